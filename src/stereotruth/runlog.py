@@ -1,0 +1,57 @@
+"""Logging and error reporting of one job: the same lines on the terminal and in its log file."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+
+from .errors import InputError
+
+log = logging.getLogger("stereotruth")
+
+
+@contextmanager
+def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
+    """Run one job: log to terminal and file; end with one clear line where the input is at fault.
+
+    InputError becomes ``error: <name>: …`` and exit status 1; anything else is a defect and keeps
+    its traceback.
+    """
+    cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
+    path = Path(log_file)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, mode="w")
+    terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handlers = (terminal, file)
+    for handler in handlers:
+        log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield log
+    except InputError as error:
+        log.error("error: %s", error)
+        raise SystemExit(1) from None
+    except Exception:
+        log.exception("unexpected failure")
+        raise
+    finally:
+        for handler in handlers:
+            log.removeHandler(handler)
+            handler.close()
+
+
+def progress(items: Iterable, total: int, what: str) -> Iterator:
+    """Pass items through and log about every tenth part done."""
+    last = -1
+    for done, item in enumerate(items, start=1):
+        yield item
+        tenth = done * 10 // max(total, 1)
+        if tenth > last:
+            last = tenth
+            log.info("%s: %d of %d", what, done, total)
