@@ -1,0 +1,44 @@
+# make tiles/<City>   set up, then make the tiles of a city of config/cities.tsv
+# make test           set up, then pass the tests
+PYTHON ?= python3
+CORES ?= 2
+BIN := .venv/bin
+READY := .venv/ready
+
+.PHONY: setup test lint lock dataset verify clean FORCE
+
+setup: $(READY)
+
+$(READY): envs/requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("Python 3.11 or later is needed, this is %d.%d: set PYTHON=/path/to/python3.11" % v[:2])'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r envs/requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+tiles/%: $(READY) FORCE
+	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
+
+dataset verify: %: $(READY) FORCE
+	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
+
+test: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/snakefmt --check Snakefile workflow
+	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --lint
+	$(BIN)/python tests/check_lock.py
+
+# Resolves again, keeping the pins that still fit; needs uv.
+lock:
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra dev --universal \
+	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --quiet \
+	  --output-file envs/requirements.lock
+
+clean:
+	rm -rf data results tiles dataset logs benchmarks
+
+FORCE:

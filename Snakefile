@@ -1,0 +1,31 @@
+"""Satellite pairs + LiDAR + GCPs -> epipolar image pairs with ground-truth disparity."""
+
+from snakemake.utils import min_version
+
+min_version("9.10")
+
+
+configfile: "config/config.yaml"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/simulate.smk"
+include: "workflow/rules/ingest.smk"
+include: "workflow/rules/align.smk"
+include: "workflow/rules/rectify.smk"
+include: "workflow/rules/project.smk"
+include: "workflow/rules/export.smk"
+include: "workflow/rules/evaluate.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        expand("tiles/{city}", city=CITIES),
+
+
+onsuccess:
+    print(made())
+
+
+report: "workflow/report/workflow.rst"

@@ -1,0 +1,231 @@
+"""The user's sheets and configuration: read, checked, and turned into plain values.
+
+Everything that can be known to be wrong before any work is refused here, in one line that names
+the sheet, the row and the remedy.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import yaml
+
+from .errors import InputError
+
+LIDAR_SUFFIXES = (".las", ".laz")
+
+
+@dataclass(frozen=True)
+class City:
+    """One row of the cities sheet; the counts are those of the paper's table 3."""
+
+    city: str
+    prefix: str
+    training: int
+    validation: int
+    testing: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One row of the scenes sheet: a stereo pair, its LiDAR and its ground control points."""
+
+    scene: str
+    city: str
+    left_image: str
+    right_image: str
+    lidar: str
+    lidar_crs: str
+    geoid: str
+    gcps: str
+
+
+def _schema(name: str, schemas: Path) -> dict[str, Any]:
+    return yaml.safe_load((schemas / f"{name}.schema.yaml").read_text(encoding="utf-8"))
+
+
+def _complaint(error: jsonschema.ValidationError) -> tuple[str, str]:
+    """What is wrong, and the remedy, of a schema violation in the user's words."""
+    key = ".".join(str(part) for part in error.absolute_path)
+    if error.validator == "additionalProperties":
+        known = sorted(error.schema.get("properties", {}))
+        unknown = sorted(set(error.instance) - set(known))
+        close = difflib.get_close_matches(unknown[0], known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
+        place = f" under {key!r}" if key else ""
+        return f"unknown key {', '.join(map(repr, unknown))}{place}", hint
+    if error.validator == "required":
+        return error.message, "add it"
+    meaning = error.schema.get("description", "")
+    return f"{key or 'value'}: {error.message}", f"{key or 'it'} is: {meaning}" if meaning else (
+        "see config/README.md"
+    )
+
+
+def check(instance: Mapping[str, Any], schema: str, schemas: Path, file: str | Path) -> None:
+    """Hold values against one of the JSON schemas.
+
+    Raises InputError with the first violation, naming ``file``, the key and what it should be.
+    """
+    validator = jsonschema.Draft202012Validator(_schema(schema, schemas))
+    error = jsonschema.exceptions.best_match(validator.iter_errors(instance))
+    if error is not None:
+        problem, remedy = _complaint(error)
+        raise InputError(problem, file=file, remedy=remedy)
+
+
+def _read_table(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """(line number, cells) of each row of a tab-separated sheet."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(
+            "no such file", file=path, remedy="correct its path in the config, or write it"
+        ) from None
+    except (UnicodeDecodeError, IsADirectoryError) as error:
+        raise InputError(str(error), file=path, remedy="save it as UTF-8 text") from None
+    rows = csv.reader(text.splitlines(), delimiter="\t")
+    numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
+    numbered = [(n, row) for n, row in numbered if not row[0].startswith("#")]
+    if not numbered:
+        raise InputError("empty sheet", file=path, remedy=f"its columns are {', '.join(columns)}")
+    header = numbered[0][1]
+    missing = [c for c in columns if c not in header]
+    unknown = [c for c in header if c not in columns]
+    if missing or unknown:
+        tabs = "" if len(header) > 1 else " (are the columns separated by tabs?)"
+        wrong = [f"column {c!r} is missing" for c in missing]
+        wrong += [f"column {c!r} is unknown" for c in unknown]
+        raise InputError(
+            "; ".join(wrong) + tabs, file=path, remedy=f"the columns are {', '.join(columns)}"
+        )
+    table = []
+    for number, row in numbered[1:]:
+        if len(row) > len(header):
+            raise InputError(
+                f"line {number} has {len(row)} cells for {len(header)} columns",
+                file=path,
+                remedy="remove the surplus tab",
+            )
+        row += [""] * (len(header) - len(row))
+        table.append((number, dict(zip(header, row))))
+    return table
+
+
+def _unique(values: Iterable[str], column: str, file: Path) -> None:
+    twice = [value for value, n in Counter(values).items() if n > 1]
+    if twice:
+        raise InputError(
+            f"{column} {twice[0]!r} stands in more than one row",
+            file=file,
+            remedy=f"give each row a {column} of its own",
+        )
+
+
+def read_cities(path: str | Path, schemas: Path) -> dict[str, City]:
+    """The cities sheet by name of the city. Raises InputError as described in the module."""
+    path = Path(path)
+    cities = {}
+    rows = _read_table(path, [f.name for f in fields(City)])
+    for number, cells in rows:
+        values: dict[str, Any] = dict(cells)
+        for count in ("training", "validation", "testing"):
+            if not re.fullmatch(r"\d+", cells[count]):
+                raise InputError(
+                    f"line {number}: {count} is {cells[count]!r}",
+                    file=path,
+                    remedy=f"{count} is a number of tiles: a whole number, 0 or more",
+                )
+            values[count] = int(cells[count])
+        check(values, "cities", schemas, f"{path}, line {number}")
+        cities[cells["city"]] = City(**values)
+    _unique([cells["city"] for _, cells in rows], "city", path)
+    _unique([cells["prefix"] for _, cells in rows], "prefix", path)
+    return cities
+
+
+def read_scenes(path: str | Path, cities: Mapping[str, City], schemas: Path) -> dict[str, Scene]:
+    """The scenes sheet by id of the scene. Raises InputError as described in the module."""
+    path = Path(path)
+    scenes = {}
+    rows = _read_table(path, [f.name for f in fields(Scene)])
+    for number, cells in rows:
+        check(cells, "scenes", schemas, f"{path}, line {number}")
+        if cells["city"] not in cities:
+            close = difflib.get_close_matches(cells["city"], cities, n=1)
+            raise InputError(
+                f"line {number}: scene {cells['scene']!r} is of city {cells['city']!r}, which is "
+                "not in the cities sheet",
+                file=path,
+                remedy=f"did you mean {close[0]!r}?" if close else "add a row to the cities sheet",
+            )
+        if cells["left_image"] == cells["right_image"]:
+            raise InputError(
+                f"line {number}: scene {cells['scene']!r} names one image twice",
+                file=path,
+                remedy="left_image is the backward view, right_image the forward view",
+            )
+        scenes[cells["scene"]] = Scene(**cells)
+    _unique([cells["scene"] for _, cells in rows], "scene", path)
+    return scenes
+
+
+def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> None:
+    """Raise InputError if a file that the scene's row names does not exist."""
+    for column in columns:
+        value = getattr(scene, column)
+        if value and not Path(value).is_file():
+            raise InputError(
+                f"scene {scene.scene!r}: {column} {value!r} does not exist",
+                file=sheet,
+                remedy="correct the path (relative to the working directory, or absolute)",
+            )
+
+
+def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
+    """The LAS/LAZ files of a scene's ``lidar`` cell (a folder or a glob), sorted.
+
+    Raises InputError if there is none.
+    """
+    pattern = Path(scene.lidar)
+    if pattern.is_dir():
+        found = [f for f in pattern.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES]
+    elif pattern.is_file():
+        found = [pattern]
+    else:
+        anchor = Path(pattern.anchor)
+        found = [f for f in anchor.glob(str(pattern.relative_to(anchor))) if f.is_file()]
+    if not found:
+        raise InputError(
+            f"scene {scene.scene!r}: no LiDAR file at {scene.lidar!r}",
+            file=sheet,
+            remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
+        )
+    return sorted(found)
+
+
+def store_names(files: Iterable[Path]) -> dict[str, Path]:
+    """A short unique name for each LiDAR file: its stem, with a hash of its path if two share it."""
+
+    def stem(file: Path) -> str:
+        name = re.sub(r"(\.copc)?\.(las|laz)$", "", file.name, flags=re.IGNORECASE)
+        return re.sub(r"[^A-Za-z0-9._-]", "_", name)
+
+    files = list(files)
+    shared = {name for name, n in Counter(map(stem, files)).items() if n > 1}
+
+    def unique(file: Path) -> str:
+        if stem(file) not in shared:
+            return stem(file)
+        return f"{stem(file)}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+
+    return {unique(file): file for file in files}

@@ -1,0 +1,37 @@
+rule align:
+    input:
+        left=left_image,
+        right=right_image,
+        gcps=lambda w: SCENES[w.scene].gcps,
+    output:
+        alignment="results/align/{city}/{scene}/alignment.json",
+        residuals=report(
+            "results/align/{city}/{scene}/residuals.csv",
+            caption="../report/residuals.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "table"},
+        ),
+        figure=report(
+            "results/align/{city}/{scene}/residuals.png",
+            caption="../report/residuals.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "figure"},
+        ),
+    log:
+        "logs/align/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/align/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        model=config["alignment"]["model"],
+        strict=config["strict"],
+        code=source_digest("alignment"),
+    message:
+        "Aligning scene {wildcards.scene} to its ground control points"
+    script:
+        "../scripts/align.py"

@@ -1,0 +1,101 @@
+"""Sheets, validation, wildcard constraints, and the input functions of all stages."""
+
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+from stereotruth import sheets
+from stereotruth.errors import InputError
+from stereotruth.provenance import source_digest
+from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
+
+SCHEMAS = Path(workflow.basedir) / "workflow" / "schemas"
+CONDA = Path(workflow.basedir) / "envs" / "workflow.yaml"
+SYNTHETIC_FOLDER = "data/synthetic"
+
+
+def is_synthetic(scene):
+    """Whether the scene's input is made by the rules of simulate.smk."""
+    city = SYNTHETIC.get(scene.city)
+    made_here = f"{SYNTHETIC_FOLDER}/{scene.city}/{scene.scene}"
+    return city is not None and scene.left_image == f"{made_here}/left.tif"
+
+
+def read_sheets():
+    """Cities and scenes by name, and the LiDAR files of each scene by store name."""
+    sheets.check(config, "config", SCHEMAS, "config")
+    cities = sheets.read_cities(config["cities"], SCHEMAS)
+    scenes = sheets.read_scenes(config["scenes"], cities, SCHEMAS)
+    lidar = {}
+    for name, scene in scenes.items():
+        sheet = config["scenes"]
+        if is_synthetic(scene):
+            sheets.require_files(scene, sheet, ["gcps"])
+            tiles = synthetic_lidar(SYNTHETIC[scene.city], name)
+            files = [Path(scene.lidar) / tile for tile in tiles]
+        else:
+            sheets.require_files(scene, sheet, ["left_image", "right_image", "gcps", "geoid"])
+            files = sheets.find_lidar(scene, sheet)
+        lidar[name] = sheets.store_names(files)
+    return cities, scenes, lidar
+
+
+try:
+    CITIES, SCENES, LIDAR = read_sheets()
+except InputError as error:
+    raise WorkflowError(str(error))
+
+
+wildcard_constraints:
+    city="|".join(CITIES),
+    scene="|".join(SCENES),
+    view="left|right",
+    lidar="[^/]+",
+
+
+def scenes_of(city):
+    """The scenes of a city, in the order of the sheet."""
+    found = [scene for scene in SCENES.values() if scene.city == city]
+    if not found:
+        raise WorkflowError(
+            f"{config['scenes']}: city {city!r} has no scene. Remedy: add a row for it"
+        )
+    return found
+
+
+def with_rpc_files(image):
+    """An image and the RPC files beside it, so that an edited RPC is seen."""
+    image = Path(image)
+    beside = [image.with_suffix(s) for s in (".RPB", ".rpb")]
+    beside += [image.with_name(f"{image.stem}{s}") for s in ("_RPC.TXT", "_rpc.txt", "_RPC.txt")]
+    return [str(image), *(str(file) for file in beside if file.is_file())]
+
+
+def left_image(wildcards):
+    return with_rpc_files(SCENES[wildcards.scene].left_image)
+
+
+def right_image(wildcards):
+    return with_rpc_files(SCENES[wildcards.scene].right_image)
+
+
+def point_stores(wildcards):
+    return expand(
+        "results/ingest/{city}/{scene}/{lidar}.zarr",
+        city=wildcards.city,
+        scene=wildcards.scene,
+        lidar=LIDAR[wildcards.scene],
+    )
+
+
+def made():
+    """What the last lines of a run say: the tiles that there are, and where to look."""
+    from stereotruth.tiles import summary_lines
+
+    lines = [
+        line
+        for city in CITIES
+        if Path("tiles", city, "manifest.csv").is_file()
+        for line in summary_lines(Path("tiles", city))
+    ]
+    return "\n".join(["", *lines]) if lines else "done"

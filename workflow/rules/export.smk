@@ -1,0 +1,85 @@
+rule export:
+    input:
+        alignment=lambda w: [
+            f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
+        ],
+        left=lambda w: [f"results/rectify/{w.city}/{s.scene}/left.zarr" for s in scenes_of(w.city)],
+        right=lambda w: [
+            f"results/rectify/{w.city}/{s.scene}/right.zarr" for s in scenes_of(w.city)
+        ],
+        disparity=lambda w: [f"results/project/{w.city}/{s.scene}.zarr" for s in scenes_of(w.city)],
+    output:
+        tiles=directory("tiles/{city}"),
+        coverage=report(
+            "results/export/{city}/coverage.png",
+            caption="../report/coverage.rst",
+            category="Tiles",
+            labels={"city": "{city}", "kind": "coverage"},
+        ),
+        contact_sheet=report(
+            "results/export/{city}/contact_sheet.png",
+            caption="../report/contact_sheet.rst",
+            category="Tiles",
+            labels={"city": "{city}", "kind": "contact sheet"},
+        ),
+    log:
+        "logs/export/{city}.log",
+    benchmark:
+        "benchmarks/export/{city}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=4000,
+        runtime=60,
+    params:
+        scenes=lambda w: [s.scene for s in scenes_of(w.city)],
+        city=lambda w: CITIES[w.city].__dict__,
+        tiles=config["tiles"],
+        seed=config["seed"],
+        strict=config["strict"],
+        code=source_digest("tiles"),
+    message:
+        "Cutting the tiles of {wildcards.city}"
+    script:
+        "../scripts/export.py"
+
+
+rule dataset:
+    input:
+        expand("tiles/{city}", city=CITIES),
+    output:
+        directory("dataset"),
+    log:
+        "logs/dataset/dataset.log",
+    benchmark:
+        "benchmarks/dataset/dataset.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=60,
+    params:
+        code=source_digest("dataset"),
+    message:
+        "Putting the cities together in the layout of the published dataset"
+    script:
+        "../scripts/dataset.py"
+
+
+rule verify:
+    log:
+        "logs/verify/verify.log",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=60,
+    params:
+        tiles=[f"tiles/{city}" for city in CITIES],
+    message:
+        "Holding the tiles against the checksums of their manifests"
+    script:
+        "../scripts/verify.py"

@@ -1,0 +1,24 @@
+rule ingest:
+    input:
+        lidar=lambda w: LIDAR[w.scene][w.lidar],
+        geoid=lambda w: SCENES[w.scene].geoid or [],
+    output:
+        store=directory("results/ingest/{city}/{scene}/{lidar}.zarr"),
+    log:
+        "logs/ingest/{city}/{scene}/{lidar}.log",
+    benchmark:
+        "benchmarks/ingest/{city}/{scene}/{lidar}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
+        drop_classes=config["ingest"]["drop_classes"],
+        code=source_digest("points"),
+    message:
+        "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"
+    script:
+        "../scripts/ingest.py"

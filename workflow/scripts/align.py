@@ -1,0 +1,25 @@
+"""One scene's images to its ground control points."""
+
+from stereotruth.alignment import align, write_alignment
+from stereotruth.provenance import describe
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    scene = snakemake.wildcards.scene
+    model, strict = snakemake.params.model, snakemake.params.strict
+    with job(snakemake.log[0], f"align {scene}"):
+        alignment = align(
+            snakemake.input.left[0],
+            snakemake.input.right[0],
+            snakemake.input.gcps,
+            model=model,
+            scene=scene,
+            strict=strict,
+            provenance=describe(snakemake.input, {"model": model}, snakemake.params.code),
+        )
+        write_alignment(
+            alignment,
+            snakemake.output.alignment,
+            snakemake.output.residuals,
+            snakemake.output.figure,
+        )

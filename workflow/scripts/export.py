@@ -1,0 +1,1 @@
+"""One city's scenes to its benchmark tiles."""

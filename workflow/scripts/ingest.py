@@ -1,0 +1,22 @@
+"""One LiDAR file to a point store."""
+
+from stereotruth.points import ingest
+from stereotruth.provenance import describe
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
+    parameters = {
+        "lidar_crs": snakemake.params.lidar_crs,
+        "drop_classes": snakemake.params.drop_classes,
+    }
+    with job(snakemake.log[0], f"ingest {scene}"):
+        ingest(
+            snakemake.input.lidar,
+            snakemake.output.store,
+            lidar_crs=parameters["lidar_crs"] or None,
+            geoid=geoid,
+            drop_classes=tuple(parameters["drop_classes"]),
+            scene=scene,
+            provenance=describe(snakemake.input, parameters, snakemake.params.code),
+        )

@@ -1,0 +1,23 @@
+"""One aligned pair to epipolar images."""
+
+from stereotruth.alignment import Alignment
+from stereotruth.provenance import describe
+from stereotruth.rectification import rectify
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    scene = snakemake.wildcards.scene
+    with job(snakemake.log[0], f"rectify {scene}"):
+        alignment = Alignment.load(snakemake.input.alignment)
+        rectify(
+            snakemake.input.left[0],
+            snakemake.input.right[0],
+            alignment.left,
+            alignment.right,
+            alignment.reference_height,
+            snakemake.output.epipolar,
+            snakemake.output.left,
+            snakemake.output.right,
+            workers=snakemake.threads,
+            provenance=describe(snakemake.input, {}, snakemake.params.code),
+        )

@@ -1,0 +1,1 @@
+"""The tiles that exist against the checksums of their manifests."""
