@@ -28,4 +28,8 @@ onsuccess:
     print(made())
 
 
+onerror:
+    print(complaints(log))
+
+
 report: "workflow/report/workflow.rst"

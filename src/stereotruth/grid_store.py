@@ -47,7 +47,7 @@ def compressor() -> BloscCodec:
 
 @contextmanager
 def building(path: str | Path) -> Iterator[Path]:
-    """A fresh scratch folder that becomes ``path`` if the block ends well, and goes if it does not."""
+    """A fresh scratch folder that becomes ``path`` if the block ends well, else it goes."""
     path = Path(path)
     scratch = path.with_name(path.name + ".partial")
     shutil.rmtree(scratch, ignore_errors=True)

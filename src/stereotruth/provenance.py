@@ -119,6 +119,6 @@ def describe(
 
 
 def digest(record: Mapping[str, Any]) -> str:
-    """Short digest of a provenance record: stands for the product in the records of later stages."""
+    """Short digest of a provenance record: stands for the product in later stages' records."""
     text = json.dumps(record, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

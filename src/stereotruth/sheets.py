@@ -214,7 +214,7 @@ def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
 
 
 def store_names(files: Iterable[Path]) -> dict[str, Path]:
-    """A short unique name for each LiDAR file: its stem, with a hash of its path if two share it."""
+    """A unique name for each LiDAR file: its stem, with a hash of its path if two share it."""
 
     def stem(file: Path) -> str:
         name = re.sub(r"(\.copc)?\.(las|laz)$", "", file.name, flags=re.IGNORECASE)

@@ -1,5 +1,6 @@
 """Sheets, validation, wildcard constraints, and the input functions of all stages."""
 
+import re
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -55,11 +56,14 @@ wildcard_constraints:
 
 def scenes_of(city):
     """The scenes of a city, in the order of the sheet."""
+    if city not in CITIES:
+        raise WorkflowError(
+            f"{config['cities']}: no city {city!r}. "
+            f"Remedy: take one of {', '.join(CITIES)}, or add a row"
+        )
     found = [scene for scene in SCENES.values() if scene.city == city]
     if not found:
-        raise WorkflowError(
-            f"{config['scenes']}: city {city!r} has no scene. Remedy: add a row for it"
-        )
+        raise WorkflowError(f"{config['scenes']}: no scene of city {city!r}. Remedy: add a row")
     return found
 
 
@@ -86,6 +90,16 @@ def point_stores(wildcards):
         scene=wildcards.scene,
         lidar=LIDAR[wildcards.scene],
     )
+
+
+def complaints(snakemake_log):
+    """The errors that the failed jobs of a run have logged, one line each."""
+    text = Path(snakemake_log).read_text()
+    logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
+    found = []
+    for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
+        found += re.findall(r"ERROR (error: .*)", file.read_text())
+    return "\n".join(found)
 
 
 def made():

@@ -26,6 +26,8 @@ rule export:
         "logs/export/{city}.log",
     benchmark:
         "benchmarks/export/{city}.tsv"
+    wildcard_constraints:
+        city="[^/]+",  # so that scenes_of can name the cities that there are
     conda:
         CONDA
     threads: 2

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from stereotruth import provenance
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A copy of the package's source that a test may edit."""
+    copy = tmp_path / "stereotruth"
+    shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(provenance, "PACKAGE", copy)
+    provenance._parsed.cache_clear()
+    yield copy
+    provenance._parsed.cache_clear()
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+    provenance._parsed.cache_clear()
+
+
+def test_digest_follows_imports_within_the_package():
+    modules = provenance.source_modules("grid_store")
+    assert {"grid_store", "errors"} <= set(modules)
+    assert "sheets" not in modules
+
+
+def test_a_change_of_an_imported_module_changes_the_digest(package):
+    before = provenance.source_digest("grid_store"), provenance.source_digest("sheets")
+    edit(package / "grid_store.py", "clevel=3", "clevel=5")
+    after = provenance.source_digest("grid_store"), provenance.source_digest("sheets")
+    assert before[0] != after[0]
+    assert before[1] == after[1]
+
+
+def test_comments_and_docstrings_do_not_change_the_digest(package):
+    before = provenance.source_digest("errors")
+    edit(package / "errors.py", '"""The one exception', '# a remark\n"""Another wording: the one')
+    # the docstring has moved behind a comment and changed
+    assert provenance.source_digest("errors") == before
+
+
+STAGES = ("points", "alignment", "rectification", "disparity", "tiles")
+
+
+def test_a_stage_depends_on_no_later_stage_and_on_no_simulation():
+    """Otherwise an edit of a late stage would rerun an early one."""
+    for n, stage in enumerate(STAGES):
+        modules = set(provenance.source_modules(stage))
+        assert not modules & set(STAGES[n + 1 :]), stage
+        assert not any(module.startswith("simulate") for module in modules), stage
+        assert "sheets" not in modules
+
+
+def test_the_simulator_shares_no_code_with_the_pipeline():
+    modules = set(provenance.source_modules("simulate.scene"))
+    assert not modules & {*STAGES, "rpc", "epipolar", "occlusion", "correlation"}
+
+
+def test_records_hold_checksums_and_are_equal_for_equal_work(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_bytes(b"abc")
+    record = provenance.describe([file], {"x": 1}, "code")
+    sha_of_abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert record["inputs"] == {"a.txt": sha_of_abc}
+    assert provenance.digest(record) == provenance.digest(
+        provenance.describe({"a.txt": sha_of_abc}, {"x": 1}, "code")
+    )
+    assert str(tmp_path) not in str(record)

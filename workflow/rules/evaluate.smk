@@ -1,0 +1,35 @@
+def synthetic_scenes():
+    return [scene for scene in SCENES.values() if is_synthetic(scene)]
+
+
+rule evaluate_truth:
+    input:
+        disparity="results/project/{city}/{scene}.zarr",
+        tiles="tiles/{city}",
+        truth="data/synthetic/{city}/{scene}/truth.zarr",
+    output:
+        figures="results/evaluate/{city}/{scene}/truth.json",
+        table="results/evaluate/{city}/{scene}/truth.csv",
+    log:
+        "logs/evaluate_truth/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/evaluate_truth/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=3000,
+        runtime=60,
+    params:
+        code=source_digest("evaluation.truth"),
+    message:
+        "Comparing scene {wildcards.scene} with its exact truth"
+    script:
+        "../scripts/evaluate_truth.py"
+
+
+rule evaluate:
+    input:
+        [f"results/evaluate/{s.city}/{s.scene}/truth.json" for s in synthetic_scenes()],
+    message:
+        "Exact-truth figures of all synthetic scenes"

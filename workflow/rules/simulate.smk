@@ -1,0 +1,69 @@
+rule simulate_image:
+    output:
+        image="data/synthetic/{city}/{scene}/{view}.tif",
+    log:
+        "logs/simulate_image/{city}/{scene}/{view}.log",
+    benchmark:
+        "benchmarks/simulate_image/{city}/{scene}/{view}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=3000,
+        runtime=30,
+    params:
+        seed=config["seed"],
+        code=source_digest("simulate.scene"),
+    message:
+        "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
+    script:
+        "../scripts/simulate_image.py"
+
+
+rule simulate_lidar:
+    output:
+        lidar="data/synthetic/{city}/{scene}/lidar/{tile}",
+    log:
+        "logs/simulate_lidar/{city}/{scene}/{tile}.log",
+    benchmark:
+        "benchmarks/simulate_lidar/{city}/{scene}/{tile}.tsv"
+    wildcard_constraints:
+        tile=r"[^/]+\.la[sz]",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=3000,
+        runtime=30,
+    params:
+        spacing_m=config["simulate"]["lidar_spacing_m"],
+        seed=config["seed"],
+        code=source_digest("simulate.scene"),
+    message:
+        "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
+    script:
+        "../scripts/simulate_lidar.py"
+
+
+rule simulate_truth:
+    output:
+        truth=directory("data/synthetic/{city}/{scene}/truth.zarr"),
+        gcps="data/synthetic/{city}/{scene}/gcps_exact.csv",
+        checkpoints="data/synthetic/{city}/{scene}/checkpoints.csv",
+    log:
+        "logs/simulate_truth/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/simulate_truth/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=3000,
+        runtime=30,
+    params:
+        seed=config["seed"],
+        code=source_digest("simulate.scene"),
+    message:
+        "Writing the exact truth of synthetic scene {wildcards.scene}"
+    script:
+        "../scripts/simulate_truth.py"
