@@ -1,0 +1,96 @@
+"""A copy of the workflow that a test may run and edit, fed with a small synthetic city."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SHEET_COLUMNS = "scene city left_image right_image lidar lidar_crs geoid gcps".split()
+
+
+@dataclass
+class Run:
+    """What a call of snakemake said."""
+
+    status: int
+    text: str
+
+    @property
+    def jobs(self) -> dict[str, int]:
+        """Planned jobs by rule, from the last table of job counts."""
+        tables = self.text.split("Job stats:")
+        if len(tables) == 1:
+            return {}
+        found = re.findall(r"^(\w+)\s+(\d+)$", tables[-1], flags=re.MULTILINE)
+        return {rule: int(n) for rule, n in found if rule != "total"}
+
+
+@dataclass
+class Project:
+    """A working directory with the workflow's files, and a source tree of its own."""
+
+    folder: Path
+
+    def snakemake(self, *arguments: str, cores: int = 2) -> Run:
+        source = self.folder / "src"
+        environment = {**os.environ, "PYTHONPATH": str(source)}
+        done = subprocess.run(
+            [sys.executable, "-m", "snakemake", "--cores", str(cores), *arguments],
+            cwd=self.folder,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=900,
+        )
+        return Run(done.returncode, done.stdout)
+
+    def plan(self, *arguments: str) -> dict[str, int]:
+        """Jobs by rule that a call would run."""
+        run = self.snakemake("--dry-run", *arguments)
+        assert run.status == 0, run.text
+        return run.jobs
+
+    def edit(self, file: str, old: str, new: str) -> None:
+        path = self.folder / file
+        text = path.read_text()
+        assert old in text, f"{old!r} is not in {file}"
+        path.write_text(text.replace(old, new, 1))
+
+    def add_scene(self, name: str, rows: list[dict[str, str]], **overrides: object) -> str:
+        """Write sheets and a config for a city of one's own; returns the config's file name."""
+        import yaml
+
+        lines = ["\t".join(SHEET_COLUMNS)]
+        lines += ["\t".join(row.get(c, "") for c in SHEET_COLUMNS) for row in rows]
+        (self.folder / f"{name}_scenes.tsv").write_text("\n".join(lines) + "\n")
+        cities = ["city\tprefix\ttraining\tvalidation\ttesting"]
+        for n, city in enumerate(dict.fromkeys(row["city"] for row in rows)):
+            cities.append(f"{city}\tC{n}\t6\t1\t3")
+        (self.folder / f"{name}_cities.tsv").write_text("\n".join(cities) + "\n")
+        config = {"scenes": f"{name}_scenes.tsv", "cities": f"{name}_cities.tsv", **overrides}
+        (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(config))
+        return f"{name}.yaml"
+
+
+def copy_project(folder: Path) -> Project:
+    """Copy what a clone holds of the workflow and the package into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(ROOT / "Snakefile", folder)
+    for name in ("workflow", "config", "profiles", "envs", "src"):
+        ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
+        shutil.copytree(ROOT / name, folder / name, ignore=ignore)
+    return Project(folder)
+
+
+@pytest.fixture
+def project(tmp_path) -> Project:
+    return copy_project(tmp_path / "project")

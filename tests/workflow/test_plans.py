@@ -1,0 +1,89 @@
+"""What Snakemake would run, and what it refuses, before any work."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from stereotruth.provenance import source_modules
+
+from .conftest import ROOT
+
+
+def test_a_city_is_planned_from_nothing(project):
+    jobs = project.plan("tiles/Qichun")
+    assert jobs["export"] == 1
+    assert jobs["align"] == jobs["rectify"] == jobs["project"] == 2
+    assert jobs["simulate_image"] == 4
+    assert jobs["ingest"] == jobs["simulate_lidar"] >= 4
+
+
+def test_all_cities_and_the_dataset_are_planned(project):
+    assert project.plan()["export"] == 6
+    assert project.plan("dataset")["dataset"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["tiles/Quichun"], ["no city 'Quichun'", "Qichun"]),
+        (["tiles/Qichun", "--config", "tile=3"], ["unknown key 'tile'", "'tiles'"]),
+        (["tiles/Qichun", "--config", "seed=x"], ["seed", "'x'"]),
+        (["tiles/Qichun", "--config", "scenes=none.tsv"], ["none.tsv", "no such file"]),
+    ],
+)
+def test_a_wrong_call_ends_before_any_work(project, arguments, words):
+    run = project.snakemake(*arguments)
+    assert run.status != 0
+    for word in words:
+        assert word in run.text
+    assert not (project.folder / "results").exists()
+    assert not (project.folder / "data").exists()
+
+
+@pytest.mark.parametrize("column", ["left_image", "right_image", "lidar", "geoid", "gcps"])
+def test_a_missing_file_is_named(project, column):
+    row = {"scene": "Mine-1", "city": "Mine"}
+    for name in ("left_image", "right_image", "lidar", "geoid", "gcps"):
+        (project.folder / f"{name}.laz").touch()
+        row[name] = f"{name}.laz"
+    (project.folder / f"{column}.laz").unlink()
+    run = project.snakemake("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
+    assert run.status != 0
+    for word in ("Mine-1", f"{column}.laz", "mine_scenes.tsv", "Remedy"):
+        assert word in run.text
+
+
+def test_lint_passes():
+    lint = subprocess.run(
+        [sys.executable, "-m", "snakemake", "--lint"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert lint.returncode == 0, lint.stderr
+
+
+def test_every_script_has_its_rule_and_log(project):
+    rules = "".join(file.read_text() for file in (project.folder / "workflow/rules").iterdir())
+    for script in (project.folder / "workflow/scripts").glob("*.py"):
+        assert f"rule {script.stem}:" in rules
+        assert f"../scripts/{script.name}" in rules
+
+
+def test_code_digests_name_the_modules_that_the_scripts_import(project):
+    """Otherwise an edit of a module would leave stale results standing."""
+    import ast
+    import re
+
+    rules = "".join(file.read_text() for file in (project.folder / "workflow/rules").iterdir())
+    for rule, body in re.findall(r"^rule (\w+):(.*?)(?=^rule |\Z)", rules, flags=re.S | re.M):
+        digest = re.search(r"source_digest\(([^)]*)\)", body)
+        if digest is None:
+            continue
+        covered = set(source_modules(*re.findall(r'"([\w.]+)"', digest[1])))
+        tree = ast.parse((project.folder / f"workflow/scripts/{rule}.py").read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth."):
+                module = node.module.removeprefix("stereotruth.")
+                # who reports and records does not change what is computed
+                assert module in covered | {"runlog", "provenance"}, (rule, module)
