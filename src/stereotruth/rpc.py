@@ -265,6 +265,15 @@ class RPC:
         low, high = centre - half, centre + half
         return tuple(float(v) for v in (low[0], low[1], high[0], high[1], low[2], high[2]))
 
+    def denominators(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> Floats:
+        """float64[2, n]: sample and line denominator at n ground points; zero is a pole."""
+        terms = _terms(
+            (np.asarray(lon) - self.long_off) / self.long_scale,
+            (np.asarray(lat) - self.lat_off) / self.lat_scale,
+            (np.asarray(height) - self.height_off) / self.height_scale,
+        )
+        return np.stack([terms @ self.samp_den_coeff, terms @ self.line_den_coeff])
+
     def packed(self) -> Floats:
         """float64[90] for kernels: ten offsets and scales in field order, then coefficients.
 
