@@ -1,0 +1,438 @@
+"""Resampling of a stereo pair into epipolar images: [y, x] Zarr grids of uint16, nodata 0.
+
+Both images of a pair get the same grid and pixel size, so that rows correspond and
+d = x_left - x_right is in px of that grid. The geometry is :mod:`stereotruth.epipolar`'s.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import warnings
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+import rasterio
+import zarr
+from dask.callbacks import Callback
+from numba import njit
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.windows import Window
+
+from .epipolar import EpipolarModel, Floats, ImageModel, fit_epipolar
+from .errors import InputError
+from .grid_store import Layer, blocks, building, create_grid
+from .rpc import SensorModel
+
+log = logging.getLogger("stereotruth")
+
+SHARD = 1024  # px; one task writes one shard file
+CHUNK = 256
+LATTICE = 16  # px between exact source coordinates; in between they are bilinear
+LATTICE_ERROR = 0.002  # px, accepted error of that
+RADIUS = 3  # px, of the interpolation kernel
+ANTIALIAS = 1.2  # source px per epipolar px above which the kernel is widened
+KERNEL = "cubic convolution, 6 x 6 taps (Keys 1981, fourth order), widened where downsampling"
+
+
+# ------------------------------------------------------------------------------------- kernels
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _kernel(s: float) -> float:
+    """Keys' six-point kernel (IEEE TASSP 29, 1981, section VI); reproduces cubic polynomials."""
+    s = abs(s)
+    if s < 1.0:
+        return (4.0 * s - 7.0) * s * s / 3.0 + 1.0
+    if s < 2.0:
+        return ((-7.0 * s + 36.0) * s - 59.0) * s / 12.0 + 2.5
+    if s < 3.0:
+        return ((s - 8.0) * s + 21.0) * s / 12.0 - 1.5
+    return 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
+    """Weights of the source samples first, first + 1, … for the value at ``at``; sum 1."""
+    total = 0.0
+    for k in range(weights.size):
+        weights[k] = _kernel((at - (first + k)) / scale)
+        total += weights[k]
+    for k in range(weights.size):
+        weights[k] /= total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(
+    source: NDArray[np.float32], first_row: int, first_col: int, down: Floats, across: Floats
+) -> float:
+    """Weighted sum of source samples; NaN where a sample with weight is nodata or missing."""
+    rows, cols = source.shape
+    if (
+        first_row >= 0
+        and first_col >= 0
+        and first_row + down.size <= rows
+        and first_col + across.size <= cols
+    ):
+        total = 0.0
+        for j in range(down.size):
+            part = 0.0
+            for i in range(across.size):
+                part += across[i] * source[first_row + j, first_col + i]
+            total += down[j] * part
+        if not np.isnan(total):
+            return total
+    total = 0.0  # at an edge or at nodata: samples without weight do not count
+    for j in range(down.size):
+        if abs(down[j]) < 1e-9:
+            continue
+        for i in range(across.size):
+            if abs(across[i]) < 1e-9:
+                continue
+            r, c = first_row + j, first_col + i
+            if r < 0 or c < 0 or r >= rows or c >= cols:
+                return np.nan
+            total += down[j] * across[i] * source[r, c]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def resample(
+    source: NDArray[np.float32],
+    lattice: Floats,
+    step: int,
+    scale: tuple[float, float],
+    out: NDArray[np.uint16],
+) -> int:
+    """Fill ``out`` from ``source``; returns how many pixels got a value.
+
+    ``source`` [row, col] holds NaN for nodata. ``lattice`` [2, k, l] gives the source's (col, row)
+    at every ``step``-th pixel of ``out``, first pixel included and past its end. ``scale`` is the
+    widening of the kernel along (col, row), 1 for none. Nodata is 0, values are 1 to 65535.
+    """
+    across = np.empty(2 * int(np.ceil(RADIUS * scale[0])))
+    down = np.empty(2 * int(np.ceil(RADIUS * scale[1])))
+    valid = 0
+    for y in range(out.shape[0]):
+        j = y // step
+        g = (y - j * step) / step
+        for x in range(out.shape[1]):
+            i = x // step
+            f = (x - i * step) / step
+            col = (1.0 - g) * ((1.0 - f) * lattice[0, j, i] + f * lattice[0, j, i + 1]) + g * (
+                (1.0 - f) * lattice[0, j + 1, i] + f * lattice[0, j + 1, i + 1]
+            )
+            row = (1.0 - g) * ((1.0 - f) * lattice[1, j, i] + f * lattice[1, j, i + 1]) + g * (
+                (1.0 - f) * lattice[1, j + 1, i] + f * lattice[1, j + 1, i + 1]
+            )
+            out[y, x] = 0
+            if not (
+                col >= -0.5
+                and row >= -0.5
+                and col <= source.shape[1] - 0.5
+                and row <= source.shape[0] - 0.5
+            ):
+                continue
+            first_col = int(np.floor(col)) + 1 - across.size // 2
+            first_row = int(np.floor(row)) + 1 - down.size // 2
+            _tap_weights(col, first_col, scale[0], across)
+            _tap_weights(row, first_row, scale[1], down)
+            value = _sample(source, first_row, first_col, down, across)
+            if np.isnan(value):
+                continue
+            out[y, x] = np.uint16(min(max(np.floor(value + 0.5), 1.0), 65535.0))
+            valid += 1
+    return valid
+
+
+# -------------------------------------------------------------------------------------- source
+
+
+class Source:
+    """One band of an image file, read by windows from any thread as float32 with NaN for nodata.
+
+    Nodata is the file's nodata value, or exactly 0 if it names none. Integer images keep their
+    digital numbers. Others keep theirs if their maximum lies in [256, 65535], else they are
+    multiplied by ``gain`` = 10000 / maximum (of a decimated reading).
+
+    Raises InputError if the file cannot be read or is complex-valued.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._local = threading.local()
+        self._opened: list[rasterio.DatasetReader] = []
+        self._lock = threading.Lock()
+        dataset = self._dataset()
+        self.size = (dataset.width, dataset.height)
+        dtype = np.dtype(dataset.dtypes[0])
+        if dtype.kind == "c":
+            raise InputError(
+                "complex image", file=path, remedy="give the amplitude as a real-valued image"
+            )
+        self.nodata = 0.0 if dataset.nodata is None else float(dataset.nodata)
+        if dataset.count > 1:
+            log.warning(
+                "%s has %d bands; band 1 (%s) is used",
+                self.path.name,
+                dataset.count,
+                dataset.descriptions[0] or dataset.colorinterp[0].name,
+            )
+        self.gain = 1.0
+        if dtype.kind == "f":
+            self.gain = self._float_gain(dataset)
+
+    def _float_gain(self, dataset: rasterio.DatasetReader) -> float:
+        shape = tuple(min(n, 2048) for n in dataset.shape)
+        sample = dataset.read(1, out_shape=shape).astype(np.float64)
+        sample = sample[np.isfinite(sample) & (sample != self.nodata)]
+        top = float(sample.max()) if sample.size else 0.0
+        if 256.0 <= top <= 65535.0 or top <= 0.0:
+            return 1.0
+        log.warning("%s: float values up to %g are scaled to 10000", self.path.name, top)
+        return 10000.0 / top
+
+    def _dataset(self) -> rasterio.DatasetReader:
+        if not hasattr(self._local, "dataset"):
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                    self._local.dataset = rasterio.open(self.path)
+            except RasterioError as error:
+                raise InputError(
+                    f"not a raster that GDAL can read ({error})",
+                    file=self.path,
+                    remedy="check the path and the file",
+                ) from error
+            with self._lock:
+                self._opened.append(self._local.dataset)
+        return self._local.dataset
+
+    def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
+        """Window [rows, cols] from (col, row) on; must lie in the image."""
+        try:
+            raw = self._dataset().read(1, window=Window(col, row, cols, rows))
+        except RasterioError as error:
+            raise InputError(
+                f"rows {row} to {row + rows} cannot be read ({error})",
+                file=self.path,
+                remedy="the file is damaged or cut short: get it again",
+            ) from error
+        values = raw.astype(np.float32)
+        values[raw == self.nodata] = np.nan
+        return values if self.gain == 1.0 else values * np.float32(self.gain)
+
+    def close(self) -> None:
+        """Close the handles of all threads."""
+        for dataset in self._opened:
+            dataset.close()
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+# ---------------------------------------------------------------------------------- one image
+
+
+def _lattice(model: ImageModel, rows: slice, cols: slice, step: int) -> Floats:
+    """Source (col, row) [2, k, l] at every ``step``-th epipolar pixel of a block and past it."""
+    y = np.arange(rows.start, rows.stop + step, step, dtype=np.float64)
+    x = np.arange(cols.start, cols.stop + step, step, dtype=np.float64)
+    return np.stack(model.inverse(x[None, :], y[:, None]))
+
+
+def _lattice_step(model: ImageModel, shape: tuple[int, int]) -> tuple[int, float]:
+    """Lattice spacing in px that keeps the error of bilinear coordinates small, and that error.
+
+    The error, in source px, is taken at the middle of lattice cells all over the grid.
+    """
+    for step in (LATTICE, LATTICE // 2, LATTICE // 4, 1):
+        y = np.linspace(0, shape[0] - 1, 33)[:, None]
+        x = np.linspace(0, shape[1] - 1, 33)[None, :]
+        corners = [
+            np.stack(model.inverse(x + a * step, y + b * step)) for a in (0, 1) for b in (0, 1)
+        ]
+        exact = np.stack(model.inverse(x + step / 2, y + step / 2))
+        error = float(np.nanmax(np.abs(sum(corners) / 4 - exact)))
+        if error <= LATTICE_ERROR or step == 1:
+            break
+    return step, error
+
+
+def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
+    """Source px per epipolar px along (col, row), mid-grid, if above ANTIALIAS; else 1."""
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    col, row = model.inverse([x - 1, x + 1, x, x], [y, y, y - 1, y + 1])
+    spans = [float(np.hypot(c[1] - c[0], c[3] - c[2]) / 2) for c in (col, row)]
+    return tuple(span if span > ANTIALIAS else 1.0 for span in spans)
+
+
+class _Progress(Callback):
+    """Logs about every tenth of the tasks done."""
+
+    def __init__(self, total: int, what: str) -> None:
+        super().__init__()
+        self.done, self.total, self.what = 0, total, what
+
+    def _posttask(self, *_: object) -> None:
+        self.done += 1
+        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
+            log.info("%s: %d of %d blocks", self.what, self.done, self.total)
+
+
+def rectify_image(
+    source: Source,
+    model: ImageModel,
+    target: zarr.Array,
+    *,
+    workers: int,
+    what: str = "rectified image",
+) -> dict[str, Any]:
+    """Resample one image into its epipolar grid, shard by shard; returns facts for the attributes.
+
+    A task reads the window of the source that its shard needs; the result does not depend on
+    ``workers`` or on the order of the tasks.
+
+    Raises InputError if no pixel of the grid gets a value.
+    """
+    shape = target.shape
+    step, error = _lattice_step(model, shape)
+    scale = _widening(model, shape)
+    reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
+
+    def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
+        lattice = _lattice(model, rows, cols, step)
+        bounds = []
+        for axis in range(2):
+            if not np.isfinite(lattice[axis]).any():
+                return None
+            low = int(np.floor(np.nanmin(lattice[axis]))) - reach[axis]
+            high = int(np.ceil(np.nanmax(lattice[axis]))) + reach[axis] + 1
+            low, high = max(low, 0), min(high, source.size[axis])
+            if low >= high:
+                return None
+            bounds += [low, high - low]
+        return lattice, bounds
+
+    def run(rows: slice, cols: slice) -> int:
+        found = window(rows, cols)
+        if found is None:
+            return 0
+        lattice, (col, width, row, height) = found
+        pixels = source.read(col, row, width, height)
+        lattice[0] -= col
+        lattice[1] -= row
+        out = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=np.uint16)
+        valid = resample(pixels, lattice, step, scale, out)
+        if valid:
+            target[rows, cols] = out
+        return valid
+
+    # In the order of source rows, so that GDAL's cache serves neighbours in files of strips.
+    todo = []
+    for rows, cols in blocks(shape, SHARD):
+        middle = model.inverse((cols.start + cols.stop) / 2, (rows.start + rows.stop) / 2)
+        todo.append((float(np.nan_to_num(middle[1])) // SHARD, rows, cols))
+    todo.sort(key=lambda item: item[0])
+    tasks = [
+        dask.delayed(run)(rows, cols, dask_key_name=f"block-{i:07d}")
+        for i, (_, rows, cols) in enumerate(todo)
+    ]
+    with _Progress(len(tasks), what):
+        counts = dask.compute(*tasks, scheduler="threads", num_workers=workers)
+    valid = int(sum(counts))
+    if valid == 0:
+        raise InputError(
+            "image has nothing but nodata where the two images overlap",
+            file=source.path,
+            remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
+        )
+    log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / target.size)
+    return {
+        "source": source.path.name,
+        "source_nodata": source.nodata,
+        "value_gain": source.gain,
+        "kernel": KERNEL,
+        "kernel_widening_col_row": list(scale),
+        "coordinate_error_px": round(error, 7),
+        "valid_pixels": valid,
+    }
+
+
+# --------------------------------------------------------------------------------------- stage
+
+
+def rectify(
+    left_image: str | Path,
+    right_image: str | Path,
+    left_sensor: SensorModel,
+    right_sensor: SensorModel,
+    reference_height: float,
+    epipolar_json: str | Path,
+    left_store: str | Path,
+    right_store: str | Path,
+    *,
+    workers: int = 1,
+    height_range: tuple[float, float] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> EpipolarModel:
+    """Fit the epipolar model of an aligned pair and resample both images into Zarr grids.
+
+    Heights are ellipsoidal m; ``height_range`` defaults to the RPCs'. Grids hold ``image`` uint16
+    [y, x], 0 where there is no value; their attributes carry the model and ``provenance``. All
+    three products appear when they are whole, or not at all.
+
+    Raises InputError for images that cannot be read, do not overlap, are one view, or hold nothing
+    but nodata.
+    """
+    with ExitStack() as stack:
+        stack.enter_context(rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"))
+        left, right = (stack.enter_context(Source(path)) for path in (left_image, right_image))
+        model = fit_epipolar(
+            left_sensor,
+            right_sensor,
+            left.size,
+            right.size,
+            reference_height,
+            height_range=height_range,
+            names=(str(left_image), str(right_image)),
+        )
+        folders = [stack.enter_context(building(path)) for path in (left_store, right_store)]
+        for view, source, image, folder in zip(
+            ("left", "right"), (left, right), (model.left_image, model.right_image), folders
+        ):
+            layer = Layer(
+                dtype="uint16",
+                fill=0,
+                attrs={
+                    "units": "1",
+                    "long_name": f"digital numbers of the {view} epipolar image",
+                    "nodata": 0,
+                },
+            )
+            arrays = create_grid(
+                folder,
+                model.shape,
+                {"image": layer},
+                chunk=CHUNK,
+                shard=SHARD,
+                attrs={
+                    "view": view,
+                    "epipolar": model.to_dict(),
+                    "provenance": dict(provenance or {}),
+                },
+            )
+            facts = rectify_image(
+                source, image, arrays["image"], workers=workers, what=f"{view} epipolar image"
+            )
+            zarr.open_group(folder, mode="r+").attrs["resampling"] = facts
+        model.save(epipolar_json)
+    return model
