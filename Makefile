@@ -23,7 +23,7 @@ dataset verify: %: $(READY) FORCE
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
 
 test: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .
