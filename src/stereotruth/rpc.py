@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 import rasterio
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from rasterio.errors import RasterioError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from .errors import InputError
 
@@ -476,7 +477,10 @@ def read_rpc(image: str | Path) -> RPC:
             rpc = RPC.from_dict(parse(text))
         else:
             source = image
-            with rasterio.open(image) as dataset:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                dataset = rasterio.open(image)
+            with dataset:
                 tags = {key.lower(): value for key, value in dataset.tags(ns="RPC").items()}
             if not tags:
                 raise InputError(
