@@ -1,0 +1,304 @@
+"""Airborne LiDAR of a city: two crossed sets of flight lines over the same exact surfaces."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import math
+import os
+import zlib
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+from numba import njit
+
+from ..errors import InputError
+from ..runlog import progress
+from .cities import CitySpec, SceneSpec, lidar_files, tile_index
+from .geodesy import LocalFrame
+from .surfaces import GROUND, IN_LIDAR, ROOF, TREE, WALL, WATER, Surfaces, cast, terrain_at
+from .world import build_surfaces, frame_of, half_size, image_axes
+
+log = logging.getLogger("stereotruth")
+
+FLYING_HEIGHT_M = 1100.0
+LINE_SPACING_M = 540.0  # ±13.8° off nadir
+NOISE_M = 0.03
+NOISE_SHARE = 1.5e-4
+WATER_RETURNS = 0.15
+SECOND_RETURNS = 0.45
+PULSES_A_CHUNK = 1_000_000
+CLASS_OF = {GROUND: 2, ROOF: 6, WALL: 6, TREE: 5, WATER: 9}
+NAN = float("nan")
+
+
+def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
+    """Packed outline float64[17] of a scene's LiDAR coverage, see :func:`covered`.
+
+    It reaches beyond the image at the first columns and last rows, and ends inside it, raggedly,
+    at the last columns and first rows.
+    """
+    across, along = image_axes(city, scene)
+    rng = np.random.default_rng([scene.pose_seed, 6])
+    beyond = 35.0 + 0.12 * city.character.relief_m
+    return np.array([
+        *scene.centre_m, *across, *along, *half_size(scene), beyond, *scene.ragged_m,
+        *rng.uniform(0, 2 * np.pi, 6),
+    ])  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def covered(c, x, y):
+    """Whether a plan position lies in the LiDAR coverage."""
+    dx, dy = x - c[0], y - c[1]
+    a, b = dx * c[2] + dy * c[3], dx * c[4] + dy * c[5]
+    if a < -c[6] - c[8] or b > c[7] + c[8]:
+        return False
+    edge_a = 1 + 0.5 * math.sin(b / 150 + c[11]) + 0.3 * math.sin(b / 61 + c[12])
+    edge_a += 0.15 * math.sin(b / 19 + c[13])
+    edge_b = 1 + 0.5 * math.sin(a / 170 + c[14]) + 0.3 * math.sin(a / 53 + c[15])
+    edge_b += 0.15 * math.sin(a / 17 + c[16])
+    return a < c[6] - c[9] * edge_a and b > -c[7] + c[10] * edge_b
+
+
+def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[float, ...]:
+    """(x_min, y_min, x_max, y_max) of a LiDAR tile: an even cut of the coverage's bounding box."""
+    c = coverage(city, scene)
+    corners = np.array([
+        c[:2] + a * c[2:4] + b * c[4:6]
+        for a in (-c[6] - c[8], c[6] - 0.05 * c[9])
+        for b in (-c[7] + 0.05 * c[10], c[7] + c[8])
+    ])  # fmt: skip
+    low, size = corners.min(axis=0), np.ptp(corners, axis=0)
+    step = size / scene.lidar_grid
+    start = low + step * index
+    return (*start, *(start + step))
+
+
+@njit(cache=True, nogil=True)
+def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
+    """Pulses of lattice lines [first, last) of one set of flight lines inside a tile.
+
+    ``strip`` 0: lines run north, 1: east. Writes world points to xyz[n, 3] and (class, return,
+    returns, intensity, angle in 0.006°, line) to info[n, 6]; returns their number.
+    """
+    n = 0
+    shift_x, shift_y = 0.31 * spacing * (strip + 1), 0.17 * spacing * (strip + 1)
+    j0 = math.ceil((box[0] - shift_x) / spacing) - 1
+    j1 = math.floor((box[2] - shift_x) / spacing) + 1
+    for i in range(first, last):
+        for j in range(j0, j1 + 1):
+            x = j * spacing + shift_x + spacing * 0.12 * (2 * rng.random() - 1)
+            y = i * spacing + shift_y + spacing * 0.12 * (2 * rng.random() - 1)
+            if x < box[0] or x >= box[2] or y < box[1] or y >= box[3]:
+                continue
+            if not covered(cover, x, y):
+                continue
+            ground, _, _ = terrain_at(s, x, y)
+            across = x if strip == 0 else y
+            line = math.floor(across / LINE_SPACING_M + 0.5 * strip)
+            slant = ((line + 0.5 - 0.5 * strip) * LINE_SPACING_M - across) / FLYING_HEIGHT_M
+            bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
+            ax, ay = x - bx * ground, y - by * ground
+            z, kind, index, _, _ = cast(s, ax, ay, bx, by, IN_LIDAR, True, ground)
+            if kind == 0:
+                continue
+            chance = rng.random()
+            if kind == WATER and chance > WATER_RETURNS:
+                continue
+            returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
+            for k in range(returns):
+                if k == 1:
+                    z, kind, index, _, _ = cast(s, ax, ay, bx, by, IN_LIDAR, False, ground)
+                    if kind == 0:
+                        break
+                px, py, pz = ax + bx * z, ay + by * z, z
+                if not covered(cover, px, py):
+                    continue
+                if kind == GROUND:
+                    label, echo = 2, 900.0
+                elif kind == TREE:
+                    label, echo = 5, 500.0
+                elif kind == WATER:
+                    label, echo = 9, 150.0
+                else:
+                    label, echo = 6, 1400.0
+                outlier = rng.random()
+                if outlier < NOISE_SHARE:  # multipath below the ground, birds above it
+                    if outlier < 0.6 * NOISE_SHARE:
+                        label = 7
+                        pz -= 2 + 45 * rng.random()
+                    else:
+                        label = 18
+                        pz += 8 + 110 * rng.random()
+                xyz[n, 0] = px + NOISE_M * rng.standard_normal()
+                xyz[n, 1] = py + NOISE_M * rng.standard_normal()
+                xyz[n, 2] = pz + NOISE_M * rng.standard_normal()
+                info[n, 0] = label
+                info[n, 1] = k + 1
+                info[n, 2] = returns
+                info[n, 3] = int(echo * (0.8 + 0.4 * rng.random())) // 16 * 16
+                info[n, 4] = int(math.degrees(math.atan(slant))) * 167
+                info[n, 5] = 100 * (strip + 1) + line
+                n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _polynomial(coefficients, middle, scale, xyz, out):
+    """Evaluate the three polynomials of :func:`to_grid` for points [n, 3]."""
+    for n in range(xyz.shape[0]):
+        x = (xyz[n, 0] - middle[0]) / scale
+        y = (xyz[n, 1] - middle[1]) / scale
+        z = (xyz[n, 2] - middle[2]) / scale
+        for m in range(3):
+            total = 0.0
+            t = 0
+            for a in range(5):
+                py = 1.0
+                inner = 0.0
+                for b in range(5 - a):
+                    value = coefficients[m, t]
+                    t += 1
+                    if a + b < 3:
+                        value += coefficients[m, t] * z
+                        t += 1
+                    if a + b < 2:
+                        value += coefficients[m, t] * z * z
+                        t += 1
+                    inner += value * py
+                    py *= y
+                total += inner * x**a
+            out[n, m] = total
+
+
+def to_grid(frame: LocalFrame, epsg: int, low: np.ndarray, high: np.ndarray):
+    """A function that takes world points [n, 3] to easting, northing, ellipsoidal height.
+
+    A polynomial of degree 4 in plan and 2 in z, fitted to the exact transformation between the
+    corners ``low`` and ``high`` [3] and checked there to 0.1 mm; 20 times as fast.
+    """
+    transformer = pyproj.Transformer.from_crs("EPSG:4979", f"EPSG:{epsg}", always_xy=True)
+
+    def exact(xyz: np.ndarray) -> np.ndarray:
+        lon, lat, height = frame.to_geodetic(xyz).T
+        east, north = transformer.transform(lon, lat)[:2]
+        return np.column_stack([east, north, height])
+
+    rng = np.random.default_rng(0)
+    middle, scale = (low + high) / 2, float(np.max(high - low) / 2)
+    xyz = rng.uniform(low, high, (1500, 3))
+    x, y, z = ((xyz - middle) / scale).T
+    columns = []
+    for a in range(5):
+        for b in range(5 - a):
+            columns += [x**a * y**b * z**k for k in range(1 + (a + b < 3) + (a + b < 2))]
+    offset = exact(middle[None])[0]
+    coefficients = np.linalg.lstsq(
+        np.column_stack(columns), exact(xyz) - offset, rcond=None
+    )[0].T.copy()  # fmt: skip
+    coefficients[:, 0] += offset
+
+    def apply(points: np.ndarray) -> np.ndarray:
+        out = np.empty_like(points)
+        _polynomial(coefficients, middle, scale, np.ascontiguousarray(points), out)
+        return out
+
+    check = rng.uniform(low, high, (500, 3))
+    miss = np.abs(apply(check) - exact(check)).max()
+    if miss > 1e-4:
+        raise RuntimeError(f"map projection is off by {miss:.2e} m in EPSG:{epsg}")
+    return apply
+
+
+def _header(city: CitySpec, offset: np.ndarray) -> laspy.LasHeader:
+    version, point_format = city.las_format.split("-")[1:]
+    header = laspy.LasHeader(version=version, point_format=int(point_format))
+    header.offsets, header.scales = offset, np.full(3, 0.001)
+    crs = pyproj.CRS.from_epsg(city.epsg)
+    # WKT can say that heights are ellipsoidal, the GeoTIFF keys of LAS 1.2 take the plain code
+    header.add_crs(crs.to_3d() if version == "1.4" else crs)
+    header.system_identifier = "synthetic"
+    header.generating_software = "stereotruth simulate"
+    header.creation_date = datetime.date(2020, 6, 1)
+    return header
+
+
+def simulate_lidar_tile(
+    city: CitySpec,
+    scene: SceneSpec,
+    tile_name: str,
+    out_laz: str | Path,
+    *,
+    spacing_m: float = 0.4,
+    seed: int,
+) -> dict[str, int]:
+    """Fly one LiDAR tile and write it as the city's LAS format says.
+
+    ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together. ``seed``
+    draws noise, jitter and which pulses pass a crown. Returns the number of points by class.
+    Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
+    """
+    if tile_name not in lidar_files(city, scene):
+        raise InputError(
+            f"scene {scene.name} has no LiDAR file {tile_name}",
+            remedy="use one of " + ", ".join(lidar_files(city, scene)),
+        )
+    if not 0.1 <= spacing_m <= 5:
+        raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
+    s: Surfaces = build_surfaces(city)
+    frame = frame_of(city)
+    cover = coverage(city, scene)
+    box = tile_box(city, scene, tile_index(scene, tile_name))
+    top = max(float(s.terrain.max()), float((s.boxes[:, 6] + s.boxes[:, 7]).max(initial=0)))
+    low = np.array([box[0] - 120, box[1] - 120, s.terrain.min() - 60])
+    high = np.array([box[2] + 120, box[3] + 120, top + 150])
+    grid = to_grid(frame, city.epsg, low, high)
+    rng = np.random.default_rng([seed, zlib.crc32(tile_name.encode())])
+    lattice = spacing_m * math.sqrt(2)
+    per_line = int((box[2] - box[0]) / lattice) + 4
+    lines = max(1, PULSES_A_CHUNK // per_line)
+    work = []
+    for strip in (0, 1):
+        first = math.floor(box[1] / lattice) - 2
+        last = math.ceil(box[3] / lattice) + 2
+        work += [(strip, a, min(a + lines, last)) for a in range(first, last, lines)]
+    xyz = np.empty((2 * per_line * lines, 3))
+    info = np.empty((len(xyz), 6), np.int32)
+    out_laz = Path(out_laz)
+    out_laz.parent.mkdir(parents=True, exist_ok=True)
+    scratch = out_laz.with_name(f".{out_laz.stem}.partial{out_laz.suffix}")
+    header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
+    counts = np.zeros(32, np.int64)
+    modern = header.point_format.id >= 6
+    try:
+        with laspy.open(
+            scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
+        ) as writer:  # fmt: skip
+            for strip, first, last in progress(work, len(work), tile_name):
+                n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
+                if not n:
+                    continue
+                record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+                east, north, height = grid(xyz[:n]).T
+                record.x, record.y, record.z = east, north, height
+                record.classification = info[:n, 0].astype(np.uint8)
+                record.return_number = info[:n, 1].astype(np.uint8)
+                record.number_of_returns = info[:n, 2].astype(np.uint8)
+                record.intensity = info[:n, 3].astype(np.uint16)
+                record.point_source_id = info[:n, 5].astype(np.uint16)
+                if modern:
+                    record.scan_angle = info[:n, 4].astype(np.int16)
+                else:
+                    record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
+                writer.write_points(record)
+                counts += np.bincount(info[:n, 0], minlength=32)
+        os.replace(scratch, out_laz)
+    finally:
+        scratch.unlink(missing_ok=True)
+    if not counts.sum():
+        raise RuntimeError(f"{tile_name}: no point lies in this tile; change the scene's lidar_grid")
+    log.info("%s: %.2f million points", tile_name, counts.sum() / 1e6)
+    return {str(k): int(v) for k, v in enumerate(counts) if v}

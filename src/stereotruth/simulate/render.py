@@ -1,0 +1,226 @@
+"""Satellite images of a city: cameras of a scene, ray-cast pixels, GeoTIFF with RPCs."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import rasterio
+from numba import njit
+from rasterio.rpc import RPC as RPCMetadata
+
+from ..errors import InputError
+from ..runlog import progress
+from .appearance import reflectance
+from .camera import aim, direction, pose, project
+from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
+from .geodesy import LocalFrame
+from .rpcs import FittedRPC, draw_bias, fit_rpc
+from .surfaces import IN_IMAGES, Surfaces, cast, terrain_heights
+from .world import build_surfaces, frame_of, half_size, near_scenes, scene_coordinates
+
+log = logging.getLogger("stereotruth")
+
+FULL_SCALE = 2047  # 11 bits
+STRIP_ROWS = 128
+PSF_SIGMA_PX = 0.42
+RPC_MARGIN_M = 130.0
+RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
+
+
+class Camera(NamedTuple):
+    """One view of a scene: packed camera, image size, and the fitted and biased RPCs."""
+
+    view: str
+    cam: np.ndarray
+    cols: int
+    rows: int
+    rpc: FittedRPC
+
+
+class Scene(NamedTuple):
+    """What every job on a scene starts from."""
+
+    city: CitySpec
+    spec: SceneSpec
+    frame: LocalFrame
+    surfaces: Surfaces
+    left: Camera
+    right: Camera
+
+
+def prepare(city: CitySpec, scene: SceneSpec) -> Scene:
+    """World and cameras of a scene; kept for further calls of the same process."""
+    return _prepare(city, scene)
+
+
+@lru_cache(maxsize=4)
+def _prepare(city: CitySpec, scene: SceneSpec) -> Scene:
+    surfaces = build_surfaces(city)
+    frame = frame_of(city)
+    # heights of the ground that the left image can show
+    ny, nx = surfaces.cell_top.shape
+    xx, yy = np.meshgrid(
+        surfaces.x0 + 20 + 20 * np.arange(int(nx * 8 / 20) - 1),
+        surfaces.y0 + 20 + 20 * np.arange(int(ny * 8 / 20) - 1),
+    )
+    xy = np.column_stack([xx.ravel(), yy.ravel()])
+    local = np.abs(scene_coordinates(city, scene, xy)) < half_size(scene) + 100
+    z = np.maximum(terrain_heights(surfaces, xy[local.all(axis=1)])[:, 0], surfaces.water)
+    low, high = float(z.min()), float(z.max())
+    objects = np.concatenate([[high], surfaces.boxes[:, 6] + surfaces.boxes[:, 7]])
+    if len(surfaces.boxes):
+        near = scene_coordinates(city, scene, surfaces.boxes[:, :2])
+        inside = (np.abs(near) < half_size(scene) + 100).all(axis=1)
+        objects = objects[np.append(True, inside)]
+    top = float(objects.max())
+    middle = (low + high) / 2
+    target = np.array([*scene.centre_m, middle])
+    heights = (
+        frame.height + low - RPC_MARGIN_M,
+        frame.height + top + RPC_MARGIN_M,
+    )
+    # the forward view takes in all that the backward view shows, however high it stands
+    lean = (max(top - middle, middle - low)) * math.tan(math.radians(29)) + 45
+    right_cols = math.ceil(scene.cols * LEFT_GSD_M / RIGHT_GSD_M + 2 * 60 + 0.02 * scene.rows)
+    right_rows = math.ceil(
+        scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
+    )
+    cameras = []
+    for view, gsd, cols, rows in (
+        ("left", LEFT_GSD_M, scene.cols, scene.rows),
+        ("right", RIGHT_GSD_M, right_cols, right_rows),
+    ):
+        cam = aim(frame, target, view, gsd=gsd, cols=cols, rows=rows,
+                  seed=scene.pose_seed, ascending=scene.ascending)  # fmt: skip
+        bias = draw_bias(cols, rows, scene.pose_seed, view)
+        rpc = fit_rpc(cam, frame, cols=cols, rows=rows, heights=heights, bias=bias)
+        if rpc.rms_px > 0.01:
+            raise RuntimeError(f"{scene.name} {view}: RPCs miss the camera by {rpc.rms_px:.3f} px")
+        cameras.append(Camera(view, cam, cols, rows, rpc))
+    return Scene(city, scene, frame, surfaces, *cameras)
+
+
+@njit(cache=True, nogil=True)
+def in_collar(left, col, row, cols, rows):
+    """Whether an image position lies in the strip without data along the frame.
+
+    Wedges along the first rows and last columns of the left image, along the last rows and first
+    columns of the right one.
+    """
+    if left:
+        return row < 3 + 14 * col / cols or col > cols - 4 - 9 * row / rows
+    return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
+
+
+@njit(cache=True, nogil=True)
+def _shade_rows(s, cam, first_row, out):
+    """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
+
+    ``first_row`` is the image row of out's row 0; out's column 0 is image column −2.
+    """
+    line = np.empty(12)
+    guess = 0.0
+    for r in range(out.shape[0]):
+        pose(cam, first_row - 0.25 + 0.5 * r, line)
+        for c in range(out.shape[1]):
+            dx, dy, dz = direction(cam, line, -2.25 + 0.5 * c)
+            bx, by = dx / dz, dy / dz
+            ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
+            z, kind, index, face, ground = cast(s, ax, ay, bx, by, IN_IMAGES, True, guess)
+            guess = ground
+            if kind == 0:
+                out[r, c] = 0.1
+            else:
+                out[r, c] = reflectance(s, ax + bx * z, ay + by * z, z, kind, index, face)
+
+
+def _decimate(half: np.ndarray) -> np.ndarray:
+    """Pixels [r, c] from the half-pixel raster [2 (r + 4), 2 (c + 4)]: a Gaussian point spread."""
+    offsets = np.arange(-2.75, 3.0, 0.5)[2:-2]  # ±0.25, 0.75, 1.25, 1.75
+    weights = np.exp(-0.5 * (offsets / PSF_SIGMA_PX) ** 2).astype(np.float32)
+    weights /= weights.sum()
+    n = len(weights)
+    start = 4 - (n // 2 - 1)
+    size = half.shape[1] // 2 - 4
+    across = sum(w * half[:, start + k : start + k + 2 * size : 2] for k, w in enumerate(weights))
+    size = half.shape[0] // 2 - 4
+    return sum(w * across[start + k : start + k + 2 * size : 2] for k, w in enumerate(weights))
+
+
+def _rpc_metadata(rpc: FittedRPC) -> RPCMetadata:
+    line_off, samp_off, lat_off, lon_off, h_off, line_s, samp_s, lat_s, lon_s, h_s = map(
+        float, rpc.numbers
+    )
+    line_num, line_den, samp_num, samp_den = (c.tolist() for c in rpc.coefficients)
+    return RPCMetadata(
+        height_off=h_off, height_scale=h_s, lat_off=lat_off, lat_scale=lat_s,
+        line_den_coeff=line_den, line_num_coeff=line_num, line_off=line_off, line_scale=line_s,
+        long_off=lon_off, long_scale=lon_s, samp_den_coeff=samp_den, samp_num_coeff=samp_num,
+        samp_off=samp_off, samp_scale=samp_s, err_bias=12.0, err_rand=0.5,
+    )  # fmt: skip
+
+
+def simulate_image(
+    city: CitySpec, scene: SceneSpec, view: str, out_tif: str | Path, *, seed: int
+) -> dict[str, float]:
+    """Render the ``"left"`` (backward) or ``"right"`` (forward) image of a scene.
+
+    Writes uint16 [rows, cols] of 11 bits with nodata 0 and the RPCs as TIFF metadata. ``seed``
+    draws the sensor noise only. Returns the image size and how well the RPCs follow the camera
+    (their bias apart). Raises InputError for another view.
+    """
+    if view not in ("left", "right"):
+        raise InputError(f"no view {view!r}", remedy="ask for left or right")
+    ready = prepare(city, scene)
+    camera: Camera = getattr(ready, view)
+    log.info(
+        "%s %s: %d x %d px; RPCs follow the camera within %.1e px rms (bias apart)",
+        scene.name, view, camera.cols, camera.rows, camera.rpc.rms_px,
+    )  # fmt: skip
+    out_tif = Path(out_tif)
+    out_tif.parent.mkdir(parents=True, exist_ok=True)
+    scratch = out_tif.with_name(f".{out_tif.stem}.partial.tif")
+    dark, gain = RADIOMETRY[view]
+    cols, rows = camera.cols, camera.rows
+    profile = dict(
+        driver="GTiff", width=cols, height=rows, count=1, dtype="uint16", nodata=0, tiled=True,
+        blockxsize=256, blockysize=256, compress="deflate", predictor=2, zlevel=1,
+        rpcs=_rpc_metadata(camera.rpc),
+    )  # fmt: skip
+    col_index = np.arange(cols, dtype=np.float64)[None, :]
+    strips = range(0, rows, STRIP_ROWS)
+    try:
+        image = np.zeros((rows, cols), np.uint16)
+        for first in progress(strips, len(strips), f"{scene.name} {view}"):
+            count = min(STRIP_ROWS, rows - first)
+            half = np.empty((2 * (count + 4), 2 * (cols + 4)), np.float32)
+            _shade_rows(ready.surfaces, camera.cam, first - 2.0, half)
+            signal = dark + gain * _decimate(half)
+            rng = np.random.default_rng([seed, view == "left", first])
+            noise = rng.standard_normal(signal.shape, dtype=np.float32)
+            # read-out noise and shot noise: 3 DN at 100, 5 DN at 600
+            signal += noise * np.sqrt(4.0 + 0.035 * signal)
+            values = np.clip(np.rint(signal), 1, FULL_SCALE).astype(np.uint16)
+            row = np.arange(first, first + count, dtype=np.float64)[:, None]
+            values[_collar(view, col_index, row, cols, rows)] = 0
+            image[first : first + count] = values
+        with rasterio.open(scratch, "w", **profile) as target:
+            target.write(image, 1)
+            target.set_band_description(1, "panchromatic, 11 bits")
+        os.replace(scratch, out_tif)
+    finally:
+        scratch.unlink(missing_ok=True)
+    return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
+
+
+def _collar(view: str, col: np.ndarray, row: np.ndarray, cols: int, rows: int) -> np.ndarray:
+    """Vectorised :func:`in_collar`."""
+    if view == "left":
+        return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
+    return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)

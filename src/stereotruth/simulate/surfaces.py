@@ -1,0 +1,285 @@
+"""Exact ray casting on the surfaces of a synthetic city.
+
+Ground is a bicubic B-spline of z over (x, y), cut by a level water plane. Buildings are rotated
+rectangles with vertical walls and a flat or gabled roof, closed below; trees are ellipsoids. Rays
+are lines x = ax + bx z, y = ay + by z, given by (ax, ay, bx, by), and all of them come from above
+everything: the surface that is hit is the one of greatest z. The cell lists only say which objects
+a ray may meet; the intersections are those of the surfaces themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
+IN_IMAGES, IN_LIDAR = 1, 2
+CELL_M = 8.0
+REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+
+
+class Surfaces(NamedTuple):
+    """All that the kernels know of a city.
+
+    ``x0``, ``y0``: lower corner of terrain and cells (m). ``terrain`` float64[ny, nx]: spline
+    coefficients, ``step`` m apart. ``boxes`` float64[n, 8]: centre x, y, long axis ux, uy, half
+    length, half width, z of the eaves, rise of the ridge. ``box_view`` uint8[n]: IN_IMAGES |
+    IN_LIDAR. ``box_style`` float64[n, 4]: albedo of roof, of walls, kind of roof cover, phase.
+    ``trees`` float64[n, 5]: x, y, z of the centre, radius, half height. ``*_first``/``*_list``:
+    objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object in the cell, and
+    ``reach_top`` the same over all cells that a ray may pass. ``zones``: see ``world``.
+    """
+
+    x0: float
+    y0: float
+    step: float
+    terrain: np.ndarray
+    water: float
+    boxes: np.ndarray
+    box_view: np.ndarray
+    box_style: np.ndarray
+    trees: np.ndarray
+    box_first: np.ndarray
+    box_list: np.ndarray
+    tree_first: np.ndarray
+    tree_list: np.ndarray
+    cell_top: np.ndarray
+    reach_top: np.ndarray
+    zones: np.ndarray
+    zone_cells: np.ndarray
+    fine: np.ndarray
+    broad: np.ndarray
+    sun: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def terrain_at(s, x, y):
+    """Terrain z and its derivatives along x and y."""
+    coefficients = s.terrain
+    u = (x - s.x0) / s.step
+    v = (y - s.y0) / s.step
+    i = min(max(int(math.floor(u)), 1), coefficients.shape[1] - 3)
+    j = min(max(int(math.floor(v)), 1), coefficients.shape[0] - 3)
+    f, g = u - i, v - j
+    f1, g1 = 1 - f, 1 - g
+    a0, a1 = f1 * f1 * f1 / 6, (4 - 6 * f * f + 3 * f * f * f) / 6
+    a2, a3 = (4 - 6 * f1 * f1 + 3 * f1 * f1 * f1) / 6, f * f * f / 6
+    d0, d1 = -f1 * f1 / 2, (-12 * f + 9 * f * f) / 6
+    d2, d3 = (12 * f1 - 9 * f1 * f1) / 6, f * f / 2
+    b0, b1 = g1 * g1 * g1 / 6, (4 - 6 * g * g + 3 * g * g * g) / 6
+    b2, b3 = (4 - 6 * g1 * g1 + 3 * g1 * g1 * g1) / 6, g * g * g / 6
+    e0, e1 = -g1 * g1 / 2, (-12 * g + 9 * g * g) / 6
+    e2, e3 = (12 * g1 - 9 * g1 * g1) / 6, g * g / 2
+    z = zx = zy = 0.0
+    for k in range(4):
+        if k == 0:
+            b, e = b0, e0
+        elif k == 1:
+            b, e = b1, e1
+        elif k == 2:
+            b, e = b2, e2
+        else:
+            b, e = b3, e3
+        row = coefficients[j - 1 + k]
+        c0, c1, c2, c3 = row[i - 1], row[i], row[i + 1], row[i + 2]
+        along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
+        z += b * along
+        zx += b * (d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3)
+        zy += e * along
+    return z, zx / s.step, zy / s.step
+
+
+@njit(cache=True, nogil=True)
+def ground_hit(s, ax, ay, bx, by, guess):
+    """z of the terrain, or water, under a ray.
+
+    One solution: no slope reaches the steepness of a ray, so Newton's method has one root to find.
+    """
+    z = guess
+    for _ in range(25):
+        t, zx, zy = terrain_at(s, ax + bx * z, ay + by * z)
+        step = (t - z) / (1 - zx * bx - zy * by)
+        z += step
+        if abs(step) < 1e-6:
+            break
+    return z
+
+
+@njit(cache=True, nogil=True)
+def box_span(box, ax, ay, bx, by):
+    """(lowest, highest, face) z of a ray inside a building; empty if lowest > highest.
+
+    Faces: 0 and 1 the roof (its two sides), 2 to 5 the walls at +u, −u, +v, −v.
+    """
+    ux, uy, a, b = box[2], box[3], box[4], box[5]
+    x, y = ax - box[0], ay - box[1]
+    u0, ub = x * ux + y * uy, bx * ux + by * uy
+    v0, vb = y * ux - x * uy, by * ux - bx * uy
+    low, high, face = -1e30, 1e30, 0
+    if ub > 1e-12 or ub < -1e-12:
+        z1, z2 = (-a - u0) / ub, (a - u0) / ub
+        if z1 < z2:
+            low, high, face = z1, z2, 2
+        else:
+            low, high, face = z2, z1, 3
+    elif abs(u0) > a:
+        return 1.0, 0.0, 0
+    if vb > 1e-12 or vb < -1e-12:
+        z1, z2 = (-b - v0) / vb, (b - v0) / vb
+        f = 4
+        if z1 > z2:
+            z1, z2, f = z2, z1, 5
+        if z1 > low:
+            low = z1
+        if z2 < high:
+            high, face = z2, f
+    elif abs(v0) > b:
+        return 1.0, 0.0, 0
+    if box[7] == 0.0:
+        if box[6] < high:
+            high, face = box[6], 0
+    else:  # two roof planes that meet in the ridge over v = 0
+        k = box[7] / b
+        z1 = (box[6] + box[7] - k * v0) / (1 + k * vb)
+        z2 = (box[6] + box[7] + k * v0) / (1 - k * vb)
+        if z1 < high:
+            high, face = z1, 0
+        if z2 < high:
+            high, face = z2, 1
+    return low, high, face
+
+
+@njit(cache=True, nogil=True)
+def tree_top(tree, ax, ay, bx, by):
+    """Highest z of a ray inside a crown, or −1e30."""
+    r2 = tree[3] * tree[3]
+    q = r2 / (tree[4] * tree[4])
+    x, y = ax + bx * tree[2] - tree[0], ay + by * tree[2] - tree[1]
+    a = bx * bx + by * by + q
+    b = x * bx + y * by
+    c = x * x + y * y - r2
+    root = b * b - a * c
+    if root <= 0:
+        return -1e30
+    return tree[2] + (-b + math.sqrt(root)) / a
+
+
+@njit(cache=True, nogil=True)
+def cast(s, ax, ay, bx, by, view, trees, guess):
+    """First surface on a ray from above: (z, kind, object, face, z of the ground below).
+
+    ``view``: objects seen, IN_IMAGES or IN_LIDAR. ``trees``: whether crowns stop the ray.
+    ``guess``: z near which the ground is sought.
+    """
+    ground = ground_hit(s, ax, ay, bx, by, guess)
+    best, kind, index, face = ground, GROUND, -1, 0
+    if best < s.water:
+        best, kind = s.water, WATER
+    x, y = ax + bx * best, ay + by * best
+    ny, nx = s.cell_top.shape
+    i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
+    if i < 0 or j < 0 or i >= nx or j >= ny:
+        return best, NONE, index, face, ground
+    top = s.reach_top[j, i]
+    z = best
+    # cells upward along the ray; the next border is crossed at next_x or next_y
+    step_x = 1 if bx > 0 else -1
+    step_y = 1 if by > 0 else -1
+    per_x = CELL_M / abs(bx) if abs(bx) > 1e-9 else 1e30
+    per_y = CELL_M / abs(by) if abs(by) > 1e-9 else 1e30
+    next_x = next_y = 1e30
+    if per_x < 1e29:
+        next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
+    if per_y < 1e29:
+        next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
+    while z < top:
+        if s.cell_top[j, i] > z:
+            cell = j * nx + i
+            for n in range(s.box_first[cell], s.box_first[cell + 1]):
+                k = s.box_list[n]
+                if s.box_view[k] & view and s.boxes[k, 6] + s.boxes[k, 7] > best:
+                    low, high, f = box_span(s.boxes[k], ax, ay, bx, by)
+                    if high >= low and high > best:
+                        best, index, face = high, k, f
+                        kind = ROOF if f < 2 else WALL
+            if trees:
+                for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
+                    k = s.tree_list[n]
+                    if s.trees[k, 2] + s.trees[k, 4] > best:
+                        high = tree_top(s.trees[k], ax, ay, bx, by)
+                        if high > best:
+                            best, kind, index, face = high, TREE, k, 0
+        if next_x < next_y:
+            z = next_x
+            next_x += per_x
+            i += step_x
+        else:
+            z = next_y
+            next_y += per_y
+            j += step_y
+        if i < 0 or j < 0 or i >= nx or j >= ny:
+            break
+    return best, kind, index, face, ground
+
+
+@njit(cache=True, nogil=True)
+def in_shadow(s, x, y, z):
+    """Whether a building or tree stands between a surface point and the sun."""
+    bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
+    ax, ay = x - bx * z, y - by * z
+    ny, nx = s.cell_top.shape
+    i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
+    if i < 0 or j < 0 or i >= nx or j >= ny:
+        return False
+    top = s.reach_top[j, i]
+    clear = z + 0.02
+    step_x = 1 if bx > 0 else -1
+    step_y = 1 if by > 0 else -1
+    per_x = CELL_M / max(abs(bx), 1e-9)
+    per_y = CELL_M / max(abs(by), 1e-9)
+    next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
+    next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
+    while z < top:
+        if s.cell_top[j, i] > z:
+            cell = j * nx + i
+            for n in range(s.box_first[cell], s.box_first[cell + 1]):
+                k = s.box_list[n]
+                if s.box_view[k] & IN_IMAGES and s.boxes[k, 6] + s.boxes[k, 7] > clear:
+                    low, high, _ = box_span(s.boxes[k], ax, ay, bx, by)
+                    if high >= low and high > clear:
+                        return True
+            for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
+                k = s.tree_list[n]
+                if (
+                    s.trees[k, 2] + s.trees[k, 4] > clear
+                    and tree_top(s.trees[k], ax, ay, bx, by) > clear + 0.1
+                ):
+                    return True
+        if next_x < next_y:
+            z = next_x
+            next_x += per_x
+            i += step_x
+        else:
+            z = next_y
+            next_y += per_y
+            j += step_y
+        if i < 0 or j < 0 or i >= nx or j >= ny:
+            break
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _heights(s, xy, out):
+    for n in range(xy.shape[0]):
+        out[n, 0], out[n, 1], out[n, 2] = terrain_at(s, xy[n, 0], xy[n, 1])
+
+
+def terrain_heights(s: Surfaces, xy: np.ndarray) -> np.ndarray:
+    """Terrain z (m) and its derivatives along x and y, [n, 3], at plan positions [n, 2]."""
+    xy = np.ascontiguousarray(xy, dtype=np.float64)
+    out = np.empty((len(xy), 3))
+    _heights(s, xy, out)
+    return out
