@@ -114,7 +114,7 @@ def coverage_figure(
     shape, px of the epipolar grid per px of the picture). ``tiles``: (scene, row0, col0, size in
     px of the epipolar grid, split, complete).
     """
-    figure = Figure(figsize=(7.0 * len(scenes), 7.4))
+    figure = Figure(figsize=(7.0 * len(scenes), 7.4), layout="constrained")
     axes = figure.subplots(1, len(scenes), squeeze=False)[0]
     for axis, (scene, grey, labelled, scale) in zip(axes, scenes):
         picture = np.repeat(grey[..., None], 3, axis=2)
@@ -124,11 +124,12 @@ def coverage_figure(
         axis.imshow(picture, extent=(-0.5, cols * scale - 0.5, rows * scale - 0.5, -0.5))
         for where, row0, col0, size, split, complete in tiles:
             if where == scene:
+                inset = size / 80  # neighbours do not hide each other's colour
                 axis.add_patch(
                     Rectangle(
-                        (col0 - 0.5, row0 - 0.5),
-                        size,
-                        size,
+                        (col0 - 0.5 + inset, row0 - 0.5 + inset),
+                        size - 2 * inset,
+                        size - 2 * inset,
                         fill=False,
                         linewidth=1.8 if complete else 1.0,
                         linestyle="-" if complete else "--",
@@ -140,7 +141,7 @@ def coverage_figure(
     legend = [Patch(fill=False, edgecolor=colour, label=s) for s, colour in SPLIT_COLOURS.items()]
     legend.append(Patch(fill=False, edgecolor="0.75", linestyle="--", label="incomplete pair"))
     legend.append(Patch(color=(0.45, 0.62, 1.0), label="labelled"))
-    figure.legend(handles=legend, loc="lower center", ncols=len(legend), frameon=False)
+    figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
     figure.suptitle(title)
     save_figure(path, figure)
 
@@ -169,6 +170,8 @@ def contact_sheet(
         trio[2].set_title("disparity", fontsize=8)
     mappable = ScalarMappable(cmap="turbo")
     mappable.set_clim(*limits)
-    figure.colorbar(mappable, ax=axes, shrink=0.6, label="disparity, px (offset removed)")
+    figure.colorbar(
+        mappable, ax=axes, fraction=0.02, aspect=50, label="disparity, px (offset removed)"
+    )
     figure.suptitle(title)
     save_figure(path, figure)

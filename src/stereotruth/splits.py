@@ -119,7 +119,10 @@ def overlaps(places: Sequence[Place]) -> list[tuple[int, int]]:
 
 
 def _sweep(places: Sequence[Place]) -> NDArray[np.intp]:
-    """Tiles in row-major order of the first scene's grid, as it lies on the ground."""
+    """Tiles row by row of the first scene's grid, as it lies on the ground, to and fro.
+
+    Every other row goes backwards, so that a run that ends within a row stays in one piece.
+    """
     rings = _metric(places)
     first = [ring for ring, place in zip(rings, places) if place.scene == places[0].scene]
     along = np.mean([ring[len(ring) // 4] - ring[0] for ring in first], axis=0)
@@ -132,7 +135,9 @@ def _sweep(places: Sequence[Place]) -> NDArray[np.intp]:
     centre -= centre[0]
     # Rows of a grid lie on the ground with small bends: an eighth of a tile bears them.
     line = np.rint(8.0 * (centre @ across) / side)
-    return np.lexsort((centre @ along, line))
+    rank = np.unique(line, return_inverse=True)[1]
+    forth = np.where(rank % 2, -1.0, 1.0)
+    return np.lexsort((forth * (centre @ along), line))
 
 
 def _cover(pairs: Sequence[tuple[int, int]], run: Sequence[int] | None = None) -> set[int]:

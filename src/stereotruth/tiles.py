@@ -47,7 +47,7 @@ log = logging.getLogger("stereotruth")
 
 MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image border
 OVERVIEW_PX = 1400  # longer side of the pictures in the coverage figure
-CONTACT_TILES = 24  # most tiles on the contact sheet
+CONTACT_TILES = 16  # most tiles on the contact sheet
 FILES = ("left", "right", "disp", "status", "orientation")
 NONE_KIND, IMAGES, LABELLED = 0, 1, 2
 REASONS = (
@@ -684,7 +684,7 @@ def _draw_contact_sheet(
                 with rasterio.open(folder / row[kind]) as dataset:
                     arrays[kind] = dataset.read(1)
             step = max(1, row["size"] // 256)
-            disparity = arrays["disp"][::step, ::step]
+            disparity = arrays["disp"][::step, ::step].astype(np.float32)
             disparity = np.where(disparity == nodata, np.nan, disparity)
             grey = [figures.shrink(figures.stretch(arrays[k]), 256) for k in ("left", "right")]
             tiles.append((row["tile"], *grey, disparity))
