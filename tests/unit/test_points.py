@@ -1,0 +1,497 @@
+"""Ingest of LiDAR files into point stores, and queries on these."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+import zarr
+
+from stereotruth import points
+from stereotruth.errors import InputError
+from stereotruth.points import Points, PointStore, coverage, ingest, query_points, summary
+
+SHARED = Path(__file__).parents[3] / "shared"
+UTM = pyproj.CRS("EPSG:32650").to_3d()
+WEST, SOUTH = 500_000.0, 3_300_000.0
+
+
+def write_las(
+    path: Path,
+    n: int = 3000,
+    *,
+    pdrf: int = 6,
+    version: str = "1.4",
+    system: pyproj.CRS | None = UTM,
+    side: float = 700.0,
+    scale: float = 0.001,
+    seed: int = 0,
+    xyz: np.ndarray | None = None,
+    **fields: np.ndarray,
+) -> np.ndarray:
+    """Random points on a square; returns their coordinates as stored, float64[n, 3]."""
+    rng = np.random.default_rng(seed)
+    if xyz is None:
+        xyz = np.column_stack(
+            [WEST + rng.uniform(0, side, n), SOUTH + rng.uniform(0, side, n), rng.normal(50, 9, n)]
+        )
+    header = laspy.LasHeader(point_format=pdrf, version=version)
+    header.scales = [scale] * 3
+    header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else [0, 0, 0]
+    if system is not None:
+        header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", system.to_wkt().encode() + b"\0"))
+        header.global_encoding.wkt = pdrf >= 6
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    values = {
+        "classification": np.full(len(xyz), 2, np.uint8),
+        "return_number": rng.integers(1, 4, len(xyz)),
+        "number_of_returns": np.full(len(xyz), 3),
+        **fields,
+    }
+    for name, value in values.items():
+        setattr(las, name, value)
+    las.write(path)
+    return np.column_stack([las.x, las.y, las.z])
+
+
+def tree_digest(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(f"{file.relative_to(folder)}\0".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def everything(store: PointStore) -> Points:
+    return store.query(*store.bounds[:4])
+
+
+def by_position(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Sorted lattice coordinates, int64[n, 3]."""
+    q = np.column_stack([np.rint(lon * 1e9), np.rint(lat * 1e9), np.rint(height * 1e4)])
+    return q[np.lexsort(q.T)].astype(np.int64)
+
+
+# ------------------------------------------------------------------ what comes in comes out
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize(
+    ("version", "pdrf"), [("1.2", 0), ("1.1", 1), ("1.2", 3), ("1.3", 5), ("1.4", 6), ("1.4", 10)]
+)
+def test_points_keep_their_place_and_attributes(tmp_path, version, pdrf, suffix) -> None:
+    """Against pyproj on the coordinates that laspy reads back: within one lattice step."""
+    file = tmp_path / f"a.{suffix}"
+    classes = np.random.default_rng(1).integers(0, 7, 3000)
+    xyz = write_las(file, pdrf=pdrf, version=version, classification=classes)
+    result = ingest(file, tmp_path / "a.zarr", lidar_crs="EPSG:32650")
+    assert result["points"]["header"] == result["points"]["read"] == 3000
+    assert result["points"]["kept"] == 3000
+    got = everything(PointStore(tmp_path / "a.zarr"))
+    truth = pyproj.Transformer.from_crs("EPSG:32650", "EPSG:4326", always_xy=True)
+    lon, lat = truth.transform(xyz[:, 0], xyz[:, 1])
+    expected = by_position(lon, lat, xyz[:, 2])
+    np.testing.assert_allclose(by_position(got.lon, got.lat, got.height), expected, atol=1)
+    order = np.argsort(lon)
+    assert np.array_equal(got.classification[np.argsort(got.lon_q)], classes[order])
+    with laspy.open(file) as reader:
+        las = reader.read()
+    for name in ("return_number", "number_of_returns"):
+        value = getattr(got, name)[np.argsort(got.lon_q)]
+        assert np.array_equal(value, np.asarray(getattr(las, name))[order])
+
+
+def test_coordinates_and_lattice_are_consistent(tmp_path) -> None:
+    write_las(tmp_path / "a.laz")
+    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
+    store = PointStore(tmp_path / "a.zarr")
+    got = everything(store)
+    assert np.array_equal(got.lon, got.lon_q / 1e9)
+    assert np.array_equal(got.height, got.h_q / 1e4)
+    limits = [f(values) for f in (np.min, np.max) for values in (got.lon, got.lat, got.height)]
+    assert store.bounds == tuple(limits[k] for k in (0, 1, 3, 4, 2, 5))
+    assert len(got) == store.count == 3000
+    assert store.attrs["source"] == "a.laz"
+
+
+def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(points, "SHARD_POINTS", 4096)
+    monkeypatch.setattr(points, "CHUNK_POINTS", 1024)
+    write_las(tmp_path / "a.laz", 20_000)
+    digests = set()
+    for k, (chunk, workers) in enumerate([(20_000, 1), (333, 1), (7000, 2), (1_000_000, 1)]):
+        store = tmp_path / f"{k}.zarr"
+        ingest(tmp_path / "a.laz", store, chunk_points=chunk, workers=workers)
+        digests.add(tree_digest(store))
+        assert not list(store.rglob("*scratch*"))
+    assert len(digests) == 1
+    assert PointStore(tmp_path / "0.zarr").count == 20_000
+
+
+def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
+    xyz = np.random.default_rng(0).uniform(0, 700, (5000, 3)) + np.array([WEST, SOUTH, 0])
+    xyz[:, 2] = np.arange(5000) * 0.1  # the height tells the place in the file
+    write_las(tmp_path / "a.laz", xyz=xyz)
+    ingest(tmp_path / "a.laz", tmp_path / "a.zarr", chunk_points=700)
+    got = everything(PointStore(tmp_path / "a.zarr"))
+    cell = np.column_stack([got.lat_q >> points.CELL_BITS, got.lon_q >> points.CELL_BITS])
+    changes = np.flatnonzero((np.diff(cell, axis=0) != 0).any(axis=1)) + 1
+    visited = cell[np.r_[0, changes]]
+    assert len(np.unique(visited, axis=0)) == len(visited) > 20  # each cell is one range
+    assert np.array_equal(np.lexsort(visited.T[::-1]), np.arange(len(visited)))  # row-major
+    for part in np.split(got.h_q, changes):
+        assert (np.diff(part) > 0).all()
+
+
+# ------------------------------------------------------------------ queries
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> PointStore:
+    folder = tmp_path_factory.mktemp("points")
+    write_las(folder / "a.laz", 30_000)
+    ingest(folder / "a.laz", folder / "a.zarr")
+    return PointStore(folder / "a.zarr")
+
+
+def test_query_is_exact_inclusive_and_in_stored_order(store) -> None:
+    got = everything(store)
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        corners = rng.integers(0, len(got), 2)  # boxes whose edges pass through points
+        lon_min, lon_max = np.sort(got.lon[corners])
+        lat_min, lat_max = np.sort(got.lat[corners])
+        inside = (got.lon >= lon_min) & (got.lon <= lon_max)
+        inside &= (got.lat >= lat_min) & (got.lat <= lat_max)
+        part = store.query(lon_min, lat_min, lon_max, lat_max)
+        for name in ("lon_q", "lat_q", "h_q", "classification", "return_number"):
+            assert np.array_equal(getattr(part, name), getattr(got, name)[inside])
+        lowest, highest = store.height_range(lon_min, lat_min, lon_max, lat_max)
+        assert lowest <= part.height.min() <= part.height.max() <= highest
+
+
+def test_edges_between_lattice_points(store) -> None:
+    lon, lat = (value[123] for value in (everything(store).lon, everything(store).lat))
+    assert len(store.query(lon, lat, lon, lat)) == 1
+    assert len(store.query(np.nextafter(lon, 180), lat, lon + 4e-10, lat)) == 0
+    assert len(store.query(-np.inf, -np.inf, np.inf, np.inf)) == store.count
+
+
+def test_empty_queries(store) -> None:
+    lon_min, lat_min, lon_max, lat_max = store.bounds[:4]
+    for box in [
+        (lon_max + 1, lat_min, lon_max + 2, lat_max),
+        (lon_min, lat_max + 1e-8, lon_max, lat_max + 1),
+        (lon_max, lat_max, lon_min, lat_min),
+    ]:
+        got = store.query(*box)
+        assert len(got) == len(got.lon) == 0
+        assert got.h_q.dtype == np.int64
+    assert store.height_range(10, 10, 11, 11) is None
+    assert len(query_points([], 0, 0, 1, 1)) == 0
+
+
+def test_two_stores_hold_what_one_does(tmp_path) -> None:
+    """Split a file in two: the same points, and the same exact sums in either order."""
+    xyz = write_las(tmp_path / "all.laz", 4000)
+    write_las(tmp_path / "a.laz", xyz=xyz[:1500])
+    write_las(tmp_path / "b.laz", xyz=xyz[1500:])
+    for name in ("all", "a", "b"):
+        ingest(tmp_path / f"{name}.laz", tmp_path / f"{name}.zarr")
+    whole = PointStore(tmp_path / "all.zarr")
+    lon_min, lat_min, lon_max, lat_max = whole.bounds[:4]
+    box = (lon_min, lat_min, (lon_min + lon_max) / 2, (lat_min + lat_max) / 2)
+    expected = whole.query(*box)
+    for names in ("ab", "ba"):
+        got = query_points([tmp_path / f"{name}.zarr" for name in names], *box)
+        assert len(got) == len(expected) > 500
+        for name in ("lon_q", "lat_q", "h_q"):
+            assert np.array_equal(np.sort(getattr(got, name)), np.sort(getattr(expected, name)))
+    parts = [PointStore(tmp_path / f"{name}.zarr") for name in "ab"]
+    assert summary(parts)["points"]["kept"] == 4000
+    assert summary(parts)["bounds"] == list(whole.bounds)
+    assert np.array_equal(coverage(parts), coverage([whole]))
+    assert summary(parts)["covered_km2"] == pytest.approx(0.49, abs=0.2)  # whole cells
+    boxes = coverage([whole])
+    inside = (expected.lon[:, None] >= boxes[:, 0]) & (expected.lon[:, None] < boxes[:, 2])
+    inside &= (expected.lat[:, None] >= boxes[:, 1]) & (expected.lat[:, None] < boxes[:, 3])
+    assert (inside.sum(axis=1) == 1).all()
+
+
+def test_southern_and_western_hemisphere(tmp_path) -> None:
+    xyz = np.random.default_rng(0).uniform(0, 300, (500, 3))
+    xyz += [320_000, 6_250_000, 0]
+    xyz = write_las(tmp_path / "a.laz", xyz=xyz, system=pyproj.CRS("EPSG:32719").to_3d())
+    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
+    got = everything(PointStore(tmp_path / "a.zarr"))
+    lon, lat = pyproj.Transformer.from_crs(32719, 4326, always_xy=True).transform(*xyz.T[:2])
+    assert lon.max() < -70
+    assert lat.max() < -33
+    expected = by_position(lon, lat, xyz[:, 2])
+    np.testing.assert_allclose(by_position(got.lon, got.lat, got.height), expected, atol=1)
+
+
+# ------------------------------------------------------------------ dropped points
+
+
+@pytest.mark.parametrize("pdrf", [1, 6])
+def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> None:
+    classes = np.full(1000, 2, np.uint8)
+    classes[:30], classes[30:50], classes[50:60] = 7, 18, 12
+    withheld = np.zeros(1000, np.uint8)
+    withheld[25:35], withheld[900:] = 1, 1
+    synthetic = np.ones(1000, np.uint8)
+    write_las(
+        tmp_path / "a.laz",
+        1000,
+        pdrf=pdrf,
+        version="1.2" if pdrf < 6 else "1.4",
+        classification=classes,
+        withheld=withheld,
+        synthetic=synthetic,
+    )
+    result = ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
+    assert result["points"] == {
+        "header": 1000,
+        "read": 1000,
+        "kept": 850,
+        "dropped": {"withheld": 110, "class 7": 25, "class 18": 15},
+    }
+    assert result["classes"] == {"2": 840, "12": 10}
+    kept = ingest(tmp_path / "a.laz", tmp_path / "b.zarr", drop_classes=())
+    assert kept["points"]["kept"] == 890
+
+
+def test_producers_own_classes_are_kept_unless_listed(tmp_path) -> None:
+    classes = np.where(np.arange(1000) < 40, 65, 2).astype(np.uint8)
+    write_las(tmp_path / "a.laz", 1000, classification=classes)
+    assert ingest(tmp_path / "a.laz", tmp_path / "a.zarr")["classes"] == {"2": 960, "65": 40}
+    dropped = ingest(tmp_path / "a.laz", tmp_path / "a.zarr", drop_classes=(7, 18, 65))
+    assert dropped["points"]["dropped"]["class 65"] == 40
+
+
+# ------------------------------------------------------------------ refused by name
+
+
+def refused(file: Path, match: str, **arguments) -> str:
+    """Ingest must fail with a message that names the file, and leave nothing behind."""
+    store = file.with_name("refused.zarr")
+    with pytest.raises(InputError, match=match) as error:
+        ingest(file, store, **arguments)
+    assert file.name in str(error.value)
+    assert "Remedy: " in str(error.value)
+    assert not list(file.parent.glob("refused.zarr*"))
+    return str(error.value)
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+def test_truncated_las_names_both_counts(tmp_path, version) -> None:
+    file = tmp_path / "a.las"
+    write_las(file, 1000, pdrf=1 if version == "1.2" else 6, version=version)
+    with laspy.open(file) as reader:
+        size = reader.header.point_format.size
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) - 10 * size - 3])
+    refused(file, "announces 1000 points, the file holds 989")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 0.999])
+def test_truncated_laz_names_both_counts(tmp_path, share) -> None:
+    file = tmp_path / "a.laz"
+    write_las(file, 60_000)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * share)])
+    refused(file, "announces 60000 points, 0 can be read")
+
+
+@pytest.mark.parametrize("count", [70_000, 150_000])
+def test_laz_whose_header_and_chunk_table_disagree(tmp_path, count) -> None:
+    file = tmp_path / "a.laz"
+    write_las(file, 120_000, pdrf=1, version="1.2")  # chunks of 50 000
+    data = bytearray(file.read_bytes())
+    struct.pack_into("<I", data, 107, count)
+    file.write_bytes(data)
+    if count == 150_000:  # within the last chunk, as far as the table goes: decoding finds out
+        refused(file, f"announces {count} points")
+    else:
+        refused(file, f"announces {count} points, its chunks hold 150000")
+
+
+def test_damaged_laz(tmp_path) -> None:
+    file = tmp_path / "a.laz"
+    write_las(file, 100_000)
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 4
+    data[middle : middle + 4000] = np.random.default_rng(0).bytes(4000)
+    file.write_bytes(data)
+    refused(file, "damaged|no place on Earth")
+
+
+@pytest.mark.parametrize("content", [b"", b"LASF", b"not a LAS file" * 100])
+def test_no_las_file(tmp_path, content) -> None:
+    (tmp_path / "a.las").write_bytes(content)
+    refused(tmp_path / "a.las", "no readable LAS")
+
+
+def test_missing_and_empty_files(tmp_path) -> None:
+    refused(tmp_path / "none.laz", "no such LiDAR file")
+    write_las(tmp_path / "empty.laz", 0)
+    refused(tmp_path / "empty.laz", "announces 0 points")
+    write_las(tmp_path / "unfinished.las", 50, pdrf=1, version="1.2")
+    data = bytearray((tmp_path / "unfinished.las").read_bytes())
+    struct.pack_into("<I", data, 107, 0)
+    (tmp_path / "unfinished.las").write_bytes(data)
+    refused(tmp_path / "unfinished.las", "never completed")
+
+
+def test_nothing_left(tmp_path) -> None:
+    write_las(tmp_path / "a.laz", 100, classification=np.full(100, 7, np.uint8))
+    refused(tmp_path / "a.laz", "no point is left of 100.*100 class 7")
+
+
+def test_no_crs_names_lidar_crs(tmp_path) -> None:
+    xyz = write_las(tmp_path / "a.laz", system=None)
+    refused(tmp_path / "a.laz", "lidar_crs")
+    refused(tmp_path / "a.laz", "outside of the area", lidar_crs="EPSG:2193")
+    ingest(tmp_path / "a.laz", tmp_path / "a.zarr", lidar_crs="EPSG:32650")
+    assert PointStore(tmp_path / "a.zarr").count == len(xyz)
+
+
+def test_places_off_the_earth(tmp_path) -> None:
+    xyz = np.random.default_rng(0).uniform(0, 100, (1000, 3))
+    xyz += [3e8, 3e8, 0]
+    write_las(tmp_path / "a.laz", xyz=xyz, scale=0.01)
+    refused(tmp_path / "a.laz", "1000 points have no place on Earth")
+
+
+def test_coarse_and_quantised_coordinates(tmp_path) -> None:
+    xyz = np.random.default_rng(0).uniform(0, 0.1, (2000, 3))
+    xyz += [114, 30, 0]
+    system = pyproj.CRS("EPSG:4979")
+    write_las(tmp_path / "a.laz", xyz=xyz, system=system, scale=0.01)
+    refused(tmp_path / "a.laz", "steps of 0.01, 1113 m on the ground")
+    write_las(tmp_path / "b.laz", xyz=np.round(xyz, 2), system=system, scale=1e-7)
+    refused(tmp_path / "b.laz", r"2000 points lie on \d+ positions")
+
+
+def test_geoid_that_misses_the_points_names_both_files(tmp_path) -> None:
+    head = struct.pack(">4d2i", 10.0, 10.0, 0.1, 0.1, 11, 11)
+    (tmp_path / "small.gtx").write_bytes(head + np.zeros(121, ">f4").tobytes())
+    write_las(tmp_path / "a.laz", system=pyproj.CRS("EPSG:32650+3855"))
+    refused(tmp_path / "a.laz", "EGM2008 height.*geoid")
+    message = refused(tmp_path / "a.laz", "3000 points", geoid=tmp_path / "small.gtx")
+    assert "small.gtx" in message
+
+
+def test_heights_with_a_geoid_and_survey_feet(tmp_path) -> None:
+    head = struct.pack(">4d2i", 29.0, 116.0, 0.1, 0.1, 21, 21)
+    (tmp_path / "n.gtx").write_bytes(head + np.full(441, -12.5, ">f4").tobytes())
+    system = pyproj.CRS("EPSG:32650+6360")  # NAVD88 in survey feet, for the unit's sake
+    xyz = write_las(tmp_path / "a.laz", system=system)
+    result = ingest(tmp_path / "a.laz", tmp_path / "a.zarr", geoid=tmp_path / "n.gtx")
+    got = everything(PointStore(tmp_path / "a.zarr"))
+    expected = np.sort(xyz[:, 2]) * 1200 / 3937 - 12.5
+    np.testing.assert_allclose(np.sort(got.height), expected, rtol=0, atol=6e-5)
+    assert result["crs"]["geoid"] == "n.gtx"
+
+
+def test_only_finished_point_stores_open(tmp_path) -> None:
+    with pytest.raises(InputError, match="no such"):
+        PointStore(tmp_path / "none.zarr")
+    write_las(tmp_path / "a.laz")
+    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
+    zarr.open_group(tmp_path / "a.zarr").attrs["complete"] = False
+    group = zarr.open_group(tmp_path / "other.zarr", mode="w")
+    group.attrs["complete"] = True
+    with pytest.raises(InputError, match="no point store"):
+        PointStore(tmp_path / "other.zarr")
+
+
+# ------------------------------------------------------------------ real files
+
+REAL = SHARED / "lidar"
+FLAT_N = -22.5  # m, of the geoid grid made for these tests: everywhere the same
+
+# file: arguments and what is to come of them, either the reason of refusal or
+# (points kept, EPSG code or None for the file's WKT, metres per height unit, datum shift allowed)
+REAL_FILES = [
+    ("autzen_trim.laz", {}, (110_000, 2994, 0.3048)),
+    ("autzen-bmx-2010.las", {}, "NAVD88"),
+    ("autzen-bmx-2010.las", {"geoid": True}, (829, 2991, 1200 / 3937)),
+    ("autzen.copc.laz", {}, "NAVD88"),
+    ("autzen.copc.laz", {"geoid": True}, (107, 2992, 1200 / 3937)),
+    ("simple_with_page.copc.laz", {}, "NAVD88"),
+    ("simple_with_page.copc.laz", {"geoid": True}, (1_065, 2991, 1200 / 3937)),
+    ("test_semis_2021_0382_6565_LA93_IGN69_cropped.laz", {}, "IGN69"),
+    ("test_semis_2021_0382_6565_LA93_IGN69_cropped.laz", {"geoid": True}, (218_731, 2154, 1.0)),
+    (
+        "test_semis_2021_0382_6565_LA93_IGN69_cropped.laz",
+        {"geoid": True, "lidar_crs": "EPSG:2154+5720", "drop_classes": (7, 18, 65, 67)},
+        (218_731 - 96, 2154, 1.0),
+    ),
+    ("sample_lareunion_epsg2975.laz", {}, (59_712, 2975, 1.0)),
+    ("test_noepsg_043500_629205_IGN69.laz", {}, "lidar_crs"),
+    ("test_noepsg_043500_629205_IGN69.laz", {"lidar_crs": "EPSG:2154"}, "IGN69"),
+    (
+        "test_noepsg_043500_629205_IGN69.laz",
+        {"lidar_crs": "EPSG:2154+5720", "geoid": True},
+        (17_845, 2154, 1.0),
+    ),
+    ("32-1-472-150-76.laz", {}, "NN2000"),  # GeoTIFF key 4096 = 5941, which laspy passes over
+    ("32-1-472-150-76.laz", {"geoid": True}, (5_628, 25832, 1.0)),
+    ("1.2-with-color-clipped.las", {"lidar_crs": "EPSG:2992"}, "1065 points, the file holds 1064"),
+    ("lonlat_scale0.01deg.laz", {}, "lidar_crs"),
+    ("lonlat_scale0.01deg.laz", {"lidar_crs": "EPSG:4979"}, "steps of 0.01"),
+    ("lonlat_scale0.01deg.laz", {"lidar_crs": "EPSG:32636"}, "look like degrees"),
+]
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="shared real files are absent")
+@pytest.mark.parametrize(("name", "arguments", "expected"), REAL_FILES)
+def test_real_files_are_read_right_or_refused_by_name(tmp_path, name, arguments, expected) -> None:
+    arguments = dict(arguments)
+    if arguments.get("geoid"):
+        head = struct.pack(">4d2i", -90.0, -180.0, 1.0, 1.0, 181, 360)
+        arguments["geoid"] = tmp_path / "flat.gtx"
+        arguments["geoid"].write_bytes(head + np.full(181 * 360, FLAT_N, ">f4").tobytes())
+    if isinstance(expected, str):
+        with pytest.raises(InputError, match=expected) as error:
+            ingest(REAL / name, tmp_path / "a.zarr", **arguments)
+        assert name in str(error.value)
+        assert not (tmp_path / "a.zarr").exists()
+        return
+    kept, epsg, unit = expected
+    result = ingest(REAL / name, tmp_path / "a.zarr", **arguments)
+    assert result["points"]["kept"] == kept
+    with laspy.open(REAL / name) as reader:
+        las = reader.read()
+    assert result["points"]["read"] == result["points"]["header"] == len(las.points)
+    good = ~np.isin(las.classification, arguments.get("drop_classes", (7, 18)))
+    x, y, z = np.array(las.x)[good], np.array(las.y)[good], np.array(las.z)[good]
+    lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y)
+    got = everything(PointStore(tmp_path / "a.zarr"))
+    # The datum shift that PROJ takes may differ with the area of interest: by 2 m at most.
+    for ours, theirs in ((got.lon, lon), (got.lat, lat)):
+        np.testing.assert_allclose(np.sort(ours), np.sort(theirs), rtol=0, atol=2e-5)
+    height = z * unit + (FLAT_N if arguments.get("geoid") else 0)
+    np.testing.assert_allclose(np.sort(got.height), np.sort(height), rtol=0, atol=1.0)
+    spread = np.sort(got.height) - np.sort(height)
+    assert np.ptp(spread) < 5e-3  # the same shift for all: no unit is off
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="shared real files are absent")
+def test_copc_with_hierarchy_page_is_read_whole(tmp_path) -> None:
+    file = REAL / "simple_with_page.copc.laz"
+    head = struct.pack(">4d2i", -90.0, -180.0, 1.0, 1.0, 181, 360)
+    (tmp_path / "n.gtx").write_bytes(head + np.zeros(181 * 360, ">f4").tobytes())
+    with laspy.CopcReader.open(str(file)) as reader:
+        whole = reader.query()
+    result = ingest(file, tmp_path / "a.zarr", geoid=tmp_path / "n.gtx")
+    assert result["points"]["read"] == len(whole) == 1065
+    # Its coordinates are in feet, its system in metres: it lands in Canada, and that is said.
+    assert any("outside of the area" in note for note in result["notes"])
