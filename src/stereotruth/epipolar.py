@@ -732,20 +732,21 @@ def _view_order(left: SensorModel, right: SensorModel, overlap: Floats, height: 
 
 
 def _grow(
-    points: _Points, check: _Points, surface: _Points, rotation: Floats
+    points: _Points, checks: list[_Points], surface: _Points, rotation: Floats
 ) -> tuple[tuple[ImageModel, ImageModel], float]:
-    """The smallest spline that is good enough, else the best; with its rms y-parallax in px."""
+    """The smallest spline that is good enough, else the best; with its rms y-parallax in px.
+
+    That is the worst rms of several sets of points that did not make the fit.
+    """
     best: tuple[ImageModel, ImageModel] | None = None
     best_rms = np.inf
     for n in SIZES:
         models = _fit_images(points, surface, rotation, n)
-        rms = float(np.sqrt(np.mean(_parallax(*models, check) ** 2)))
-        if best is None or rms < best_rms:
-            gain = 1.0 if best is None else 1.0 - rms / best_rms
+        rms = max(float(np.sqrt(np.mean(_parallax(*models, check) ** 2))) for check in checks)
+        gain = 1.0 - rms / best_rms
+        if best is None or gain > 0:
             best, best_rms = models, rms
-            if rms <= GOOD_RMS or gain < 0.1:
-                break
-        else:
+        if best_rms <= GOOD_RMS or gain < 0.1:
             break
     assert best is not None
     return best, best_rms
@@ -872,12 +873,14 @@ def fit_epipolar(
     defect = _box_defect(left, right, box, in_box, 25 * 25 * heights.size)
     if not defect:
         wide = surface + _of_box(left, right, box, at_reference, 25, 0.0)
-        images, rms = _grow(in_box + in_frames, check_box, wide, rotation)
+        images, rms = _grow(in_box + in_frames, [check_box, check_frames], wide, rotation)
         if rms > ACCEPTED_RMS:
-            defect = f"y-parallax of {rms:.3f} px rms over the RPCs' ground box"
+            defect = f"y-parallax of {rms:.3f} px rms where the RPCs are valid"
     if defect:
         log.warning("epipolar model: %s; fitted to the image footprints only", defect)
-        images, rms = _grow(in_frames, check_frames, surface, rotation)
+        images, rms = _grow(in_frames, [check_frames], surface, rotation)
+        if rms > ACCEPTED_RMS:
+            log.warning("epipolar model: %.3f px rms remain even so", rms)
 
     x0, y0, shape, disparities = _grid(*images, sizes, in_frames, names)
     images = images[0].shifted(x0, y0), images[1].shifted(x0, y0)

@@ -37,6 +37,7 @@ LATTICE = 16  # px between exact source coordinates; in between they are bilinea
 LATTICE_ERROR = 0.002  # px, accepted error of that
 RADIUS = 3  # px, of the interpolation kernel
 ANTIALIAS = 1.2  # source px per epipolar px above which the kernel is widened
+CACHE_MB = 256  # of decoded source; 1024 rows of a scene 34 000 px wide take 70
 KERNEL = "cubic convolution, 6 x 6 taps (Keys 1981, fourth order), widened where downsampling"
 
 
@@ -394,7 +395,8 @@ def rectify(
     but nodata.
     """
     with ExitStack() as stack:
-        stack.enter_context(rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"))
+        # GDAL's default, 5 % of the machine's memory, can be more than a job may use
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=CACHE_MB))
         left, right = (stack.enter_context(Source(path)) for path in (left_image, right_image))
         model = fit_epipolar(
             left_sensor,
