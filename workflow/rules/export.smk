@@ -10,6 +10,7 @@ rule export:
         disparity=lambda w: [f"results/project/{w.city}/{s.scene}.zarr" for s in scenes_of(w.city)],
     output:
         tiles=directory("tiles/{city}"),
+        summary="results/export/{city}/summary.json",
         coverage=report(
             "results/export/{city}/coverage.png",
             caption="../report/coverage.rst",

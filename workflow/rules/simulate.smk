@@ -13,7 +13,7 @@ rule simulate_image:
         runtime=30,
     params:
         seed=config["seed"],
-        code=source_digest("simulate.scene"),
+        code=source_digest("simulate.render"),
     message:
         "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
     script:
@@ -38,7 +38,7 @@ rule simulate_lidar:
     params:
         spacing_m=config["simulate"]["lidar_spacing_m"],
         seed=config["seed"],
-        code=source_digest("simulate.scene"),
+        code=source_digest("simulate.lidar"),
     message:
         "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
     script:
@@ -62,7 +62,7 @@ rule simulate_truth:
         runtime=30,
     params:
         seed=config["seed"],
-        code=source_digest("simulate.scene"),
+        code=source_digest("simulate.truth", "simulate.points"),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"
     script:

@@ -1,1 +1,36 @@
 """One city's scenes to its benchmark tiles."""
+
+import json
+from pathlib import Path
+
+from stereotruth.runlog import job
+from stereotruth.tiles import Scene, export_city, summary_lines
+
+if __name__ == "__main__":
+    given, city, tiles = snakemake.input, snakemake.params.city, snakemake.params.tiles
+    with job(snakemake.log[0], f"export {city['city']}") as log:
+        summary = export_city(
+            scenes=list(
+                map(
+                    Scene,
+                    snakemake.params.scenes,
+                    given.disparity,
+                    given.left,
+                    given.right,
+                    given.alignment,
+                )
+            ),
+            out_dir=snakemake.output.tiles,
+            **city,
+            **tiles,
+            seed=snakemake.params.seed,
+            strict=snakemake.params.strict,
+            code=snakemake.params.code,
+            workers=snakemake.threads,
+            coverage=snakemake.output.coverage,
+            contact_sheet=snakemake.output.contact_sheet,
+        )
+        summary["lines"] = summary_lines(summary, snakemake.output.tiles)
+        Path(snakemake.output.summary).write_text(json.dumps(summary, indent=2) + "\n")
+        for line in summary["lines"]:
+            log.info(line)

@@ -1,1 +1,14 @@
 """The tiles that exist against the checksums of their manifests."""
+
+from pathlib import Path
+
+from stereotruth.errors import InputError
+from stereotruth.runlog import job
+from stereotruth.verification import verify
+
+if __name__ == "__main__":
+    with job(snakemake.log[0], "verify"):
+        folders = [folder for folder in snakemake.params.tiles if Path(folder).is_dir()]
+        if not folders:
+            raise InputError("no tiles to verify", remedy="make some: snakemake tiles/<City>")
+        verify(folders)

@@ -1,0 +1,12 @@
+"""One image of a synthetic scene."""
+
+from stereotruth.runlog import job
+from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.render import simulate_image
+
+if __name__ == "__main__":
+    city = CITIES[snakemake.wildcards.city]
+    scene = city.scene(snakemake.wildcards.scene)
+    view = snakemake.wildcards.view
+    with job(snakemake.log[0], f"simulate {scene.name} {view}"):
+        simulate_image(city, scene, view, snakemake.output.image, seed=snakemake.params.seed)

@@ -1,0 +1,19 @@
+"""One LiDAR file of a synthetic scene."""
+
+from stereotruth.runlog import job
+from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.lidar import simulate_lidar_tile
+
+if __name__ == "__main__":
+    city = CITIES[snakemake.wildcards.city]
+    scene = city.scene(snakemake.wildcards.scene)
+    tile = snakemake.wildcards.tile
+    with job(snakemake.log[0], f"simulate {tile}"):
+        simulate_lidar_tile(
+            city,
+            scene,
+            tile,
+            snakemake.output.lidar,
+            spacing_m=snakemake.params.spacing_m,
+            seed=snakemake.params.seed,
+        )

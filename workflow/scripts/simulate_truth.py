@@ -1,0 +1,20 @@
+"""The exact truth of a synthetic scene: per pixel, and as points."""
+
+from stereotruth.runlog import job
+from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.points import simulate_points
+from stereotruth.simulate.truth import simulate_truth
+
+if __name__ == "__main__":
+    city = CITIES[snakemake.wildcards.city]
+    scene = city.scene(snakemake.wildcards.scene)
+    with job(snakemake.log[0], f"simulate {scene.name} truth"):
+        simulate_points(
+            city,
+            scene,
+            None,  # the measured ground control points stand in config/gcps
+            snakemake.output.gcps,
+            snakemake.output.checkpoints,
+            seed=snakemake.params.seed,
+        )
+        simulate_truth(city, scene, snakemake.output.truth)
