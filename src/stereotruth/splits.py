@@ -168,7 +168,7 @@ def split_tiles(places: Sequence[Place], weights: Mapping[str, int], seed: int) 
     ``weights`` are the paper's counts by split name. Tiles are taken in sweep order, in runs
     whose lengths are :func:`scaled_counts`; the seed draws which split comes first. A run ends
     a little earlier or later where that costs fewer tiles; tiles that share ground with a tile
-    across the end of a run get ``none`` (as few as a greedy search finds).
+    across the end of a run get ``none`` (as few as a greedy search finds, of long runs first).
     """
     if not places:
         return []
@@ -189,11 +189,11 @@ def split_tiles(places: Sequence[Place], weights: Mapping[str, int], seed: int) 
         target += counts[name]
         low, high = cuts[-1] + 1, len(places) - (len(names) - k)
         best, cost = target, np.inf
-        for step in range(len(places)):
-            if step >= cost:
-                break
+        # A split is moved by a sixth of its tiles at most, or by one: counts are the point.
+        reach = max(1, min(counts[name], counts[names[k]]) // 6)
+        for step in range(reach + 1):
             for cut in (target - step, target + step):
-                if low <= cut <= high:
+                if low <= cut <= high and step < cost:
                     lost = len(_cover([(p, q) for p, q in pairs if p < cut <= q]))
                     if step + 2 * lost < cost:  # a tile lost is worse than one moved
                         best, cost = cut, step + 2 * lost

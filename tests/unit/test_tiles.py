@@ -28,7 +28,7 @@ from stereotruth.verification import defects, verify
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 SIZE = 64
-PIXELS = 460  # side of the original images
+PIXELS = 360  # side of the original images
 FLAGS = ["no_points", "labelled", "hidden_in_left", "hidden_in_right", "low_correlation"]
 LAT, LON = 30.2, 115.4
 METRE_LAT = 1 / 111_000.0
@@ -74,9 +74,9 @@ def surface(sensor: SensorModel, col: np.ndarray, row: np.ndarray) -> tuple[np.n
     return lon, lat, height
 
 
-def make_scene(folder: Path, *, bare_from: int = 10**6) -> Scene:
+def make_scene(folder: Path, *, bare_from: int = 10**6, turn: float = 0.02) -> Scene:
     """Stores of one scene; labels end at epipolar row ``bare_from``."""
-    left, right = camera(0.09, 0.02, 0.70), camera(-0.48, -0.03, 0.75)
+    left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
     model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
     y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
     attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
@@ -126,7 +126,7 @@ def make_scene(folder: Path, *, bare_from: int = 10**6) -> Scene:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return make_scene(tmp_path_factory.mktemp("scenes") / "s1", bare_from=300)
+    return make_scene(tmp_path_factory.mktemp("scenes") / "s1", bare_from=240)
 
 
 run = partial(
@@ -317,6 +317,19 @@ def test_overlapping_tiles_share_no_ground_across_splits(scene: Scene, tmp_path:
     with pytest.raises(InputError, match="share ground"):
         run([scene], tmp_path / "S", stride=SIZE // 2, strict=True)
     assert not (tmp_path / "S").exists()
+
+
+def test_two_scenes_of_one_city(scene: Scene, tmp_path: Path) -> None:
+    """A second pair over the same ground: its tiles count on, and share no ground across splits."""
+    other = make_scene(tmp_path / "s2", turn=0.3)
+    summary = run([scene, other], tmp_path / "T", workers=2)
+    rows = rows_of(tmp_path / "T")
+    assert {row["scene"] for row in rows} == {"s1", "s2"} == set(summary["scenes"])
+    assert len({row["tile"] for row in rows}) == len(rows)
+    assert shared_ground(tmp_path / "T" / "manifest.csv") == []
+    realised = summary["splits"]["realised"]
+    assert sum(realised.values()) == summary["labelled_pairs"] and realised["none"] > 0
+    assert all(realised[name] for name in ("train", "val", "test"))
 
 
 def test_nothing_to_export_is_refused(scene: Scene, tmp_path: Path) -> None:
