@@ -13,7 +13,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SHEET_COLUMNS = "scene city left_image right_image lidar lidar_crs geoid gcps".split()
+SHEET_COLUMNS = [
+    "scene",
+    "city",
+    "left_image",
+    "right_image",
+    "lidar",
+    "lidar_crs",
+    "geoid",
+    "gcps",
+]
 
 
 @dataclass

@@ -1,0 +1,346 @@
+"""The whole workflow on a small synthetic city: products, reruns, and what a user gets wrong."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from stereotruth.simulate.__main__ import make_scene
+from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
+
+from .conftest import Project, copy_project
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
+TINY = CitySpec(
+    name="Tiny",
+    lon=114.3,
+    lat=30.6,
+    epsg=32650,
+    base_height_m=20.0,
+    world_seed=7,
+    character=Character(
+        relief_m=8,
+        valley=0.2,
+        wavelength_m=900,
+        max_slope_deg=10,
+        river_m=0,
+        lakes=0,
+        zones={"slabs": 3, "lowrise": 2, "park": 1},
+        towers_m=(30, 40),
+        trees=0.4,
+        zone_m=150.0,
+    ),
+    scenes=(SceneSpec("Tiny-1", (0.0, 0.0), 560, 560, 5, ragged_m=(20.0, 20.0)),),
+)
+SIZE = {"tiles": {"size": 128, "min_labelled": 0.5}}
+STAGES = {"align", "rectify", "project", "export"}
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory) -> Path:
+    """The city's files: left.tif, right.tif, lidar/, gcps.csv, truth.zarr."""
+    folder = tmp_path_factory.mktemp("data") / "Tiny-1"
+    make_scene(TINY, TINY.scenes[0], folder, spacing_m=0.4, seed=1)
+    return folder
+
+
+def row_of(folder: Path, **changes: str) -> dict[str, str]:
+    return {
+        "scene": "Tiny-1",
+        "city": "Tiny",
+        "left_image": str(folder / "left.tif"),
+        "right_image": str(folder / "right.tif"),
+        "lidar": str(folder / "lidar"),
+        "gcps": str(folder / "gcps.csv"),
+        **changes,
+    }
+
+
+@pytest.fixture(scope="session")
+def made(data, tmp_path_factory) -> Project:
+    """A project in which tiles/Tiny has been made, by two cores; config in tiny.yaml."""
+    project = copy_project(tmp_path_factory.mktemp("made") / "project")
+    shutil.copytree(data, project.folder / "in")
+    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
+    run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
+    assert run.status == 0, run.text[-4000:]
+    assert "Look at tiles/Tiny/manifest.csv" in run.text
+    return project
+
+
+def plan(project: Project, *arguments: str) -> dict[str, int]:
+    return project.plan("tiles/Tiny", "--configfile", "tiny.yaml", *arguments)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Checksum of each file below, but for Snakemake's own time stamps."""
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.name != ".snakemake_timestamp"
+    }
+
+
+def manifest(project: Project) -> list[dict[str, str]]:
+    with (project.folder / "tiles/Tiny/manifest.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_tiles_are_made_with_all_their_files(made):
+    rows = manifest(made)
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    assert len(labelled) >= 4
+    folder = made.folder / "tiles/Tiny"
+    for kind, dtype in (("left", "uint16"), ("right", "uint16"), ("status", "uint8")):
+        files = sorted((folder / kind).iterdir())
+        assert len(files) == len(labelled)
+        with rasterio.open(files[0]) as tile:
+            assert (tile.width, tile.height, tile.dtypes[0]) == (128, 128, dtype)
+    assert len(list((folder / "disp").iterdir())) == len(labelled)
+    assert len(list((folder / "orientation").iterdir())) >= len(labelled)
+
+
+def test_disparity_agrees_with_the_exact_truth(made, data):
+    """Labelled and truly visible pixels: the limits that the project has set itself."""
+    from stereotruth.evaluation.truth import evaluate_truth
+
+    report = evaluate_truth(made.folder / "results/project/Tiny/Tiny-1.zarr", data / "truth.zarr")
+    whole = report["scene"]
+    assert whole["mean_absolute_error_px"] <= 0.25
+    assert whole["share_above_1_px"] <= 0.005
+    assert whole["y_parallax_rms_px"] <= 0.25
+
+
+def test_a_second_call_runs_nothing(made):
+    assert plan(made) == {}
+
+
+def test_touching_inputs_runs_nothing(made):
+    for file in (made.folder / "in").rglob("*"):
+        if file.is_file() and "truth" not in str(file):
+            os.utime(file)
+    assert plan(made) == {}
+
+
+def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made):
+    file = made.folder / "in/gcps.csv"
+    before = file.read_text()
+    lines = before.splitlines()
+    cells = lines[1].split(",")
+    cells[4] = f"{float(cells[4]) + 0.1:.3f}"
+    file.write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
+    assert set(plan(made)) == STAGES
+    file.write_text(before)
+    assert plan(made) == {}
+
+
+def test_another_tile_size_runs_export_only(made):
+    made.edit("tiny.yaml", "size: 128", "size: 96")
+    assert set(plan(made)) == {"export"}
+    made.edit("tiny.yaml", "size: 96", "size: 128")
+    assert plan(made) == {}
+
+
+@pytest.mark.parametrize(
+    ("module", "rules"),
+    [
+        ("tiles", {"export"}),
+        ("disparity", {"project", "export"}),
+        ("rectification", {"rectify", "project", "export"}),
+        ("alignment", STAGES),
+        ("points", {"ingest", "project", "export"}),
+        ("sheets", set()),
+        ("simulate/render", set()),
+    ],
+)
+def test_edited_code_runs_its_stage_and_what_follows(made, module, rules):
+    file = made.folder / f"src/stereotruth/{module}.py"
+    before = file.read_text()
+    try:
+        file.write_text(before + "\n# a remark is no change\n")
+        assert plan(made) == {}
+        file.write_text(before + "\nADDED = 1\n")
+        assert set(plan(made)) == rules
+    finally:
+        file.write_text(before)
+
+
+def test_a_new_lidar_file_is_the_only_one_read(made):
+    new = made.folder / "in/lidar/new.laz"
+    shutil.copy(next((made.folder / "in/lidar").glob("*_0_0.laz")), new)
+    try:
+        assert plan(made) == {"ingest": 1, "project": 1, "export": 1}
+    finally:
+        new.unlink()
+
+
+def test_one_core_gives_the_same_bytes(made, tmp_path):
+    other = copy_project(tmp_path / "other")
+    shutil.copytree(made.folder / "in", other.folder / "in")
+    other.add_scene("tiny", [row_of(Path("in"))], **SIZE)
+    run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml", cores=1)
+    assert run.status == 0, run.text[-4000:]
+    for product in ("results/project", "tiles"):
+        assert hashes(made.folder / product) == hashes(other.folder / product)
+
+
+def test_verify_finds_an_edited_tile(made, tmp_path):
+    assert made.snakemake("verify", "--configfile", "tiny.yaml").status == 0
+    tile = next((made.folder / "tiles/Tiny/left").iterdir())
+    before = tile.read_bytes()
+    tile.write_bytes(before[:-1] + b"x")
+    run = made.snakemake("verify", "--configfile", "tiny.yaml")
+    tile.write_bytes(before)
+    assert run.status != 0
+    assert tile.name in run.text
+
+
+def test_the_dataset_has_the_published_layout(made):
+    run = made.snakemake("dataset", "--configfile", "tiny.yaml")
+    assert run.status == 0, run.text[-4000:]
+    root = made.folder / "dataset"
+    labelled = [row for row in manifest(made) if row["split"] in ("train", "val", "test")]
+    for kind in ("left", "right", "disp"):
+        files = list(root.glob(f"with ground truth/*/{kind}/*.tiff"))
+        assert len(files) == len(labelled)
+    assert (root / "without ground truth/left").is_dir()
+
+
+# ------------------------------------------------------------------------ what a user gets wrong
+
+
+def image_without_rpc(folder: Path) -> dict[str, str]:
+    with rasterio.open(folder / "left.tif") as source:
+        profile, pixels = source.profile, source.read()
+    with rasterio.open(folder / "plain.tif", "w", **profile) as target:
+        target.write(pixels)
+    return {"left_image": str(folder / "plain.tif")}
+
+
+def nodata_only_image(folder: Path) -> dict[str, str]:
+    with rasterio.open(folder / "left.tif") as source:
+        profile, pixels, rpcs = source.profile, source.read(), source.rpcs
+    with rasterio.open(folder / "empty.tif", "w", **profile) as target:
+        target.write(np.zeros_like(pixels))
+        target.rpcs = rpcs
+    return {"left_image": str(folder / "empty.tif")}
+
+
+def edited_gcps(folder: Path, edit) -> dict[str, str]:
+    with (folder / "gcps.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    rows = edit(rows)
+    with (folder / "edited.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    return {"gcps": str(folder / "edited.csv")}
+
+
+def gcp_outside(folder: Path) -> dict[str, str]:
+    def edit(rows):
+        rows[3]["left_col"] = "5000.0"
+        return rows
+
+    return edited_gcps(folder, edit)
+
+
+def two_gcps(folder: Path) -> dict[str, str]:
+    return edited_gcps(folder, lambda rows: rows[:2])
+
+
+def swapped_images(folder: Path) -> dict[str, str]:
+    return {
+        "left_image": str(folder / "right.tif"),
+        "right_image": str(folder / "left.tif"),
+    }
+
+
+def other_lidar(folder: Path, epsg: int | None, east: float) -> dict[str, str]:
+    """The LiDAR under another CRS, or moved by ``east`` metres."""
+    import laspy
+    import pyproj
+
+    target = folder / "other"
+    target.mkdir()
+    for file in (folder / "lidar").iterdir():
+        las = laspy.read(file)
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.offsets, header.scales = las.header.offsets, las.header.scales
+        if epsg is not None:
+            header.add_crs(pyproj.CRS.from_epsg(epsg))
+        moved = laspy.LasData(header)
+        moved.x, moved.y, moved.z = las.x + east, las.y, las.z
+        moved.classification = las.classification
+        moved.write(target / file.name)
+    return {"lidar": str(target)}
+
+
+def lidar_without_crs(folder: Path) -> dict[str, str]:
+    return other_lidar(folder, None, 0.0)
+
+
+def lidar_of_another_zone(folder: Path) -> dict[str, str]:
+    return other_lidar(folder, 32648, 0.0)
+
+
+def lidar_elsewhere(folder: Path) -> dict[str, str]:
+    return other_lidar(folder, 32650, 20_000.0)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (image_without_rpc, ["plain.tif", "RPC"]),
+        (nodata_only_image, ["empty.tif", "nodata"]),
+        (gcp_outside, ["edited.csv", "outside", "left.tif"]),
+        (two_gcps, ["edited.csv", "affine", "shift"]),
+        (swapped_images, ["swapped"]),
+        (lidar_without_crs, ["other", "lidar_crs"]),
+        (lidar_of_another_zone, ["CRS"]),
+        (lidar_elsewhere, ["overlap"]),
+    ],
+)
+def test_a_mistake_ends_in_one_clear_message(data, tmp_path, mistake, words):
+    folder = tmp_path / "in"
+    shutil.copytree(data, folder, ignore=shutil.ignore_patterns("truth.zarr"))
+    project = copy_project(tmp_path / "project")
+    project.add_scene("wrong", [row_of(folder, **mistake(folder))], **SIZE)
+    run = project.snakemake("tiles/Tiny", "--configfile", "wrong.yaml")
+    assert run.status != 0
+    message = run.text.strip().splitlines()
+    errors = {line.partition("error: ")[2] for line in message if "error: " in line}
+    assert len(errors) == 1, run.text[-3000:]
+    error = errors.pop()
+    assert "Remedy:" in error
+    assert "Tiny-1" in run.text
+    for word in words:
+        assert word in error, error
+    assert "Traceback" not in run.text
+    left = [f for f in (project.folder / "results").rglob("*") if f.suffix == ".partial"]
+    assert left == []
+    assert not (project.folder / "tiles").exists()
+
+
+def test_provenance_is_in_every_product(made):
+    import zarr
+
+    records = [
+        json.loads((made.folder / "results/align/Tiny/Tiny-1/alignment.json").read_text()),
+        json.loads((made.folder / "results/rectify/Tiny/Tiny-1/epipolar.json").read_text()),
+        json.loads(next((made.folder / "tiles/Tiny/orientation").iterdir()).read_text()),
+    ]
+    stores = [*(made.folder / "results").rglob("*.zarr")]
+    assert len(stores) >= 4
+    records += [dict(zarr.open_group(store, mode="r").attrs) for store in stores]
+    for record in records:
+        assert {"code", "inputs", "parameters"} <= set(record["provenance"])
