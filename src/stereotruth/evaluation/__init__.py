@@ -1,0 +1,1 @@
+"""How good products are: against exact truth, at check points, and by warping images."""

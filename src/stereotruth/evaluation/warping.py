@@ -1,0 +1,180 @@
+"""Image warping (section IV-A of the paper): the right image brought to the left by the disparity.
+
+For each labelled left pixel (x, y), the right image is interpolated at (x − d, y), by cubic
+convolution along the row (Keys 1981). How well left and warped right image agree is said by their
+correlation coefficient over all labelled pixels of a scene or a tile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..grid_store import blocks, require_complete
+
+Floats = NDArray[np.float64]
+BLOCK = 1024  # px
+
+
+@dataclass
+class CorrelationSum:
+    """Sums of two images' values, from which their correlation coefficient follows."""
+
+    count: int = 0
+    a: float = 0.0
+    b: float = 0.0
+    aa: float = 0.0
+    bb: float = 0.0
+    ab: float = 0.0
+
+    def add(self, a: Floats, b: Floats) -> None:
+        """Add pairs of finite values."""
+        self.count += a.size
+        self.a += float(a.sum())
+        self.b += float(b.sum())
+        self.aa += float((a * a).sum())
+        self.bb += float((b * b).sum())
+        self.ab += float((a * b).sum())
+
+    @property
+    def coefficient(self) -> float:
+        """Pearson's; NaN for fewer than two pairs or a constant image."""
+        n = self.count
+        if n < 2:
+            return float("nan")
+        va, vb = self.aa - self.a**2 / n, self.bb - self.b**2 / n
+        if va <= 0 or vb <= 0:
+            return float("nan")
+        return (self.ab - self.a * self.b / n) / float(np.sqrt(va * vb))
+
+
+def warp_rows(right: Floats, x: Floats) -> Floats:
+    """Values float64[h, w] of an image [h, W] at columns ``x`` [h, w] of the same rows.
+
+    Cubic convolution (a = −0.5). NaN where x is NaN, where one of the four columns is nodata (0)
+    or outside the image.
+    """
+    width = right.shape[1]
+    known = np.isfinite(x) & (x >= 1) & (x <= width - 3)
+    i = np.where(known, np.floor(np.where(known, x, 1.0)), 1.0).astype(np.intp)
+    t = np.where(known, x, 1.0) - i
+    rows = np.arange(len(x))[:, None]
+    total = np.zeros(x.shape)
+    for k, weight in enumerate(
+        (
+            ((-0.5 * t + 1.0) * t - 0.5) * t,
+            (1.5 * t - 2.5) * t * t + 1.0,
+            ((-1.5 * t + 2.0) * t + 0.5) * t,
+            (0.5 * t - 0.5) * t * t,
+        )
+    ):
+        value = right[rows, np.clip(i + k - 1, 0, width - 1)]
+        known &= value != 0
+        total += weight * value
+    return np.where(known, total, np.nan)
+
+
+def warp_window(right: Any, disparity: Floats, rows: slice, cols: slice) -> Floats:
+    """The right image (array [y, x], may be Zarr) in the left geometry of a window, NaN unlabelled.
+
+    ``disparity`` float64[h, w] px of the window.
+    """
+    x = np.arange(cols.start, cols.stop)[None, :] - disparity
+    known = np.isfinite(x)
+    if not known.any():
+        return np.full(disparity.shape, np.nan)
+    first = max(int(np.floor(x[known].min())) - 2, 0)
+    last = min(int(np.ceil(x[known].max())) + 3, right.shape[1])
+    if last - first < 4:
+        return np.full(disparity.shape, np.nan)
+    part = np.asarray(right[rows, first:last], dtype=np.float64)
+    return warp_rows(part, x - first)
+
+
+def evaluate_warping(left: str | Path, right: str | Path, disparity: str | Path) -> dict[str, Any]:
+    """Correlation of left and warped right image over the labelled pixels of a scene.
+
+    Takes left.zarr, right.zarr and disparity.zarr. Raises InputError for unfinished stores.
+    """
+    left_image, right_image = (require_complete(path)["image"] for path in (left, right))
+    labels = require_complete(disparity)["disparity"]
+    if not left_image.shape == right_image.shape == labels.shape:
+        raise InputError(
+            "images and disparity differ in size", file=disparity, remedy="run project again"
+        )
+    total = CorrelationSum()
+    for rows, cols in blocks(labels.shape, BLOCK):
+        values = labels[rows, cols].astype(np.float64)
+        warped = warp_window(right_image, values, rows, cols)
+        reference = left_image[rows, cols].astype(np.float64)
+        good = np.isfinite(warped) & (reference != 0)
+        total.add(reference[good], warped[good])
+    return {"pixels": total.count, "correlation": round(total.coefficient, 6)}
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedTile:
+    """An exported tile: left, warped right (NaN unlabelled) and disparity, float64[h, w]."""
+
+    name: str
+    left: Floats
+    warped: Floats
+    disparity: Floats
+
+    @property
+    def correlation(self) -> float:
+        """Of left and warped right image over the labelled pixels."""
+        total = CorrelationSum()
+        good = np.isfinite(self.warped) & (self.left != 0)
+        total.add(self.left[good], self.warped[good])
+        return total.coefficient
+
+
+def warp_tile(tiles: str | Path, row: Mapping[str, str]) -> WarpedTile:
+    """Warp an exported tile by its own disparity; ``row`` is its line of the manifest."""
+    folder = Path(tiles)
+    images = []
+    for kind in ("left", "right", "disp"):
+        with rasterio.open(folder / row[kind]) as dataset:
+            images.append(dataset.read(1).astype(np.float64))
+            nodata = dataset.nodata
+    left, right, disparity = images
+    disparity[disparity == nodata] = np.nan
+    x = np.arange(left.shape[1])[None, :] - disparity
+    return WarpedTile(row["tile"], left, warp_rows(right, x), disparity)
+
+
+def draw_panels(tile: WarpedTile, path: str | Path) -> None:
+    """PNG of the left image, the warped right one, their difference and the disparity."""
+    from matplotlib.figure import Figure
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(15, 14.4), layout="constrained")
+    axes = figure.subplots(2, 2)
+    low, high = np.percentile(tile.left, (1, 99))
+    difference = tile.left - tile.warped
+    spread = float(np.nanpercentile(np.abs(difference), 99)) if np.isfinite(difference).any() else 1
+    gray = {"cmap": "gray", "vmin": low, "vmax": high}
+    panels = (
+        (tile.left, "left", gray),
+        (tile.warped, f"warped right, correlation {tile.correlation:.3f}", gray),
+        (difference, "left − warped right", {"cmap": "RdBu", "vmin": -spread, "vmax": spread}),
+        (tile.disparity, "disparity (px)", {"cmap": "turbo"}),
+    )
+    for ax, (image, title, style) in zip(axes.ravel(), panels):
+        ax.set_facecolor("black")
+        shown = ax.imshow(image, interpolation="nearest", **style)
+        ax.set_title(f"{tile.name}: {title}")
+        if style is not gray:
+            figure.colorbar(shown, ax=ax, shrink=0.7)
+    scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
+    figure.savefig(scratch, dpi=75)
+    scratch.replace(path)
