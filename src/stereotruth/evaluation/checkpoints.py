@@ -89,13 +89,12 @@ def sample_labels(disparity: Any, x: Floats, y: Floats) -> Floats:
         four = np.stack(
             [part[jj, ii], part[jj, ii + 1], part[jj + 1, ii], part[jj + 1, ii + 1]], axis=1
         )
-        fy, fx = y[at] - j[at], x[at] - i[at]
+        fy, fx = np.clip(y[at] - j[at], 0, 1), np.clip(x[at] - i[at], 0, 1)  # half a pixel outside
         weights = np.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx], axis=1)
-        # Half a pixel outside the grid the weights are negative: the nearest pixel's label.
         nearest = np.argmax(weights, axis=1)
         there = four[np.arange(at.size), nearest]
         known = np.isfinite(four)
-        weights = np.where(known, np.maximum(weights, 0.0), 0.0)
+        weights = np.where(known, weights, 0.0)
         low, high = (f(np.where(known, four, there[:, None]), axis=1) for f in (np.min, np.max))
         with np.errstate(invalid="ignore"):
             mean = (weights * np.where(known, four, 0.0)).sum(axis=1) / weights.sum(axis=1)
