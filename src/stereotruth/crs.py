@@ -345,7 +345,8 @@ class GeoidGrid:
 
     The nodes are the pixel centres; between them N is bilinear, as in PROJ's ``vgridshift``.
     Longitudes may run from −180 or from 0; a grid around the whole Earth has no seam. Only the rows
-    that a file needs are read. Raises InputError if the file is no usable grid.
+    that a file needs are read. ``above_wgs84``: N counts from WGS 84 itself (EGM grids), not from a
+    national datum on the same ellipsoid. Raises InputError if the file is no usable grid.
     """
 
     path: Path
@@ -360,16 +361,20 @@ class GeoidGrid:
             )
         try:
             with rasterio.open(self.path) as grid:
-                transform, crs = grid.transform, grid.crs
+                transform, crs, driver = grid.transform, grid.crs, grid.driver
                 self.height, self.width = grid.height, grid.width
         except rasterio.errors.RasterioError as error:
             raise self._unusable(f"GDAL cannot read it ({error})") from error
+        self.above_wgs84 = "egm" in self.path.name.lower()
         if transform.b or transform.d or not (transform.a > 0 > transform.e):
             raise self._unusable("it is not a north-up grid of longitude and latitude")
         if crs is not None:
             if not crs.is_geographic:
                 raise self._unusable("its nodes are not on a grid of longitude and latitude")
-            ellipsoid = CRS.from_wkt(crs.to_wkt()).ellipsoid
+            system = CRS.from_wkt(crs.to_wkt())
+            ellipsoid = system.ellipsoid
+            # GDAL says WGS 84 of every GTX, so that only a GeoTIFF's word counts.
+            self.above_wgs84 |= driver == "GTiff" and "World Geodetic" in system.datum.name
             if ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) > 1:
                 raise self._unusable(f"its undulations are above the ellipsoid {ellipsoid.name}")
         self.step_lon, self.step_lat = transform.a, -transform.e
@@ -606,6 +611,7 @@ def to_wgs84(
             file=file,
             remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
         ) from error
+    grid = GeoidGrid(Path(geoid)) if geoid else None
     ellipsoid = system.horizontal.ellipsoid
     modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
     if geoid:
@@ -619,10 +625,10 @@ def to_wgs84(
         heights=heights,
         notes=tuple(notes + remarks),
         _transformer=transformer,
-        _geoid=GeoidGrid(Path(geoid)) if geoid else None,
-        # Undulations are above GRS 80 / WGS 84: H + N needs the height part of a datum
-        # transformation only if the datum itself is on such an ellipsoid.
-        _heights_follow_datum=modern,
+        _geoid=grid,
+        # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
+        # and goes through the datum transformation; above WGS 84 it is final.
+        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
     )
 
 

@@ -26,6 +26,7 @@ import logging
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -158,18 +159,17 @@ def read_header(file: str | Path) -> laspy.LasHeader:
 
 
 def _chunks(
-    file: Path, header: laspy.LasHeader, size: int, parallel: bool
+    file: Path, header: laspy.LasHeader, size: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
     """All points of a file in its order, at most ``size`` at a time, with the fields needed here.
 
     COPC is read like any LAZ, through its chunk table: whole, whatever its hierarchy pages.
     """
-    backend = laspy.LazBackend.LazrsParallel if parallel else laspy.LazBackend.Lazrs
     fields = laspy.DecompressionSelection
     done = 0
     with laspy.open(
         file,
-        laz_backend=backend,
+        laz_backend=laspy.LazBackend.Lazrs,  # the parallel one takes all cores there are
         read_evlrs=False,
         decompression_selection=fields.XY_RETURNS_CHANNEL
         | fields.Z
@@ -187,6 +187,15 @@ def _chunks(
             if len(points) < wanted:
                 raise _wrong_count(file, header.point_count, f"{done} were read")
             yield points
+
+
+def _ahead(items: Iterator) -> Iterator:
+    """The same items, each made in a thread while the one before is in use."""
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
 
 
 # ------------------------------------------------------------------ ingest
@@ -454,7 +463,7 @@ def ingest(
     (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
     IGN's files) are kept unless listed. Coordinates: see :mod:`stereotruth.crs`. ``lidar_crs``
     (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where not needed.
-    With ``workers`` > 1 LAZ is decoded by several threads (the result is the same).
+    With ``workers`` > 1 a thread decodes ahead (the result is the same).
 
     Returns what is also in the store's attributes: ``points`` (header, read, kept, dropped by
     reason), ``classes`` (kept points by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
@@ -474,7 +483,9 @@ def ingest(
     with building(store) as unfinished:
         group = zarr.open_group(unfinished, mode="w", zarr_format=3)
         runs = _Runs(unfinished / "runs.scratch")
-        chunks = _chunks(file, header, chunk_points, workers > 1)
+        chunks = _chunks(file, header, chunk_points)
+        if workers > 1:
+            chunks = _ahead(chunks)
         total = -(-header.point_count // chunk_points)
         for points in progress(chunks, total, f"{file.name}: chunks of points read"):
             tally.reach(points)

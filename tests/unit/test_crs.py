@@ -14,6 +14,7 @@ from rasterio.transform import from_origin
 
 from stereotruth import crs
 from stereotruth.errors import InputError
+from stereotruth.points import read_header
 
 SHARED = Path(__file__).parents[3] / "shared"
 FT, US_FT = 0.3048, 1200 / 3937
@@ -188,6 +189,18 @@ def test_the_header_bit_decides_between_wkt_and_geokeys() -> None:
     assert (by_wkt.horizontal.to_epsg(), by_keys.horizontal.to_epsg()) == (32610, 26911)
     with_vertical, _ = crs.header_crs(header_of(UTM_WKT1, [*keys, (4096, 0, 1, 5703)]))
     assert with_vertical.vertical_datum == "NAVD88 height"
+
+
+def test_wkt_in_an_extended_record(tmp_path) -> None:
+    las = laspy.LasData(header_of())
+    las.x, las.y, las.z = [np.array([1.0])] * 3
+    las.evlrs = laspy.vlrs.vlrlist.VLRList(
+        [laspy.VLR("LASF_Projection", 2112, "", UTM_WKT1.encode() + b"\0")]
+    )
+    las.write(tmp_path / "a.laz")
+    header = read_header(tmp_path / "a.laz")
+    assert not any(record.user_id == "LASF_Projection" for record in header.vlrs)
+    assert crs.header_crs(header)[0].horizontal.to_epsg() == 32610
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="shared real files are absent")
@@ -433,6 +446,20 @@ def test_geoid_heights_ignore_the_shift_of_an_old_datum(tmp_path) -> None:
         np.array([600000.0]), np.array([200000.0]), np.array([540.0])
     )[2]
     assert height == pytest.approx(589.5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["national", "egm96"])
+def test_the_datum_of_the_geoid_decides_about_the_shift(tmp_path, name) -> None:
+    """NAD83(HARN) is 0.4 m off WGS 84 in height: GEOID grids count from NAD83, EGM from WGS 84."""
+    values = np.full((31, 31), -22.5)
+    geoid = write_gtx(tmp_path / f"{name}.gtx", values, -124.0, 43.0, 0.1)
+    header = header_of(pyproj.CRS("EPSG:2993").to_wkt(), low=(200_000, 300_000, 0))
+    x, y, z = np.array([200_000.0]), np.array([300_000.0]), np.array([100.0])
+    bare = crs.to_wgs84(header, "a.laz")(x, y, z)[2]
+    assert 0.1 < abs(bare[0] - 100) < 1
+    base = 100 if name == "egm96" else bare[0]
+    height = crs.to_wgs84(header, "a.laz", geoid=geoid)(x, y, z)[2]
+    assert height[0] == pytest.approx(base - 22.5, abs=1e-6)
 
 
 def test_ballpark_and_missing_grids_are_named() -> None:

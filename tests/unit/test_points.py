@@ -417,8 +417,8 @@ def test_only_finished_point_stores_open(tmp_path) -> None:
 REAL = SHARED / "lidar"
 FLAT_N = -22.5  # m, of the geoid grid made for these tests: everywhere the same
 
-# file: arguments and what is to come of them, either the reason of refusal or
-# (points kept, EPSG code or None for the file's WKT, metres per height unit, datum shift allowed)
+# file, arguments, and what is to come of them: the reason of refusal, or
+# (points kept, EPSG code of the horizontal system, metres per unit of height)
 REAL_FILES = [
     ("autzen_trim.laz", {}, (110_000, 2994, 0.3048)),
     ("autzen-bmx-2010.las", {}, "NAVD88"),
@@ -473,15 +473,18 @@ def test_real_files_are_read_right_or_refused_by_name(tmp_path, name, arguments,
     assert result["points"]["read"] == result["points"]["header"] == len(las.points)
     good = ~np.isin(las.classification, arguments.get("drop_classes", (7, 18)))
     x, y, z = np.array(las.x)[good], np.array(las.y)[good], np.array(las.z)[good]
-    lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y)
+    system = pyproj.CRS(epsg).to_3d()
+    truth = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
+    lon, lat, height = truth.transform(x, y, z * unit)
+    if arguments.get("geoid"):
+        height += FLAT_N
     got = everything(PointStore(tmp_path / "a.zarr"))
-    # The datum shift that PROJ takes may differ with the area of interest: by 2 m at most.
     for ours, theirs in ((got.lon, lon), (got.lat, lat)):
-        np.testing.assert_allclose(np.sort(ours), np.sort(theirs), rtol=0, atol=2e-5)
-    height = z * unit + (FLAT_N if arguments.get("geoid") else 0)
-    np.testing.assert_allclose(np.sort(got.height), np.sort(height), rtol=0, atol=1.0)
-    spread = np.sort(got.height) - np.sort(height)
-    assert np.ptp(spread) < 5e-3  # the same shift for all: no unit is off
+        np.testing.assert_allclose(np.sort(ours), np.sort(theirs), rtol=0, atol=1.1e-9)
+    np.testing.assert_allclose(np.sort(got.height), np.sort(height), rtol=0, atol=6e-5)
+    pairs = [np.column_stack(q) for q in ((got.lon, got.lat, got.height), (lon, lat, height))]
+    sums = [(p[:, 0] - lon.mean()) @ p[:, 2] for p in pairs]  # the heights are at their places
+    assert sums[0] == pytest.approx(sums[1], abs=1e-6 * len(lon))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="shared real files are absent")
