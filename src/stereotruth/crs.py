@@ -412,6 +412,8 @@ class GeoidGrid:
 
         Raises InputError for points outside the grid or beside nodes without a value.
         """
+        if lon.size == 0:
+            return np.empty(0)
         slack = 1e-6  # of a node's step, against rounding at the outermost nodes
         col = np.mod((lon - self.lon_first) / self.step_lon + slack, 360 / self.step_lon) - slack
         row = (self.lat_first - lat) / self.step_lat

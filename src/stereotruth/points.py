@@ -17,7 +17,7 @@ Layout of a store (Zarr v3, sharded; n points, m cells):
 ``cell_min``, ``cell_max``   int32 [m]      lowest and highest height in the cell
 ===========================  =============  ==================================================
 
-One array for all that is read together: twice as fast as one each.
+One array for all that is read together: queries are nearly twice as fast as with one each.
 """
 
 from __future__ import annotations
@@ -156,6 +156,17 @@ def read_header(file: str | Path) -> laspy.LasHeader:
                 remedy="fetch or write the file again",
             ) from error
     return header
+
+
+def _surplus(header: laspy.LasHeader, file: Path) -> str | None:
+    """Remark on points after the last that the header counts (a stale header), or None."""
+    if header.are_points_compressed or header.version.minor == 3:  # 1.3: waveforms may follow
+        return None
+    end = header.start_of_first_evlr if header.number_of_evlrs else file.stat().st_size
+    held = (end - header.offset_to_point_data) // header.point_format.size
+    if held <= header.point_count:
+        return None
+    return f"the header announces {header.point_count} points, which are read; {held} would fit"
 
 
 def _chunks(
@@ -317,7 +328,7 @@ def _cell_key(row: np.ndarray, col: np.ndarray) -> np.ndarray:
 
 
 def _order_by_cell(row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """Stable order by cell. Few cells sort as uint16, by radix: 8 times as fast as int64."""
+    """Stable order by cell. Few cells sort as uint16, which NumPy does by radix."""
     width = int(col.max() - col.min()) + 1
     local = (row - row.min()) * width + (col - col.min())
     if (int(row.max() - row.min()) + 1) * width <= 1 << 16:
@@ -478,6 +489,8 @@ def ingest(
     transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
     _refuse_coarse(header, transform, file)
     notes = list(transform.notes)
+    if remark := _surplus(header, file):
+        notes.append(remark)
     tally = _Tally()
     scale, offset = np.asarray(header.scales), np.asarray(header.offsets)
     with building(store) as unfinished:
@@ -511,7 +524,7 @@ def ingest(
         if remark := check_area(transform.system, lon, lat, file):
             notes.append(remark)
         if bounds[4] < -600 or bounds[5] > 9500:
-            notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are not of this Earth")
+            notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
         runs.write(group)
         runs.scratch.unlink()
         summary = {

@@ -349,6 +349,18 @@ def test_missing_and_empty_files(tmp_path) -> None:
     refused(tmp_path / "unfinished.las", "never completed")
 
 
+def test_stale_header_is_remarked(tmp_path) -> None:
+    file = tmp_path / "a.las"
+    write_las(file, 100, pdrf=1, version="1.2")
+    assert not ingest(file, tmp_path / "a.zarr")["notes"]
+    data = bytearray(file.read_bytes())
+    struct.pack_into("<I", data, 107, 80)
+    file.write_bytes(data)
+    result = ingest(file, tmp_path / "a.zarr")
+    assert result["points"]["kept"] == 80
+    assert "announces 80 points, which are read; 100 would fit" in result["notes"][0]
+
+
 def test_nothing_left(tmp_path) -> None:
     write_las(tmp_path / "a.laz", 100, classification=np.full(100, 7, np.uint8))
     refused(tmp_path / "a.laz", "no point is left of 100.*100 class 7")
@@ -392,10 +404,13 @@ def test_heights_with_a_geoid_and_survey_feet(tmp_path) -> None:
     head = struct.pack(">4d2i", 29.0, 116.0, 0.1, 0.1, 21, 21)
     (tmp_path / "n.gtx").write_bytes(head + np.full(441, -12.5, ">f4").tobytes())
     system = pyproj.CRS("EPSG:32650+6360")  # NAVD88 in survey feet, for the unit's sake
-    xyz = write_las(tmp_path / "a.laz", system=system)
-    result = ingest(tmp_path / "a.laz", tmp_path / "a.zarr", geoid=tmp_path / "n.gtx")
+    noise = np.where(np.arange(3000) < 1000, 7, 2).astype(np.uint8)  # one whole chunk of it
+    xyz = write_las(tmp_path / "a.laz", system=system, classification=noise)
+    result = ingest(
+        tmp_path / "a.laz", tmp_path / "a.zarr", geoid=tmp_path / "n.gtx", chunk_points=1000
+    )
     got = everything(PointStore(tmp_path / "a.zarr"))
-    expected = np.sort(xyz[:, 2]) * 1200 / 3937 - 12.5
+    expected = np.sort(xyz[1000:, 2]) * 1200 / 3937 - 12.5
     np.testing.assert_allclose(np.sort(got.height), expected, rtol=0, atol=6e-5)
     assert result["crs"]["geoid"] == "n.gtx"
 
