@@ -35,6 +35,8 @@ SHARD = 1024  # px; one task writes one shard file
 CHUNK = 256
 LATTICE = 16  # px between exact source coordinates; in between they are bilinear
 LATTICE_ERROR = 0.002  # px, accepted error of that
+# Of waves of 6 px, Keys' six points leave 0.6 % rms, four points 2.1 %, Lanczos' eight 0.7 %; but
+# Lanczos bends a ramp by 0.015 px, and OpenCV's remap rounds positions to 1/32 px.
 RADIUS = 3  # px, of the interpolation kernel
 ANTIALIAS = 1.2  # source px per epipolar px above which the kernel is widened
 CACHE_MB = 256  # of decoded source; 1024 rows of a scene 34 000 px wide take 70
@@ -60,6 +62,16 @@ def _kernel(s: float) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
     """Weights of the source samples first, first + 1, … for the value at ``at``; sum 1."""
+    if scale == 1.0:  # the same without branches: 19 instead of 11 M px/s in all
+        f = at - first - 2.0
+        e = 1.0 - f
+        weights[0] = (((f - 2.0) * f + 1.0) * f) / 12.0
+        weights[5] = (((e - 2.0) * e + 1.0) * e) / 12.0
+        weights[1] = (((-7.0 * f + 15.0) * f - 8.0) * f) / 12.0
+        weights[4] = (((-7.0 * e + 15.0) * e - 8.0) * e) / 12.0
+        weights[2] = (4.0 * f - 7.0) * f * f / 3.0 + 1.0
+        weights[3] = (4.0 * e - 7.0) * e * e / 3.0 + 1.0
+        return
     total = 0.0
     for k in range(weights.size):
         weights[k] = _kernel((at - (first + k)) / scale)
@@ -200,18 +212,18 @@ class Source:
 
     def _dataset(self) -> rasterio.DatasetReader:
         if not hasattr(self._local, "dataset"):
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                    self._local.dataset = rasterio.open(self.path)
-            except RasterioError as error:
-                raise InputError(
-                    f"not a raster that GDAL can read ({error})",
-                    file=self.path,
-                    remedy="check the path and the file",
-                ) from error
-            with self._lock:
-                self._opened.append(self._local.dataset)
+            with self._lock, warnings.catch_warnings():  # which is not thread-safe by itself
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                try:
+                    dataset = rasterio.open(self.path)
+                except RasterioError as error:
+                    raise InputError(
+                        f"not a raster that GDAL can read ({error})",
+                        file=self.path,
+                        remedy="check the path and the file",
+                    ) from error
+                self._opened.append(dataset)
+                self._local.dataset = dataset
         return self._local.dataset
 
     def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
