@@ -333,7 +333,8 @@ def test_labels_are_sampled_bilinearly_and_not_across_edges():
     grid[20:, :10] = np.nan
     px = np.array([3.25, 29.4, 29.6, 5.0, 5.0, 5.0, -0.4, 49.4, 60.0])
     py = np.array([7.75, 11.0, 11.0, 19.3, 19.6, 25.0, 0.0, 39.4, 1.0])
-    got = checkpoints.sample_labels(grid, px, py)
+    got, inner = checkpoints.sample_labels(grid, px, py)
+    assert np.flatnonzero(inner).tolist() == [0, 6, 7]
     smooth = 0.1 * px - 0.07 * py
     assert got[0] == pytest.approx(smooth[0])
     assert got[1] == pytest.approx(0.1 * 29 - 0.77)
@@ -362,6 +363,7 @@ def test_check_points_of_perfect_labels(scene, tmp_path):
     assert figures["points"] == figures["labelled"] == 200
     assert figures["median"] == pytest.approx(moved[0], abs=0.003)
     assert figures["nmad"] < 0.003
+    assert figures["inner"]["count"] > 150
     assert figures["y_parallax_median"] == pytest.approx(moved[1], abs=0.003)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..control_points import ControlPoints, read_gcps
 from ..epipolar import EpipolarModel
 from ..grid_store import blocks, require_complete
-from .statistics import median_and_nmad
+from .statistics import LIMITS, median_and_nmad
 
 Floats = NDArray[np.float64]
 STEP_PX = 1.0  # px of disparity between four neighbours: beyond, they are not one surface
@@ -31,7 +31,8 @@ class CheckPointErrors:
     """n check points that both images see.
 
     ``x``, ``y`` px in the left epipolar grid, ``measured`` and ``label`` disparity in px (NaN
-    where there is no label), ``y_parallax`` px, y_right − y_left of the measured positions.
+    where there is no label), ``inner`` bool[n]: four labelled neighbours of one surface;
+    ``y_parallax`` px, y_right − y_left of the measured positions.
     """
 
     ids: tuple[str, ...]
@@ -39,39 +40,49 @@ class CheckPointErrors:
     y: Floats
     measured: Floats
     label: Floats
+    inner: NDArray[np.bool_]
     y_parallax: Floats
 
     def figures(self) -> dict[str, Any]:
-        """JSON-ready: px, of label less measured disparity, and of the y-parallax."""
+        """JSON-ready: px, of label less measured disparity, and of the y-parallax.
+
+        ``inner``: of the points on one surface. A check point on the corner of a roof has ground
+        for most of its neighbours, and which of them it stands for is not known.
+        """
         labelled = np.isfinite(self.label)
         errors = (self.label - self.measured)[labelled]
         result: dict[str, Any] = {
             "points": len(self.ids),
             "labelled": int(labelled.sum()),
-            "median": None,
-            "nmad": None,
-            "mean_absolute": None,
             "y_parallax_rms": None,
             "y_parallax_median": None,
         }
-        if errors.size:
-            median, nmad = median_and_nmad(errors)
-            result |= {"median": median, "nmad": nmad}
-            result["mean_absolute"] = float(np.abs(errors).mean())
-            result |= {f"share_over_{d:g}_px": float((np.abs(errors) > d).mean()) for d in (1, 3)}
+        result |= _spread(errors)
+        result["inner"] = _spread((self.label - self.measured)[labelled & self.inner])
         if self.ids:
             result["y_parallax_rms"] = float(np.sqrt(np.mean(self.y_parallax**2)))
             result["y_parallax_median"] = float(np.median(self.y_parallax))
         return {k: round(v, 6) if isinstance(v, float) else v for k, v in result.items()}
 
 
-def sample_labels(disparity: Any, x: Floats, y: Floats) -> Floats:
+def _spread(errors: Floats) -> dict[str, Any]:
+    if not errors.size:
+        return {"count": 0, "median": None, "nmad": None, "mean_absolute": None}
+    median, nmad = median_and_nmad(errors)
+    size = np.abs(errors)
+    values = {"median": median, "nmad": nmad, "mean_absolute": float(size.mean())}
+    values |= {f"share_over_{limit:g}_px": float((size > limit).mean()) for limit in LIMITS}
+    return {"count": errors.size, **{key: round(value, 6) for key, value in values.items()}}
+
+
+def sample_labels(disparity: Any, x: Floats, y: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Labels float64[n] px at sub-pixel positions of a grid [y, x]; NaN where there is none.
 
-    ``disparity`` may be a Zarr array; it is read in blocks.
+    The second is bool[n]: all four neighbours are labelled, as one surface. ``disparity`` may be
+    a Zarr array; it is read in blocks.
     """
     height, width = disparity.shape
-    label = np.full(x.shape, np.nan)
+    label, inner = np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
     # Every point belongs to the block of its upper-left neighbour.
     i = np.clip(np.floor(x), 0, width - 2)
     j = np.clip(np.floor(y), 0, height - 2)
@@ -100,7 +111,8 @@ def sample_labels(disparity: Any, x: Floats, y: Floats) -> Floats:
             mean = (weights * np.where(known, four, 0.0)).sum(axis=1) / weights.sum(axis=1)
             one_surface = high - low <= STEP_PX
         label[at] = np.where(np.isfinite(there), np.where(one_surface, mean, there), np.nan)
-    return label
+        inner[at] = known.all(axis=1) & one_surface
+    return label, inner
 
 
 def check_point_errors(
@@ -110,12 +122,14 @@ def check_point_errors(
     both = np.flatnonzero(points.in_left & points.in_right)
     x, y = model.left_to_epipolar(*points.left[both].T)
     x_right, y_right = model.right_to_epipolar(*points.right[both].T)
+    label, inner = sample_labels(disparity, x, y)
     return CheckPointErrors(
         ids=tuple(points.ids[i] for i in both),
         x=x,
         y=y,
         measured=x - x_right,
-        label=sample_labels(disparity, x, y),
+        label=label,
+        inner=inner,
         y_parallax=y_right - y,
     )
 
