@@ -9,7 +9,12 @@ rule evaluate_truth:
         truth="data/synthetic/{city}/{scene}/truth.zarr",
     output:
         figures="results/evaluate/{city}/{scene}/truth.json",
-        table="results/evaluate/{city}/{scene}/truth.csv",
+        table=report(
+            "results/evaluate/{city}/{scene}/truth.csv",
+            caption="../report/truth.rst",
+            category="Exact truth",
+            labels={"scene": "{scene}"},
+        ),
     log:
         "logs/evaluate_truth/{city}/{scene}.log",
     benchmark:
