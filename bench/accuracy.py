@@ -239,7 +239,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             )
             report["points"].append({"scene": name, **figures})
         warped = warping.evaluate_warping(made.left, made.right, made.disparity)
-        tiles_warped = panels(made, arguments.panels or Path(), arguments.panels and 2 or 0)
+        tiles_warped = panels(made, arguments.panels or Path(), 2 if arguments.panels else 0)
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
     report["cities"] = [truth_row(f"{city} tiles", c) for city, c in by_city.items()]
     return report
