@@ -490,7 +490,7 @@ def _refuse_misfit(
             file=points.file,
             remedy="check these GCPs, and that the file belongs to these images",
         )
-    if n <= system.minimal + 1 and sigma > UNCHECKED_SIGMA:
+    if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
         delta = system.delta
         far = np.hypot(*(delta - np.median(delta, axis=0)).T)
         suspect = points.ids[view.index[int(np.argmax(far))]]
@@ -498,8 +498,8 @@ def _refuse_misfit(
             f"{where}: the {n} GCPs contradict each other by {sigma:.1f} px, and so few do not "
             f"tell which is wrong ({suspect} differs most from the others' shift){of}",
             file=points.file,
-            remedy=f"check {suspect} first; measure more GCPs: with "
-            f"{system.minimal + 2} or more a blunder is found and left out",
+            remedy=f"check {suspect} first; measure more GCPs: among "
+            f"{system.minimal + 3} or more a blunder is found and left out",
         )
     if sigma > MAX_SIGMA:
         raise InputError(
