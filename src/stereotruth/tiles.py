@@ -555,8 +555,6 @@ def export_city(
     except BaseException:
         shutil.rmtree(scratch, ignore_errors=True)
         raise
-    for line in summary_lines(summary, out):
-        log.info("%s", line)
     return summary
 
 
