@@ -170,6 +170,8 @@ def test_perfect_labels_have_no_error(scene):
     # The nearest raw pixel is half a pixel away at most, on a slope of 0.02 px per px.
     assert np.abs((labels - true.disparity)[edge]).max() < 0.05
     assert np.nanmax(np.abs(true.y_parallax)) < 1e-3
+    either = truth.compare(labels, true).either.figures()
+    assert either["max"] < 0.05
     assert not true.visible[true.surface == 0].any()
     assert not (true.visible & true.hidden).any()
 

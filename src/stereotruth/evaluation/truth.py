@@ -9,7 +9,10 @@ The true disparity at an epipolar pixel, whose raw left position falls between f
 
 - interpolated bilinearly, if all four see one class of surface and their disparities differ by
   ``SMOOTH_PX`` at most;
-- else that of the nearest raw pixel. (On edges either surface would be right to half a pixel.)
+- else that of the nearest raw pixel. That is right to half a pixel, so that on an edge a label of
+  the one surface may be held against the other, although the ray through the epipolar pixel's
+  centre meets the first. How much of the error that can be is told by ``errors_either``, which
+  takes the surface of the four raw pixels that is nearest to the label.
 
 Visibility, change and class are those of the nearest raw pixel. Everything is done in blocks of the
 grid.
@@ -51,6 +54,7 @@ MEANING = {
     "and images agree on",
     "errors_smooth": "of these, where the truth is interpolated on one surface",
     "errors_edge": "of these, where the truth is that of the nearest raw pixel",
+    "errors_either": "as errors, but on edges against the closest of the four raw pixels around",
     "errors_with_changed": "as errors, with pixels where LiDAR and images disagree by design",
     "y_parallax": "y of the true right position less y of the left one, px; all pixels that both "
     "views see",
@@ -67,12 +71,14 @@ class TrueLabels:
     """The truth in a window of the left epipolar grid; arrays [h, w].
 
     ``disparity`` (x_left − x_right) and ``y_parallax`` (y_right − y_left) float64 px, NaN where
-    the left image shows nothing that is known; ``smooth``: interpolated on one surface;
+    the left image shows nothing that is known; ``around`` [4, h, w]: disparities of the four raw
+    pixels around; ``smooth``: interpolated on one surface;
     ``visible``: seen in the right view; ``hidden``: inside the right frame, but not seen;
     ``changed``, ``covered`` (by LiDAR); ``surface`` uint8 class.
     """
 
     disparity: Floats
+    around: Floats
     y_parallax: Floats
     smooth: Bools
     visible: Bools
@@ -89,6 +95,7 @@ class Comparison:
     errors: ErrorSum = field(default_factory=ErrorSum)
     smooth: ErrorSum = field(default_factory=ErrorSum)
     edge: ErrorSum = field(default_factory=ErrorSum)
+    either: ErrorSum = field(default_factory=ErrorSum)
     with_changed: ErrorSum = field(default_factory=ErrorSum)
     parallax: ErrorSum = field(default_factory=ErrorSum)
     pixels: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTS, 0))
@@ -96,7 +103,7 @@ class Comparison:
 
     def merge(self, other: Comparison) -> None:
         """Add the figures of other pixels."""
-        for name in ("errors", "smooth", "edge", "with_changed", "parallax"):
+        for name in ("errors", "smooth", "edge", "either", "with_changed", "parallax"):
             getattr(self, name).merge(getattr(other, name))
         for mine, others in ((self.pixels, other.pixels), (self.labelled, other.labelled)):
             for key, value in others.items():
@@ -114,6 +121,7 @@ class Comparison:
             "errors": self.errors.figures(),
             "errors_smooth": self.smooth.figures(),
             "errors_edge": self.edge.figures(),
+            "errors_either": self.either.figures(),
             "errors_with_changed": self.with_changed.figures(),
             "y_parallax": self.parallax.figures(),
             "pixels": self.pixels,
@@ -173,7 +181,8 @@ def true_labels(
     inside = (col >= -0.5) & (col <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
     if not inside.any():
         nothing, no = np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
-        return TrueLabels(nothing, nothing, no, no, no, no, no, np.zeros(x.shape, np.uint8))
+        four = np.full((4, *x.shape), np.nan)
+        return TrueLabels(nothing, four, nothing, *[no] * 5, np.zeros(x.shape, np.uint8))
     top, bottom = _reach(row[inside], height)
     first, last = _reach(col[inside], width)
     window = np.s_[top:bottom, first:last]
@@ -215,6 +224,7 @@ def true_labels(
 
     return TrueLabels(
         disparity=interpolated(disparity, four),
+        around=np.where(inside, four, np.nan),
         y_parallax=interpolated(parallax, np.stack([parallax[c] for c in corners])),
         smooth=smooth,
         visible=inside & seen[at],
@@ -244,6 +254,10 @@ def compare(labels: Floats, truth: TrueLabels, where: Bools | None = None) -> Co
     result.errors.add(errors[good])
     result.smooth.add(errors[good & truth.smooth])
     result.edge.add(errors[good & ~truth.smooth])
+    edge = good & ~truth.smooth
+    either = np.fmin.reduce(np.abs(labels[edge] - truth.around[:, edge]), axis=0)
+    result.either.add(errors[good & truth.smooth])
+    result.either.add(np.where(np.isfinite(either), either, np.abs(errors[edge])))
     result.with_changed.add(errors[labelled & seen])
     result.parallax.add(truth.y_parallax[seen])
     groups = {
