@@ -53,6 +53,7 @@ MAX_SIGMA = 5.0  # px: beyond, GCPs and image do not belong together
 POOR_SIGMA = 2.0  # px
 UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder among them
 LARGE_SHIFT = 200.0  # px: RPCs err by some 1 to 50 px
+MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 LARGE_TILT = 0.005  # change of scale, rotation or shear; RPCs err by less than 0.001
 MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
@@ -331,9 +332,8 @@ def _remedy(model: str, points: Floats) -> str:
     return f"{more}, or set alignment.model to {names}, which these GCPs can carry"
 
 
-def _open_view(
-    name: str, image: Path, points: ControlPoints, fail_scene: str
-) -> tuple[SensorModel, tuple[int, int]]:
+def _open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
+    """The RPC of an image and its size (cols, rows)."""
     sensor = SensorModel(read_rpc(image))
     try:
         with warnings.catch_warnings():
@@ -342,7 +342,7 @@ def _open_view(
                 return sensor, (dataset.width, dataset.height)
     except RasterioError as error:
         raise InputError(
-            f"cannot be opened as the {name} image{fail_scene} ({error})",
+            f"cannot be opened as the {name} image{of} ({error})",
             file=image,
             remedy="check the file",
         ) from None
@@ -509,7 +509,19 @@ def _refuse_misfit(
             remedy="check that GCP file, image and RPC belong together, and that heights are "
             "metres above the ellipsoid",
         )
+    if (tilt := _tilt(system.affine(system.solve(used)))) > MAX_TILT:
+        raise InputError(
+            f"{where}: the GCPs ask for a change of scale or angle by {100 * tilt:.0f} %{of}",
+            file=points.file,
+            remedy="check that columns count from the left and rows from the top, and that GCP "
+            "file, image and RPC belong together",
+        )
     return sigma
+
+
+def _tilt(affine: Floats) -> float:
+    """Largest relative change of a distance by the linear part of an affine."""
+    return float(np.linalg.norm(affine[:, :2] - np.eye(2), ord=2))
 
 
 def _view_fit(
@@ -569,8 +581,7 @@ def _doubts(fit: ViewFit, model: str) -> list[str]:
             f"{fit.view} image: the RPC is off by {np.hypot(*shift):.0f} px; check that heights "
             "are ellipsoidal and that RPC and image belong together"
         )
-    tilt = float(np.linalg.norm(fit.affine[:, :2] - np.eye(2), ord=2))
-    if tilt > LARGE_TILT:
+    if (tilt := _tilt(fit.affine)) > LARGE_TILT:
         found.append(
             f"{fit.view} image: the {model} changes scale or angle by {100 * tilt:.2f} %, more "
             "than RPCs err; check the GCPs at the ends, or take a simpler alignment.model"
@@ -618,7 +629,7 @@ def align(
     of = f" (scene {scene})" if scene else ""
     images = Path(left_image), Path(right_image)
     points = read_gcps(gcps_csv, scene)
-    opened = [_open_view(n, image, points, of) for n, image in zip(("left", "right"), images)]
+    opened = [_open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
     near = _check_ground(points, (_footprint(*item) for item in opened), of)
     _check_swapped(points, sensors, near, of)

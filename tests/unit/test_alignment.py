@@ -364,6 +364,17 @@ def collinear(n: int = 12) -> list[dict]:
             r"point G06 is measured in neither image",
         ),
         ([], {}, r"no points in the file"),
+        (
+            [{**row, "left_row": 2999 - row["left_row"]} for row in make_gcps()],
+            {},
+            r"left image.*scale or angle by 200 %.*rows from the top",
+        ),
+        ([{**row, "height": row["height"] / 0.3048} for row in make_gcps()], {}, r"do not fit"),
+        (
+            [{**row, "right_col": "", "right_row": ""} for row in make_gcps()],
+            {},
+            r"right image right\.tif: 0 GCPs",
+        ),
         (make_gcps(), {"model": "cubic"}, r"unknown alignment model 'cubic'"),
         (change(make_gcps(), left_col=500.0), {"strict": True}, r"GCP G06 left out.*strict"),
     ],
