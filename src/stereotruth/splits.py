@@ -169,6 +169,7 @@ def split_tiles(places: Sequence[Place], weights: Mapping[str, int], seed: int) 
     whose lengths are :func:`scaled_counts`; the seed draws which split comes first. A run ends
     a little earlier or later where that costs fewer tiles; tiles that share ground with a tile
     across the end of a run get ``none`` (as few as a greedy search finds, of long runs first).
+    If that leaves a split without a tile, it is done again without the least of the splits.
     """
     if not places:
         return []
@@ -200,7 +201,11 @@ def split_tiles(places: Sequence[Place], weights: Mapping[str, int], seed: int) 
         cuts.append(best)
     run = np.searchsorted(cuts[1:], np.arange(len(places)), side="right")
     none = _cover([(p, q) for p, q in pairs if run[p] != run[q]], run.tolist())
-    return [NONE if p in none else names[run[p]] for p in position.tolist()]
+    found = [NONE if p in none else names[run[p]] for p in position.tolist()]
+    if all(name in found for name in names):
+        return found
+    fewest = min(names, key=lambda name: weights.get(name, 0))
+    return split_tiles(places, {n: w for n, w in weights.items() if n != fewest}, seed)
 
 
 def shared_ground(*manifests: str | Path) -> list[tuple[str, str]]:

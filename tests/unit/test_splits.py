@@ -146,3 +146,8 @@ def test_all_test_and_none_at_all() -> None:
     assert split_tiles([], weights("Wuhan"), 0) == []
     assert set(split_tiles(grid(2, 3, stride=SIZE // 2), weights("Wuhan"), 0)) == {"test"}
     assert split_tiles(grid(1, 1), weights("Qichun"), 0) == ["train"]
+
+
+def test_tiles_that_all_overlap_stay_together() -> None:
+    places = grid(2, 2, stride=SIZE // 4)
+    assert split_tiles(places, weights("Qichun"), 0) == ["train"] * 4
