@@ -19,4 +19,5 @@ if __name__ == "__main__":
             min_points=settings["min_points_per_px"],
             workers=snakemake.threads,
             code=snakemake.params.code,
+            scene=scene,
         )
