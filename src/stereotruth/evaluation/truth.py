@@ -9,10 +9,12 @@ The true disparity at an epipolar pixel, whose raw left position falls between f
 
 - interpolated bilinearly, if all four see one class of surface and their disparities differ by
   ``SMOOTH_PX`` at most;
-- else that of the nearest raw pixel. That is right to half a pixel, so that on an edge a label of
-  the one surface may be held against the other, although the ray through the epipolar pixel's
-  centre meets the first. How much of the error that can be is told by ``errors_either``, which
-  takes the surface of the four raw pixels that is nearest to the label.
+- else that of the nearest raw pixel, which is right to half a pixel: on an edge, a label of the one
+  surface may be held against the other although the ray through the epipolar pixel's centre meets
+  the first. ``errors_either`` takes the surface of the four raw pixels that is closest to the
+  label instead. Against rays cast through the epipolar pixels' centres (a small scene full of trees)
+  the rule is fair: 0.104 px mean and 0.64 % over 1 px, where the rays gave 0.100 px and 0.57 %;
+  ``errors_either`` is too kind: 0.068 px and 0.12 %.
 
 Visibility, change and class are those of the nearest raw pixel. Everything is done in blocks of the
 grid.
