@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 import zarr
 from numpy.typing import NDArray
 
@@ -41,6 +40,7 @@ from ..errors import InputError
 from ..grid_store import blocks, require_complete
 from ..runlog import progress
 from .statistics import LIMITS, ErrorSum
+from .warping import read_tile
 
 log = logging.getLogger("stereotruth")
 
@@ -293,10 +293,7 @@ def _tile_rows(tiles: Path, scene: str) -> list[dict[str, str]]:
 
 def read_tile_disparity(tiles: Path, row: Mapping[str, str]) -> Floats:
     """Disparity of an exported tile in px of the scene's grid: its right offset is added."""
-    with rasterio.open(tiles / row["disp"]) as dataset:
-        values = dataset.read(1).astype(np.float64)
-        values[values == dataset.nodata] = np.nan
-    return values + float(row["right_offset_px"])
+    return read_tile(tiles / row["disp"]) + float(row["right_offset_px"])
 
 
 def _mapped(work: Any, items: Sequence[Any], workers: int, what: str) -> Iterator[Any]:

@@ -7,6 +7,7 @@ correlation coefficient over all labelled pixels of a scene or a tile.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
 
 from ..errors import InputError
 from ..grid_store import blocks, require_complete
@@ -53,6 +55,13 @@ class CorrelationSum:
         if va <= 0 or vb <= 0:
             return float("nan")
         return (self.ab - self.a * self.b / n) / float(np.sqrt(va * vb))
+
+    def match(self, b: Floats) -> Floats:
+        """``b`` brought to the brightness of ``a`` by the linear regression of a on b."""
+        n = max(self.count, 1)
+        variance = self.bb - self.b**2 / n
+        gain = (self.ab - self.a * self.b / n) / variance if variance > 0 else 1.0
+        return gain * (b - self.b / n) + self.a / n
 
 
 def warp_rows(right: Floats, x: Floats) -> Floats:
@@ -129,30 +138,43 @@ class WarpedTile:
     disparity: Floats
 
     @property
-    def correlation(self) -> float:
+    def sums(self) -> CorrelationSum:
         """Of left and warped right image over the labelled pixels."""
         total = CorrelationSum()
         good = np.isfinite(self.warped) & (self.left != 0)
         total.add(self.left[good], self.warped[good])
-        return total.coefficient
+        return total
+
+    @property
+    def correlation(self) -> float:
+        """Coefficient of left and warped right image over the labelled pixels."""
+        return self.sums.coefficient
+
+
+def read_tile(path: Path) -> Floats:
+    """The band of an exported TIFF, float64[h, w]; NaN where it is nodata."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as dataset:
+            values = dataset.read(1).astype(np.float64)
+            values[values == dataset.nodata] = np.nan
+            return values
 
 
 def warp_tile(tiles: str | Path, row: Mapping[str, str]) -> WarpedTile:
     """Warp an exported tile by its own disparity; ``row`` is its line of the manifest."""
     folder = Path(tiles)
-    images = []
-    for kind in ("left", "right", "disp"):
-        with rasterio.open(folder / row[kind]) as dataset:
-            images.append(dataset.read(1).astype(np.float64))
-            nodata = dataset.nodata
-    left, right, disparity = images
-    disparity[disparity == nodata] = np.nan
+    left, right, disparity = (read_tile(folder / row[kind]) for kind in ("left", "right", "disp"))
     x = np.arange(left.shape[1])[None, :] - disparity
-    return WarpedTile(row["tile"], left, warp_rows(right, x), disparity)
+    warped = warp_rows(np.nan_to_num(right), x)
+    return WarpedTile(row["tile"], np.nan_to_num(left), warped, disparity)
 
 
 def draw_panels(tile: WarpedTile, path: str | Path) -> None:
-    """PNG of the left image, the warped right one, their difference and the disparity."""
+    """PNG of the left image, the warped right one, their difference and the disparity.
+
+    The difference is taken after a linear match of brightness.
+    """
     from matplotlib.figure import Figure
 
     path = Path(path)
@@ -160,13 +182,17 @@ def draw_panels(tile: WarpedTile, path: str | Path) -> None:
     figure = Figure(figsize=(15, 14.4), layout="constrained")
     axes = figure.subplots(2, 2)
     low, high = np.percentile(tile.left, (1, 99))
-    difference = tile.left - tile.warped
+    difference = tile.left - tile.sums.match(tile.warped)
     spread = float(np.nanpercentile(np.abs(difference), 99)) if np.isfinite(difference).any() else 1
     gray = {"cmap": "gray", "vmin": low, "vmax": high}
     panels = (
         (tile.left, "left", gray),
         (tile.warped, f"warped right, correlation {tile.correlation:.3f}", gray),
-        (difference, "left − warped right", {"cmap": "RdBu", "vmin": -spread, "vmax": spread}),
+        (
+            difference,
+            "left − warped right, brought to its brightness",
+            {"cmap": "RdBu", "vmin": -spread, "vmax": spread},
+        ),
         (tile.disparity, "disparity (px)", {"cmap": "turbo"}),
     )
     for ax, (image, title, style) in zip(axes.ravel(), panels):
