@@ -1,7 +1,7 @@
 """Make synthetic cities without a workflow.
 
-    python -m stereotruth.simulate Qichun data/synthetic/Qichun
-    python -m stereotruth.simulate gcps config/gcps
+python -m stereotruth.simulate Qichun data/synthetic/Qichun
+python -m stereotruth.simulate gcps config/gcps
 """
 
 from __future__ import annotations

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+import numpy as np
 
-from .surfaces import CELL_M, GROUND, ROOF, TREE, WALL, WATER, in_shadow, terrain_at
+from .kernels import inlined
+from .surfaces import CELL_M, GROUND, ROOF, TREE, WATER, in_shadow
 
 SKY = 0.34  # diffuse share of the light
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _hash(i, j, k):
     """Uniform number in [0, 1) of three integers."""
     h = (i * 374761393 + j * 668265263 + k * 2147483647) & 0xFFFFFFFF
@@ -24,19 +25,20 @@ def _hash(i, j, k):
     return (h ^ (h >> 15)) / 4294967296.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _sample(texture, u, v):
     """Bilinear value of a periodic texture at (u, v) in its pixels; the size is a power of two."""
     mask = texture.shape[0] - 1
-    i, j = math.floor(u), math.floor(v)
-    f, g = u - i, v - j
-    i, j = int(i) & mask, int(j) & mask
-    k, m = (i + 1) & mask, (j + 1) & mask
+    fu, fv = math.floor(u), math.floor(v)
+    f, g = u - fu, v - fv
+    iu, iv = int(fu), int(fv)
+    i, j = np.uint64(iu & mask), np.uint64(iv & mask)
+    k, m = np.uint64((iu + 1) & mask), np.uint64((iv + 1) & mask)
     top = texture[j, i] * (1 - f) + texture[j, k] * f
     return top * (1 - g) + (texture[m, i] * (1 - f) + texture[m, k] * f) * g
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def zone_at(s, x, y):
     """Land use zone of a plan position."""
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
@@ -53,40 +55,50 @@ def zone_at(s, x, y):
     return zone
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _ground(s, x, y, slope):
     """Reflectance of the ground."""
     fine = _sample(s.fine, 4.0 * x, 4.0 * y)
     # the same texture turned and enlarged: no pattern repeats within a scene
     mid = _sample(s.fine, 1.13 * x + 0.83 * y, 1.13 * y - 0.83 * x)
     broad = _sample(s.broad, 0.5 * x, 0.5 * y)
-    z = s.zones[zone_at(s, x, y)]
-    kind = int(z[7])
+    n = zone_at(s, x, y)
+    kind = int(s.zones[n, 7])
     if slope > 0.24 and kind != 8:
         kind = 7
-    p = x * z[2] + y * z[3]
-    q = y * z[2] - x * z[3]
-    i, j = math.floor(p / z[4]), math.floor(q / z[5])
-    pe, qe = p - i * z[4], q - j * z[5]
-    pe, qe = min(pe, z[4] - pe), min(qe, z[5] - qe)
+    p = x * s.zones[n, 2] + y * s.zones[n, 3]
+    q = y * s.zones[n, 2] - x * s.zones[n, 3]
+    i, j = math.floor(p / s.zones[n, 4]), math.floor(q / s.zones[n, 5])
+    pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
+    pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
     edge = min(pe, qe)
-    chance = _hash(int(i), int(j), int(z[8] * 1e6))
+    chance = _hash(int(i), int(j), int(s.zones[n, 8] * 1e6))
     if kind < 5:
-        if edge < z[6]:  # street
+        if edge < s.zones[n, 6]:  # street
             along = q if pe < qe else p
-            value = 0.155 + 0.02 * z[8] + 0.016 * fine + 0.022 * mid + 0.012 * broad
-            if z[6] > 3.5 and edge < 0.22 and along - 8 * math.floor(along / 8) < 4:
+            value = 0.155 + 0.02 * s.zones[n, 8] + 0.016 * fine + 0.022 * mid + 0.012 * broad
+            if s.zones[n, 6] > 3.5 and edge < 0.22 and along - 8 * math.floor(along / 8) < 4:
                 value = 0.42
             # vehicles: parked and moving ones stand still for the seconds between the views
             slot = math.floor(along / 9.0)
-            lane = z[6] - 2.6
+            lane = s.zones[n, 6] - 2.6
             offset = along - 9.0 * slot
-            side = int(pe < qe) + 2 * int((p - i * z[4] < z[4] / 2) if pe < qe else (q - j * z[5] < z[5] / 2))
+            side = int(pe < qe) + 2 * int(
+                (p - i * s.zones[n, 4] < s.zones[n, 4] / 2)
+                if pe < qe
+                else (q - j * s.zones[n, 5] < s.zones[n, 5] / 2)
+            )
             car = _hash(int(slot), int(i * 7919 + j), 17 + side)
-            if z[6] > 3.5 and car < 0.3 and abs(edge - lane) < 0.95 and offset > 2 and offset < 6.4:
+            if (
+                s.zones[n, 6] > 3.5
+                and car < 0.3
+                and abs(edge - lane) < 0.95
+                and offset > 2
+                and offset < 6.4
+            ):
                 value = 0.08 + 2.2 * car if car > 0.06 else 0.75
             return value
-        if edge < z[6] + 2.2 and z[6] > 3.5:
+        if edge < s.zones[n, 6] + 2.2 and s.zones[n, 6] > 3.5:
             return 0.30 + 0.03 * fine + 0.03 * mid
         green = 0.55 * mid + 0.8 * broad + 2.2 * (chance - 0.5)
         if kind == 4:
@@ -101,52 +113,64 @@ def _ground(s, x, y, slope):
             return 0.36 + 0.03 * fine
         return 0.14 + 0.03 * fine + 0.025 * mid + 0.02 * broad
     if kind == 6:  # fields
-        if edge < z[6]:
+        if edge < s.zones[n, 6]:
             return 0.30 + 0.04 * fine
         crop = _hash(int(i), int(j), 5)
         furrow = 1.1 + 1.6 * crop
         lines = math.sin(2 * math.pi * (q if chance > 0.3 else p) / furrow + 1.5 * mid)
-        return 0.11 + 0.19 * chance + 0.018 * lines + (0.02 + 0.015 * crop) * fine + 0.025 * mid + 0.012 * broad
+        return (
+            0.11
+            + 0.19 * chance
+            + 0.018 * lines
+            + (0.02 + 0.015 * crop) * fine
+            + 0.025 * mid
+            + 0.012 * broad
+        )
     if kind == 7:  # under trees: litter, grass
         return 0.12 + 0.035 * fine + 0.025 * mid + 0.015 * broad
     return 0.27 + 0.06 * fine + 0.05 * mid + 0.03 * broad
 
 
-@njit(cache=True, nogil=True)
-def reflectance(s, x, y, z, kind, index, face):
-    """Light that comes back from a surface point, about 0 to 1."""
+@inlined
+def reflectance(s, x, y, z, kind, index, face, zx, zy):
+    """Light that comes back from a surface point, about 0 to 1; ``zx``, ``zy``: slope of ground."""
     sun = s.sun
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == GROUND:
-        _, zx, zy = terrain_at(s, x, y)
         value = _ground(s, x, y, math.sqrt(zx * zx + zy * zy))
         n = 1 / math.sqrt(1 + zx * zx + zy * zy)
         nx, ny, nz = -zx * n, -zy * n, n
     elif kind == WATER:
         value = 0.06 + 0.004 * _sample(s.fine, 1.7 * x, 1.7 * y) + 0.006 * _sample(s.broad, x, y)
     elif kind == TREE:
-        tree = s.trees[index]
-        nx = (x - tree[0]) / (tree[3] * tree[3])
-        ny = (y - tree[1]) / (tree[3] * tree[3])
-        nz = (z - tree[2]) / (tree[4] * tree[4])
+        nx = (x - s.trees[index, 0]) / (s.trees[index, 3] * s.trees[index, 3])
+        ny = (y - s.trees[index, 1]) / (s.trees[index, 3] * s.trees[index, 3])
+        nz = (z - s.trees[index, 2]) / (s.trees[index, 4] * s.trees[index, 4])
         n = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx * n, ny * n, nz * n
         leaf = _sample(s.fine, 4.1 * x + 2.3 * z, 4.1 * y - 1.7 * z)
-        value = 0.15 + 0.05 * (tree[3] - math.floor(tree[3]) - 0.5) + 0.062 * leaf
+        value = (
+            0.15 + 0.05 * (s.trees[index, 3] - math.floor(s.trees[index, 3]) - 0.5) + 0.062 * leaf
+        )
     else:
-        box, style = s.boxes[index], s.box_style[index]
-        u = (x - box[0]) * box[2] + (y - box[1]) * box[3]
-        v = (y - box[1]) * box[2] - (x - box[0]) * box[3]
+        u = (x - s.boxes[index, 0]) * s.boxes[index, 2] + (y - s.boxes[index, 1]) * s.boxes[
+            index, 3
+        ]
+        v = (y - s.boxes[index, 1]) * s.boxes[index, 2] - (x - s.boxes[index, 0]) * s.boxes[
+            index, 3
+        ]
         if kind == ROOF:
-            fine = _sample(s.fine, 4.0 * u + style[3], 4.0 * v + 1.7 * style[3])
-            mid = _sample(s.fine, 1.3 * v - style[3], 1.3 * u + style[3])
-            cover = int(style[2])
-            value = style[0] * (1 + 0.10 * fine + 0.12 * mid)
-            if box[7] > 0:
-                k = box[7] / box[5]
+            fine = _sample(
+                s.fine, 4.0 * u + s.box_style[index, 3], 4.0 * v + 1.7 * s.box_style[index, 3]
+            )
+            mid = _sample(s.fine, 1.3 * v - s.box_style[index, 3], 1.3 * u + s.box_style[index, 3])
+            cover = int(s.box_style[index, 2])
+            value = s.box_style[index, 0] * (1 + 0.10 * fine + 0.12 * mid)
+            if s.boxes[index, 7] > 0:
+                k = s.boxes[index, 7] / s.boxes[index, 5]
                 n = 1 / math.sqrt(1 + k * k)
                 side = 1.0 if face == 0 else -1.0
-                nx, ny, nz = -side * k * n * box[3], side * k * n * box[2], n
+                nx, ny, nz = -side * k * n * s.boxes[index, 3], side * k * n * s.boxes[index, 2], n
             if cover == 2:  # tiles: lines down the slope
                 value *= 1 + 0.07 * math.sin(2 * math.pi * u / 1.4)
             elif cover == 3:  # sheet metal: broad panels
@@ -154,23 +178,23 @@ def reflectance(s, x, y, z, kind, index, face):
                 value *= 0.92 + 0.16 * _hash(int(panel), index, 3)
             elif cover == 1:
                 value *= 1 + 0.09 * fine
-            rim = min(box[4] - abs(u), box[5] - abs(v))
-            if box[7] == 0:
+            rim = min(s.boxes[index, 4] - abs(u), s.boxes[index, 5] - abs(v))
+            if s.boxes[index, 7] == 0:
                 if rim < 0.55:  # parapet
                     value = value * 0.6 + 0.18
-                elif cover == 0 and box[4] > 5:  # sheets of bitumen, plants, tanks
+                elif cover == 0 and s.boxes[index, 4] > 5:  # sheets of bitumen, plants, tanks
                     cell = _hash(int(math.floor(u / 3.1)), int(math.floor(v / 2.7)), index)
                     if cell < 0.10:
                         value *= 0.55 + 6 * cell
         else:
             if face < 4:
                 along, side = v, 1.0 if face == 2 else -1.0
-                nx, ny, nz = side * box[2], side * box[3], 0.0
+                nx, ny, nz = side * s.boxes[index, 2], side * s.boxes[index, 3], 0.0
             else:
                 along, side = u, 1.0 if face == 4 else -1.0
-                nx, ny, nz = -side * box[3], side * box[2], 0.0
-            fine = _sample(s.fine, 4.0 * along + style[3], 4.0 * z + face * 97.0)
-            value = style[1] * (1 + 0.10 * fine)
+                nx, ny, nz = -side * s.boxes[index, 3], side * s.boxes[index, 2], 0.0
+            fine = _sample(s.fine, 4.0 * along + s.box_style[index, 3], 4.0 * z + face * 97.0)
+            value = s.box_style[index, 1] * (1 + 0.10 * fine)
             storey = z - 3.0 * math.floor(z / 3.0)
             bay = along - 3.4 * math.floor(along / 3.4)
             if storey > 0.9 and storey < 2.4 and bay > 0.7 and bay < 2.6:

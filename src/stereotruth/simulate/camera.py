@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
+from .kernels import kernel
 
 ALTITUDE_M = 505e3
 INCLINATION_DEG = 97.4
@@ -36,15 +36,23 @@ ROWS_MID = 36
 SIZE = 37
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose(cam, row, out):
     """Write position and body axes (forward, left, up) of one line, world frame, to out[12]."""
     t = cam[TIME0] + row * cam[PERIOD]
     # the circle in inertial space, turned back into ECEF
     c, s = math.cos(cam[MOTION] * t), math.sin(cam[MOTION] * t)
     ce, se = math.cos(EARTH_RATE * t), math.sin(EARTH_RATE * t)
-    ux, uy, uz = c * cam[P] + s * cam[Q], c * cam[P + 1] + s * cam[Q + 1], c * cam[P + 2] + s * cam[Q + 2]
-    fx, fy, fz = c * cam[Q] - s * cam[P], c * cam[Q + 1] - s * cam[P + 1], c * cam[Q + 2] - s * cam[P + 2]
+    ux, uy, uz = (
+        c * cam[P] + s * cam[Q],
+        c * cam[P + 1] + s * cam[Q + 1],
+        c * cam[P + 2] + s * cam[Q + 2],
+    )
+    fx, fy, fz = (
+        c * cam[Q] - s * cam[P],
+        c * cam[Q + 1] - s * cam[P + 1],
+        c * cam[Q + 2] - s * cam[P + 2],
+    )
     ux, uy = ce * ux + se * uy, -se * ux + ce * uy
     fx, fy = ce * fx + se * fy, -se * fx + ce * fy
     lx, ly, lz = uy * fz - uz * fy, uz * fx - ux * fz, ux * fy - uy * fx
@@ -70,7 +78,7 @@ def pose(cam, row, out):
         out[9 + k] = f * m02 + le * m12 + u * m22
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def direction(cam, line, col):
     """Direction (not normalised, z < 0) of the ray of a column, given its line's pose."""
     across = (col - cam[COL0]) * cam[PITCH_PER_COL]
@@ -82,7 +90,7 @@ def direction(cam, line, col):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_point(cam, x, y, z, row, line):
     """(col, row) of a world point; ``row`` is a first guess, ``line`` float64[12] is scratch.
 
@@ -109,7 +117,7 @@ def project_point(cam, x, y, z, row, line):
     return cam[COL0] + across / cam[PITCH_PER_COL], row
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project(cam, xyz, out):
     line = np.empty(12)
     row = cam[ROWS_MID]
@@ -126,7 +134,7 @@ def project(cam: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rays(cam, colrow, origin, toward):
     line = np.empty(12)
     for i in range(colrow.shape[0]):

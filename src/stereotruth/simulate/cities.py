@@ -18,7 +18,8 @@ class SceneSpec:
     ``centre_m``: ground position of the scene's middle, east and north of the city's centre.
     ``cols``, ``rows``: size of the left image. ``pose_seed`` draws orbit offset, attitude and the
     bias of the RPCs. ``lidar_grid``: LiDAR tiles (east, north). ``ragged_m``: how far the
-    coverage's edge stays inside the left image at its last columns and its first rows.
+    coverage's edge stays inside the left image at its last columns and its first rows, on average;
+    ``gap_m``: size of the block without LiDAR in the corner between these two sides.
     """
 
     name: str
@@ -28,7 +29,8 @@ class SceneSpec:
     pose_seed: int
     ascending: bool = False
     lidar_grid: tuple[int, int] = (2, 2)
-    ragged_m: tuple[float, float] = (90.0, 90.0)
+    ragged_m: tuple[float, float] = (40.0, 40.0)
+    gap_m: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,9 @@ class CitySpec:
 
 
 def _one(name: str, cols: int, rows: int, seed: int, **more) -> tuple[SceneSpec, ...]:
-    return (SceneSpec(f"{name}-1", (0.0, 0.0), cols, rows, seed, **more),)
+    return (
+        SceneSpec(f"{name}-1", (0.0, 0.0), cols, rows, seed, gap_m=(845.0, 748.0), **more),
+    )
 
 
 CITIES: dict[str, CitySpec] = {
@@ -111,7 +115,7 @@ CITIES: dict[str, CitySpec] = {
                 (45, 98),
                 0.8,
             ),
-            _one("Wuhan", 2900, 2900, 101),
+            _one("Wuhan", 2500, 3400, 101),
         ),
         CitySpec(
             "Hengyang",
@@ -131,7 +135,7 @@ CITIES: dict[str, CitySpec] = {
                 (30, 60),
                 0.8,
             ),
-            _one("Hengyang", 2900, 2900, 102),
+            _one("Hengyang", 2500, 3400, 102),
             las_format="las-1.2-1",
         ),
         CitySpec(
@@ -142,17 +146,14 @@ CITIES: dict[str, CitySpec] = {
             72.0,
             13,
             Character(
-                420,
-                0.38,
-                1900,
-                42,
+                360, 0.42, 2300, 40,
                 90,
                 0,
                 {"towers": 1, "slabs": 2, "lowrise": 2, "village": 1, "fields": 1, "forest": 3},
                 (28, 55),
                 1.0,
             ),
-            _one("Shaoguan", 2900, 2900, 103),
+            _one("Shaoguan", 2500, 3400, 103),
         ),
         CitySpec(
             "Kunming",
@@ -180,7 +181,7 @@ CITIES: dict[str, CitySpec] = {
                 (40, 75),
                 1.0,
             ),
-            _one("Kunming", 2900, 2900, 104),
+            _one("Kunming", 2500, 3400, 104),
             sun_elevation_deg=58.0,
         ),
         CitySpec(
@@ -191,17 +192,14 @@ CITIES: dict[str, CitySpec] = {
             36.0,
             15,
             Character(
-                460,
-                0.3,
-                1700,
-                45,
+                400, 0.36, 2500, 42,
                 80,
                 0,
                 {"slabs": 1, "lowrise": 1.5, "village": 2.5, "fields": 3, "forest": 4, "bare": 1},
                 (20, 40),
                 1.15,
             ),
-            _one("Yingde", 2900, 2900, 105, ascending=True),
+            _one("Yingde", 2500, 3400, 105, ascending=True),
         ),
         CitySpec(
             "Qichun",
@@ -231,8 +229,10 @@ CITIES: dict[str, CitySpec] = {
                 0.9,
             ),
             (
-                SceneSpec("Qichun-1", (-1080.0, 170.0), 3650, 3650, 106, lidar_grid=(3, 2)),
-                SceneSpec("Qichun-2", (1080.0, -170.0), 3650, 3650, 107, lidar_grid=(3, 2)),
+                SceneSpec("Qichun-1", (-1080.0, 170.0), 3650, 3650, 106, lidar_grid=(3, 2),
+                          gap_m=(845.0, 812.0)),
+                SceneSpec("Qichun-2", (1080.0, -170.0), 3650, 3650, 107, lidar_grid=(3, 2),
+                          gap_m=(845.0, 812.0)),
             ),
         ),
     )

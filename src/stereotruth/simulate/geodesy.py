@@ -11,7 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from .kernels import kernel
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563
@@ -34,7 +35,7 @@ def geodetic_to_ecef(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ecef_to_geodetic_point(x, y, z):
     """Longitude, latitude (degrees) and ellipsoidal height (m) of one ECEF point.
 
@@ -60,7 +61,7 @@ def ecef_to_geodetic_point(x, y, z):
     return math.degrees(math.atan2(y, x)), math.degrees(math.atan(tan_phi)), height
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ecef_to_geodetic(xyz, out):
     for i in range(xyz.shape[0]):
         out[i, 0], out[i, 1], out[i, 2] = ecef_to_geodetic_point(xyz[i, 0], xyz[i, 1], xyz[i, 2])
@@ -112,7 +113,7 @@ class LocalFrame:
         return np.concatenate([self.origin, self.axes.ravel()])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def world_to_geodetic_point(frame, x, y, z):
     """Longitude, latitude (degrees), ellipsoidal height (m) of one world point."""
     return ecef_to_geodetic_point(

@@ -12,12 +12,12 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pyproj
-from numba import njit
 
 from ..errors import InputError
 from ..runlog import progress
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
+from .kernels import kernel
 from .surfaces import GROUND, IN_LIDAR, ROOF, TREE, WALL, WATER, Surfaces, cast, terrain_at
 from .world import build_surfaces, frame_of, half_size, image_axes
 
@@ -35,10 +35,10 @@ NAN = float("nan")
 
 
 def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
-    """Packed outline float64[17] of a scene's LiDAR coverage, see :func:`covered`.
+    """Packed outline float64[21] of a scene's LiDAR coverage, see :func:`covered`.
 
     It reaches beyond the image at the first columns and last rows, and ends inside it, raggedly,
-    at the last columns and first rows.
+    at the last columns and first rows, with a block missing in the corner between them.
     """
     across, along = image_axes(city, scene)
     rng = np.random.default_rng([scene.pose_seed, 6])
@@ -49,7 +49,7 @@ def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
     ])  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def covered(c, x, y):
     """Whether a plan position lies in the LiDAR coverage."""
     dx, dy = x - c[0], y - c[1]
@@ -60,7 +60,11 @@ def covered(c, x, y):
     edge_a += 0.15 * math.sin(b / 19 + c[13])
     edge_b = 1 + 0.5 * math.sin(a / 170 + c[14]) + 0.3 * math.sin(a / 53 + c[15])
     edge_b += 0.15 * math.sin(a / 17 + c[16])
-    return a < c[6] - c[9] * edge_a and b > -c[7] + c[10] * edge_b
+    if a > c[6] - c[9] * edge_a or b < -c[7] + c[10] * edge_b:
+        return False
+    gap_a = c[17] * (1 + 0.05 * math.sin(b / 90 + c[19]) + 0.02 * math.sin(b / 23))
+    gap_b = c[18] * (1 + 0.05 * math.sin(a / 80 + c[20]) + 0.02 * math.sin(a / 21))
+    return a < c[6] - gap_a or b > -c[7] + gap_b
 
 
 def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[float, ...]:
@@ -77,7 +81,7 @@ def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[
     return (*start, *(start + step))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
     """Pulses of lattice lines [first, last) of one set of flight lines inside a tile.
 
@@ -102,7 +106,9 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             slant = ((line + 0.5 - 0.5 * strip) * LINE_SPACING_M - across) / FLYING_HEIGHT_M
             bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
             ax, ay = x - bx * ground, y - by * ground
-            z, kind, index, _, _ = cast(s, ax, ay, bx, by, IN_LIDAR, True, ground)
+            z, kind, index, _, _, _, _ = cast(
+                s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground
+            )
             if kind == 0:
                 continue
             chance = rng.random()
@@ -111,7 +117,9 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
             for k in range(returns):
                 if k == 1:
-                    z, kind, index, _, _ = cast(s, ax, ay, bx, by, IN_LIDAR, False, ground)
+                    z, kind, index, _, _, _, _ = cast(
+                        s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, False, ground
+                    )
                     if kind == 0:
                         break
                 px, py, pz = ax + bx * z, ay + by * z, z
@@ -146,7 +154,7 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _polynomial(coefficients, middle, scale, xyz, out):
     """Evaluate the three polynomials of :func:`to_grid` for points [n, 3]."""
     for n in range(xyz.shape[0]):
@@ -299,6 +307,8 @@ def simulate_lidar_tile(
     finally:
         scratch.unlink(missing_ok=True)
     if not counts.sum():
-        raise RuntimeError(f"{tile_name}: no point lies in this tile; change the scene's lidar_grid")
+        raise RuntimeError(
+            f"{tile_name}: no point lies in this tile; change the scene's lidar_grid"
+        )
     log.info("%s: %.2f million points", tile_name, counts.sum() / 1e6)
     return {str(k): int(v) for k, v in enumerate(counts) if v}

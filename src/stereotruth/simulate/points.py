@@ -8,10 +8,10 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from .cities import CITIES, CitySpec, SceneSpec
-from .render import Scene, in_collar, prepare
+from .kernels import kernel
+from .render import Scene, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, cast, terrain_heights
 from .truth import seen_from
 from .world import scene_coordinates
@@ -25,14 +25,14 @@ GCP_NOISE_PX = 0.25
 FRAME_MARGIN_PX = 30.0
 
 
-@njit(cache=True, nogil=True)
-def _see(s, left, right, size, xyz, tolerance, image, seen):
+@kernel
+def _see(s, above_left, above_right, left, right, size, xyz, tolerance, image, seen):
     """Image coordinates (left col, row, right col, row) of points, and whether both views do."""
     line = np.empty(12)
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        lc, lr, free = seen_from(s, left, x, y, z, 0.5 * size[1], line, tolerance)
-        rc, rr, both = seen_from(s, right, x, y, z, 0.5 * size[3], line, tolerance)
+        lc, lr, free = seen_from(s, above_left, left, x, y, z, 0.5 * size[1], line, tolerance)
+        rc, rr, both = seen_from(s, above_right, right, x, y, z, 0.5 * size[3], line, tolerance)
         image[n, 0], image[n, 1], image[n, 2], image[n, 3] = lc, lr, rc, rr
         m = FRAME_MARGIN_PX
         seen[n] = (
@@ -51,7 +51,7 @@ def _sizes(ready: Scene) -> np.ndarray:
 def _visible(ready: Scene, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     image = np.empty((len(xyz), 4))
     seen = np.zeros(len(xyz), bool)
-    _see(ready.surfaces, ready.left.cam, ready.right.cam, _sizes(ready),
+    _see(ready.surfaces, ready.left.horizon, ready.right.horizon, ready.left.cam, ready.right.cam, _sizes(ready),
          np.ascontiguousarray(xyz), 0.005, image, seen)  # fmt: skip
     return image, seen
 
@@ -171,12 +171,12 @@ def make_points(
     return measured, exact, checks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _open(s, xyz, out):
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        a, kind_a, _, _, _ = cast(s, x, y, 0.0, 0.0, IN_IMAGES, True, z)
-        b, kind_b, _, _, _ = cast(s, x, y, 0.0, 0.0, IN_LIDAR, True, z)
+        a, kind_a, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, IN_IMAGES, True, z)
+        b, kind_b, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, IN_LIDAR, True, z)
         out[n] = kind_a != 0 and kind_b != 0 and a < z + 0.005 and b < z + 0.005
 
 

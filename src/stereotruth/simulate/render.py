@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 import rasterio
-from numba import njit
 from rasterio.rpc import RPC as RPCMetadata
 
 from ..errors import InputError
 from ..runlog import progress
 from .appearance import reflectance
-from .camera import aim, direction, pose, project
+from .camera import aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
+from .kernels import kernel
 from .rpcs import FittedRPC, draw_bias, fit_rpc
-from .surfaces import IN_IMAGES, Surfaces, cast, terrain_heights
-from .world import build_surfaces, frame_of, half_size, near_scenes, scene_coordinates
+from .surfaces import IN_IMAGES, Surfaces, cast, horizon, terrain_heights
+from .world import build_surfaces, frame_of, half_size, scene_coordinates
 
 log = logging.getLogger("stereotruth")
 
@@ -34,13 +34,14 @@ RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN
 
 
 class Camera(NamedTuple):
-    """One view of a scene: packed camera, image size, and the fitted and biased RPCs."""
+    """One view of a scene: packed camera, image size, biased RPCs, horizon of its rays."""
 
     view: str
     cam: np.ndarray
     cols: int
     rows: int
     rpc: FittedRPC
+    horizon: np.ndarray
 
 
 class Scene(NamedTuple):
@@ -102,11 +103,13 @@ def _prepare(city: CitySpec, scene: SceneSpec) -> Scene:
         rpc = fit_rpc(cam, frame, cols=cols, rows=rows, heights=heights, bias=bias)
         if rpc.rms_px > 0.01:
             raise RuntimeError(f"{scene.name} {view}: RPCs miss the camera by {rpc.rms_px:.3f} px")
-        cameras.append(Camera(view, cam, cols, rows, rpc))
+        _, toward = rays(cam, [[(cols - 1) / 2, (rows - 1) / 2]])
+        above = horizon(surfaces.cell_top, toward[0, 0], toward[0, 1])
+        cameras.append(Camera(view, cam, cols, rows, rpc, above))
     return Scene(city, scene, frame, surfaces, *cameras)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_collar(left, col, row, cols, rows):
     """Whether an image position lies in the strip without data along the frame.
 
@@ -118,26 +121,29 @@ def in_collar(left, col, row, cols, rows):
     return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
 
 
-@njit(cache=True, nogil=True)
-def _shade_rows(s, cam, first_row, out):
+@kernel
+def _shade_rows(s, above, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
 
     ``first_row`` is the image row of out's row 0; out's column 0 is image column −2.
     """
     line = np.empty(12)
-    guess = 0.0
+    guess = before = 0.0
     for r in range(out.shape[0]):
         pose(cam, first_row - 0.25 + 0.5 * r, line)
         for c in range(out.shape[1]):
             dx, dy, dz = direction(cam, line, -2.25 + 0.5 * c)
             bx, by = dx / dz, dy / dz
             ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-            z, kind, index, face, ground = cast(s, ax, ay, bx, by, IN_IMAGES, True, guess)
-            guess = ground
+            z, kind, index, face, ground, zx, zy = cast(
+                s, above, ax, ay, bx, by, IN_IMAGES, True, guess
+            )
+            guess = ground + (ground - before) if c else ground  # the ground goes on as it did
+            before = ground
             if kind == 0:
                 out[r, c] = 0.1
             else:
-                out[r, c] = reflectance(s, ax + bx * z, ay + by * z, z, kind, index, face)
+                out[r, c] = reflectance(s, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy)
 
 
 def _decimate(half: np.ndarray) -> np.ndarray:
@@ -200,7 +206,7 @@ def simulate_image(
         for first in progress(strips, len(strips), f"{scene.name} {view}"):
             count = min(STRIP_ROWS, rows - first)
             half = np.empty((2 * (count + 4), 2 * (cols + 4)), np.float32)
-            _shade_rows(ready.surfaces, camera.cam, first - 2.0, half)
+            _shade_rows(ready.surfaces, camera.horizon, camera.cam, first - 2.0, half)
             signal = dark + gain * _decimate(half)
             rng = np.random.default_rng([seed, view == "left", first])
             noise = rng.standard_normal(signal.shape, dtype=np.float32)

@@ -13,12 +13,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from scipy.ndimage import maximum_filter
+
+from .kernels import inlined, kernel
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR = 1, 2
 CELL_M = 8.0
 REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
 
 
 class Surfaces(NamedTuple):
@@ -29,8 +32,8 @@ class Surfaces(NamedTuple):
     length, half width, z of the eaves, rise of the ridge. ``box_view`` uint8[n]: IN_IMAGES |
     IN_LIDAR. ``box_style`` float64[n, 4]: albedo of roof, of walls, kind of roof cover, phase.
     ``trees`` float64[n, 5]: x, y, z of the centre, radius, half height. ``*_first``/``*_list``:
-    objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object in the cell, and
-    ``reach_top`` the same over all cells that a ray may pass. ``zones``: see ``world``.
+    objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object in the cell. ``sun_top``
+    and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses. ``zones``: see ``world``.
     """
 
     x0: float
@@ -47,7 +50,8 @@ class Surfaces(NamedTuple):
     tree_first: np.ndarray
     tree_list: np.ndarray
     cell_top: np.ndarray
-    reach_top: np.ndarray
+    sun_top: np.ndarray
+    lidar_top: np.ndarray
     zones: np.ndarray
     zone_cells: np.ndarray
     fine: np.ndarray
@@ -55,14 +59,14 @@ class Surfaces(NamedTuple):
     sun: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def terrain_at(s, x, y):
     """Terrain z and its derivatives along x and y."""
-    coefficients = s.terrain
+    c = s.terrain
     u = (x - s.x0) / s.step
     v = (y - s.y0) / s.step
-    i = min(max(int(math.floor(u)), 1), coefficients.shape[1] - 3)
-    j = min(max(int(math.floor(v)), 1), coefficients.shape[0] - 3)
+    i = min(max(int(math.floor(u)), 1), c.shape[1] - 3)
+    j = min(max(int(math.floor(v)), 1), c.shape[0] - 3)
     f, g = u - i, v - j
     f1, g1 = 1 - f, 1 - g
     a0, a1 = f1 * f1 * f1 / 6, (4 - 6 * f * f + 3 * f * f * f) / 6
@@ -73,49 +77,47 @@ def terrain_at(s, x, y):
     b2, b3 = (4 - 6 * g1 * g1 + 3 * g1 * g1 * g1) / 6, g * g * g / 6
     e0, e1 = -g1 * g1 / 2, (-12 * g + 9 * g * g) / 6
     e2, e3 = (12 * g1 - 9 * g1 * g1) / 6, g * g / 2
-    z = zx = zy = 0.0
-    for k in range(4):
-        if k == 0:
-            b, e = b0, e0
-        elif k == 1:
-            b, e = b1, e1
-        elif k == 2:
-            b, e = b2, e2
-        else:
-            b, e = b3, e3
-        row = coefficients[j - 1 + k]
-        c0, c1, c2, c3 = row[i - 1], row[i], row[i + 1], row[i + 2]
-        along = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3
-        z += b * along
-        zx += b * (d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3)
-        zy += e * along
+    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
+    j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
+    i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
+    c0, c1, c2, c3 = c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3]
+    r0, q0 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+    c0, c1, c2, c3 = c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3]
+    r1, q1 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+    c0, c1, c2, c3 = c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3]
+    r2, q2 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+    c0, c1, c2, c3 = c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3]
+    r3, q3 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+    z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
+    zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
+    zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
     return z, zx / s.step, zy / s.step
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def ground_hit(s, ax, ay, bx, by, guess):
-    """z of the terrain, or water, under a ray.
+    """(z, z along x, z along y) of the terrain under a ray.
 
     One solution: no slope reaches the steepness of a ray, so Newton's method has one root to find.
     """
-    z = guess
+    z, zx, zy = guess, 0.0, 0.0
     for _ in range(25):
         t, zx, zy = terrain_at(s, ax + bx * z, ay + by * z)
         step = (t - z) / (1 - zx * bx - zy * by)
         z += step
-        if abs(step) < 1e-6:
+        if abs(step) < 1e-3:  # the next step would be its square
             break
-    return z
+    return z, zx, zy
 
 
-@njit(cache=True, nogil=True)
-def box_span(box, ax, ay, bx, by):
+@inlined
+def box_span(boxes, n, ax, ay, bx, by):
     """(lowest, highest, face) z of a ray inside a building; empty if lowest > highest.
 
     Faces: 0 and 1 the roof (its two sides), 2 to 5 the walls at +u, −u, +v, −v.
     """
-    ux, uy, a, b = box[2], box[3], box[4], box[5]
-    x, y = ax - box[0], ay - box[1]
+    ux, uy, a, b = boxes[n, 2], boxes[n, 3], boxes[n, 4], boxes[n, 5]
+    x, y = ax - boxes[n, 0], ay - boxes[n, 1]
     u0, ub = x * ux + y * uy, bx * ux + by * uy
     v0, vb = y * ux - x * uy, by * ux - bx * uy
     low, high, face = -1e30, 1e30, 0
@@ -138,13 +140,13 @@ def box_span(box, ax, ay, bx, by):
             high, face = z2, f
     elif abs(v0) > b:
         return 1.0, 0.0, 0
-    if box[7] == 0.0:
-        if box[6] < high:
-            high, face = box[6], 0
+    if boxes[n, 7] == 0.0:
+        if boxes[n, 6] < high:
+            high, face = boxes[n, 6], 0
     else:  # two roof planes that meet in the ridge over v = 0
-        k = box[7] / b
-        z1 = (box[6] + box[7] - k * v0) / (1 + k * vb)
-        z2 = (box[6] + box[7] + k * v0) / (1 - k * vb)
+        k = boxes[n, 7] / b
+        z1 = (boxes[n, 6] + boxes[n, 7] - k * v0) / (1 + k * vb)
+        z2 = (boxes[n, 6] + boxes[n, 7] + k * v0) / (1 - k * vb)
         if z1 < high:
             high, face = z1, 0
         if z2 < high:
@@ -152,29 +154,32 @@ def box_span(box, ax, ay, bx, by):
     return low, high, face
 
 
-@njit(cache=True, nogil=True)
-def tree_top(tree, ax, ay, bx, by):
+@inlined
+def tree_top(trees, n, ax, ay, bx, by):
     """Highest z of a ray inside a crown, or −1e30."""
-    r2 = tree[3] * tree[3]
-    q = r2 / (tree[4] * tree[4])
-    x, y = ax + bx * tree[2] - tree[0], ay + by * tree[2] - tree[1]
+    r2 = trees[n, 3] * trees[n, 3]
+    q = r2 / (trees[n, 4] * trees[n, 4])
+    x, y = ax + bx * trees[n, 2] - trees[n, 0], ay + by * trees[n, 2] - trees[n, 1]
     a = bx * bx + by * by + q
     b = x * bx + y * by
     c = x * x + y * y - r2
     root = b * b - a * c
     if root <= 0:
         return -1e30
-    return tree[2] + (-b + math.sqrt(root)) / a
+    return trees[n, 2] + (-b + math.sqrt(root)) / a
 
 
-@njit(cache=True, nogil=True)
-def cast(s, ax, ay, bx, by, view, trees, guess):
-    """First surface on a ray from above: (z, kind, object, face, z of the ground below).
+@inlined
+def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
+    """First surface on a ray from above.
+
+    Returns z, kind, object, face, and of the ground below z and its derivatives along x and y.
 
     ``view``: objects seen, IN_IMAGES or IN_LIDAR. ``trees``: whether crowns stop the ray.
-    ``guess``: z near which the ground is sought.
+    ``horizon``: what :func:`horizon` gives for such rays. ``guess``: z near which the ground is
+    sought.
     """
-    ground = ground_hit(s, ax, ay, bx, by, guess)
+    ground, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
     best, kind, index, face = ground, GROUND, -1, 0
     if best < s.water:
         best, kind = s.water, WATER
@@ -182,26 +187,28 @@ def cast(s, ax, ay, bx, by, view, trees, guess):
     ny, nx = s.cell_top.shape
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
-        return best, NONE, index, face, ground
-    top = s.reach_top[j, i]
+        return best, NONE, index, face, ground, zx, zy
     z = best
+    if z >= horizon[j, i]:
+        return best, kind, index, face, ground, zx, zy
     # cells upward along the ray; the next border is crossed at next_x or next_y
-    step_x = 1 if bx > 0 else -1
-    step_y = 1 if by > 0 else -1
-    per_x = CELL_M / abs(bx) if abs(bx) > 1e-9 else 1e30
-    per_y = CELL_M / abs(by) if abs(by) > 1e-9 else 1e30
+    forward_x, forward_y = bx > 0, by > 0
+    step_x, step_y = 1 if forward_x else -1, 1 if forward_y else -1
+    inverse_x = 1 / bx if abs(bx) > 1e-9 else 1e30
+    inverse_y = 1 / by if abs(by) > 1e-9 else 1e30
+    per_x, per_y = CELL_M * abs(inverse_x), CELL_M * abs(inverse_y)
     next_x = next_y = 1e30
     if per_x < 1e29:
-        next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
+        next_x = (s.x0 + CELL_M * (i + forward_x) - ax) * inverse_x
     if per_y < 1e29:
-        next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
-    while z < top:
+        next_y = (s.y0 + CELL_M * (j + forward_y) - ay) * inverse_y
+    while z < horizon[j, i]:
         if s.cell_top[j, i] > z:
             cell = j * nx + i
             for n in range(s.box_first[cell], s.box_first[cell + 1]):
                 k = s.box_list[n]
                 if s.box_view[k] & view and s.boxes[k, 6] + s.boxes[k, 7] > best:
-                    low, high, f = box_span(s.boxes[k], ax, ay, bx, by)
+                    low, high, f = box_span(s.boxes, k, ax, ay, bx, by)
                     if high >= low and high > best:
                         best, index, face = high, k, f
                         kind = ROOF if f < 2 else WALL
@@ -209,7 +216,7 @@ def cast(s, ax, ay, bx, by, view, trees, guess):
                 for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
                     k = s.tree_list[n]
                     if s.trees[k, 2] + s.trees[k, 4] > best:
-                        high = tree_top(s.trees[k], ax, ay, bx, by)
+                        high = tree_top(s.trees, k, ax, ay, bx, by)
                         if high > best:
                             best, kind, index, face = high, TREE, k, 0
         if next_x < next_y:
@@ -222,10 +229,10 @@ def cast(s, ax, ay, bx, by, view, trees, guess):
             j += step_y
         if i < 0 or j < 0 or i >= nx or j >= ny:
             break
-    return best, kind, index, face, ground
+    return best, kind, index, face, ground, zx, zy
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def in_shadow(s, x, y, z):
     """Whether a building or tree stands between a surface point and the sun."""
     bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
@@ -234,7 +241,8 @@ def in_shadow(s, x, y, z):
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
         return False
-    top = s.reach_top[j, i]
+    if z >= s.sun_top[j, i]:
+        return False
     clear = z + 0.02
     step_x = 1 if bx > 0 else -1
     step_y = 1 if by > 0 else -1
@@ -242,20 +250,20 @@ def in_shadow(s, x, y, z):
     per_y = CELL_M / max(abs(by), 1e-9)
     next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
     next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
-    while z < top:
+    while z < s.sun_top[j, i]:
         if s.cell_top[j, i] > z:
             cell = j * nx + i
             for n in range(s.box_first[cell], s.box_first[cell + 1]):
                 k = s.box_list[n]
                 if s.box_view[k] & IN_IMAGES and s.boxes[k, 6] + s.boxes[k, 7] > clear:
-                    low, high, _ = box_span(s.boxes[k], ax, ay, bx, by)
+                    low, high, _ = box_span(s.boxes, k, ax, ay, bx, by)
                     if high >= low and high > clear:
                         return True
             for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
                 k = s.tree_list[n]
                 if (
                     s.trees[k, 2] + s.trees[k, 4] > clear
-                    and tree_top(s.trees[k], ax, ay, bx, by) > clear + 0.1
+                    and tree_top(s.trees, k, ax, ay, bx, by) > clear + 0.1
                 ):
                     return True
         if next_x < next_y:
@@ -271,7 +279,34 @@ def in_shadow(s, x, y, z):
     return False
 
 
-@njit(cache=True, nogil=True)
+def horizon(cell_top: np.ndarray, lean_x: float, lean_y: float) -> np.ndarray:
+    """z above which a ray that passes a cell upwards meets nothing more, float32[ny, nx].
+
+    For rays x = ax + lean_x z, y = ay + lean_y z, or a little off (2 degrees in direction).
+    """
+    lean = math.hypot(lean_x, lean_y)
+    padded = np.pad(maximum_filter(cell_top, 3, mode="nearest"), REACH_CELLS, constant_values=-1e9)
+    ny, nx = cell_top.shape
+    top = np.full(cell_top.shape, -1e9, np.float32)
+    for k in range(REACH_CELLS + 1):
+        i = REACH_CELLS + round(k * lean_x / max(lean, 1e-9))
+        j = REACH_CELLS + round(k * lean_y / max(lean, 1e-9))
+        # a ray that is k cells away has risen by at least this much
+        rise = max(k - 2.0, 0.0) * CELL_M / max(lean, 1e-9)
+        np.maximum(top, padded[j : j + ny, i : i + nx] - rise, out=top)
+    return top
+
+
+def lidar_horizon(cell_top: np.ndarray) -> np.ndarray:
+    """:func:`horizon` of rays that lean by up to LIDAR_LEAN to any side."""
+    top = cell_top.copy()
+    for k in range(1, 8):
+        near = maximum_filter(cell_top, 2 * k + 1, mode="nearest")
+        np.maximum(top, near - (k - 1) * CELL_M / LIDAR_LEAN, out=top)
+    return top
+
+
+@kernel
 def _heights(s, xy, out):
     for n in range(xy.shape[0]):
         out[n, 0], out[n, 1], out[n, 2] = terrain_at(s, xy[n, 0], xy[n, 1])

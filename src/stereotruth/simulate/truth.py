@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 import zarr
-from numba import njit
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..grid_store import building
@@ -16,6 +15,7 @@ from ..runlog import progress
 from .camera import SIZE, direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
+from .kernels import kernel
 from .lidar import coverage, covered
 from .render import in_collar, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
@@ -38,18 +38,18 @@ LAYERS = {
 }
 
 
-@njit(cache=True, nogil=True)
-def seen_from(s, cam, x, y, z, row, line, tolerance):
+@kernel
+def seen_from(s, above, cam, x, y, z, row, line, tolerance):
     """(col, row, whether nothing hides it) of a world point in a camera; ``row`` a first guess."""
     col, row = project_point(cam, x, y, z, row, line)
     depth = line[2] - z
     bx, by = (line[0] - x) / depth, (line[1] - y) / depth
-    hit, kind, _, _, _ = cast(s, x - bx * z, y - by * z, bx, by, IN_IMAGES, True, z)
+    hit, kind, _, _, _, _, _ = cast(s, above, x - bx * z, y - by * z, bx, by, IN_IMAGES, True, z)
     return col, row, kind != NONE and hit <= z + tolerance
 
 
-@njit(cache=True, nogil=True)
-def _truth_rows(s, left, right, frame, cover, size, first, real, flags):
+@kernel
+def _truth_rows(s, above_left, above_right, left, right, frame, cover, size, first, real, flags):
     """Rows of the truth from left image row ``first``.
 
     ``size``: left cols, rows, right cols, rows. real[5, r, c]: lon, lat, height, right col, row;
@@ -69,11 +69,15 @@ def _truth_rows(s, left, right, frame, cover, size, first, real, flags):
             dx, dy, dz = direction(left, line, float(c))
             bx, by = dx / dz, dy / dz
             ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-            z, kind, _, _, ground = cast(s, ax, ay, bx, by, IN_IMAGES, True, guess)
+            z, kind, _, _, ground, _, _ = cast(
+                s, above_left, ax, ay, bx, by, IN_IMAGES, True, guess
+            )
             guess = ground
             x, y = ax + bx * z, ay + by * z
             lon, lat, height = world_to_geodetic_point(frame, x, y, z)
-            col, right_row, free = seen_from(s, right, x, y, z, right_row, other, SEEN_TOLERANCE_M)
+            col, right_row, free = seen_from(
+                s, above_right, right, x, y, z, right_row, other, SEEN_TOLERANCE_M
+            )
             inside = (
                 col >= 0
                 and right_row >= 0
@@ -81,7 +85,7 @@ def _truth_rows(s, left, right, frame, cover, size, first, real, flags):
                 and right_row <= size[3] - 1
                 and not in_collar(False, col, right_row, size[2], size[3])
             )
-            scanned, _, _, _, _ = cast(s, ax, ay, bx, by, IN_LIDAR, True, guess)
+            scanned, _, _, _, _, _, _ = cast(s, above_left, ax, ay, bx, by, IN_LIDAR, True, guess)
             real[0, r, c], real[1, r, c], real[2, r, c] = lon, lat, height
             real[3, r, c], real[4, r, c] = col, right_row
             flags[0, r, c] = free and inside
@@ -90,9 +94,7 @@ def _truth_rows(s, left, right, frame, cover, size, first, real, flags):
             flags[3, r, c] = covered(cover, x, y)
 
 
-def simulate_truth(
-    city: CitySpec, scene: SceneSpec, out_zarr: str | Path
-) -> dict[str, float]:
+def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> dict[str, float]:
     """Write the truth on the raw left image's grid [row, col], one array per layer of LAYERS.
 
     Pixels of the collar hold NaN and 0. Longitudes and latitudes are rounded to 2^-33 degrees
@@ -101,6 +103,7 @@ def simulate_truth(
     """
     ready = prepare(city, scene)
     left, right = ready.left, ready.right
+    kernel = (ready.surfaces, left.horizon, right.horizon, left.cam, right.cam)
     size = np.array([left.cols, left.rows, right.cols, right.rows], dtype=np.float64)
     cover = coverage(city, scene)
     frame = ready.frame.packed()
@@ -130,7 +133,7 @@ def simulate_truth(
             count = min(CHUNK, left.rows - first)
             real = np.empty((5, count, left.cols))
             flags = np.empty((4, count, left.cols), np.uint8)
-            _truth_rows(ready.surfaces, left.cam, right.cam, frame, cover, size, first, real, flags)
+            _truth_rows(*kernel, frame, cover, size, first, real, flags)
             real *= steps
             np.rint(real, out=real)
             real /= steps

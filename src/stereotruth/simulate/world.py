@@ -11,12 +11,20 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from .cities import LEFT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
-from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, REACH_CELLS, Surfaces, terrain_heights
+from .kernels import kernel
+from .surfaces import (
+    CELL_M,
+    IN_IMAGES,
+    IN_LIDAR,
+    Surfaces,
+    horizon,
+    lidar_horizon,
+    terrain_heights,
+)
 
 log = logging.getLogger("stereotruth")
 
@@ -122,8 +130,10 @@ def _terrain(
     ny = int((box[3] - box[1]) / TERRAIN_STEP_M) + 6
     size = 2 ** math.ceil(math.log2(max(nx, ny, 2.2 * c.wavelength_m / TERRAIN_STEP_M)))
     shape = (size, size)
-    hills = spectral_noise(rng, shape, TERRAIN_STEP_M, (c.wavelength_m / 5, c.wavelength_m), 2.0)
-    rough = spectral_noise(rng, shape, TERRAIN_STEP_M, (60, 400), 1.8)
+    hills = spectral_noise(
+        rng, shape, TERRAIN_STEP_M, (c.wavelength_m / 3.5, c.wavelength_m * 1.3), 3.0
+    )
+    rough = spectral_noise(rng, shape, TERRAIN_STEP_M, (120, 500), 2.2)
     micro = spectral_noise(rng, shape, TERRAIN_STEP_M, (40, 90), 1.0)
     hills, rough, micro = (a[:ny, :nx] for a in (hills, rough, micro))
     x = box[0] + TERRAIN_STEP_M * np.arange(nx)
@@ -131,7 +141,7 @@ def _terrain(
     floor = np.quantile(hills, c.valley)
     rise = hills - floor
     rise = (rise + np.sqrt(rise**2 + 0.05)) / 2  # a plain that bends smoothly into hills
-    z = rise * (1 + 0.18 * rough * np.minimum(rise, 1))
+    z = rise * (1 + 0.07 * rough)
     z -= z.min()
     z *= c.relief_m / max(z.max(), 1e-9)
     for _ in range(8):  # relief gives way to the steepest slope allowed
@@ -147,8 +157,7 @@ def _terrain(
             steep = np.clip(np.hypot(gx, gy) / math.tan(math.radians(c.max_slope_deg)) - 0.7, 0, 1)
             z = z + np.minimum(1, 3 * steep) * (blurred - z)
     gy, gx = np.gradient(z, TERRAIN_STEP_M)
-    steepest = np.hypot(gx, gy).max()
-    z *= min(1.0, math.tan(math.radians(c.max_slope_deg)) / max(steepest, 1e-9))
+    z *= min(1.0, math.tan(math.radians(48)) / max(np.hypot(gx, gy).max(), 1e-9))
     z += 4 + 0.12 * micro
     water = -1e9
     if c.river_m:
@@ -169,7 +178,10 @@ def _terrain(
         q = q - 110 * np.sin(p / 420 + phase[0]) - 40 * np.sin(p / 170 + phase[1])
         bank = 0.5 * c.river_m + 6 * rough
         depth = np.clip((bank - np.abs(q)) / 14, -1.5, 1)  # banks of about 20 degrees
-        valley = np.exp(-((np.abs(q) / (c.river_m * 2.5)) ** 2))
+        if c.relief_m > 150:  # slopes of 27 degrees at most from the river up
+            cap = 5.0 + 0.5 * np.maximum(np.abs(q) - 0.6 * c.river_m, 0)
+            z = -3.0 * np.logaddexp(-z / 3.0, -cap / 3.0)
+        valley = 0.0 if c.relief_m > 150 else np.exp(-((np.abs(q) / (c.river_m * 2.5)) ** 2))
         z = z * (1 - valley) + np.minimum(z, 5.0 + 0.02 * z) * valley
         z = np.where(depth > -1.5, np.minimum(z, 2.2 - 4.0 * depth), z)
     if c.lakes:
@@ -186,7 +198,7 @@ def _zones(
     city: CitySpec, rng: np.random.Generator, s: Surfaces
 ) -> tuple[np.ndarray, np.ndarray, cKDTree]:
     """Land use: zones float64[n, 9] (x, y, cos, sin, block length, width, half street, kind,
-    tone), the zone of each cell (−1 where several meet), and the sites as a tree."""  # noqa: D205, D209
+    tone), the zone of each cell (−1 where several meet), and the sites as a tree."""
     c = city.character
     ny, nx = s.cell_top.shape
     width, height = nx * CELL_M, ny * CELL_M
@@ -261,9 +273,7 @@ class _Builder:
             # at the end of the body, reaching out to +v
             wa, wb = wing[1] / 2, wing[0] / 2
             du, dv = a - wa, b + wb - 2.0
-            parts.append(
-                (cx + du * ux - dv * uy, cy + du * uy + dv * ux, ux, uy, wa, wb + 0.0)
-            )
+            parts.append((cx + du * ux - dv * uy, cy + du * uy + dv * ux, ux, uy, wa, wb + 0.0))
         corners = np.array([
             (px + i * pa * ux - j * pb * uy, py + i * pa * uy + j * pb * ux)
             for px, py, _, _, pa, pb in parts
@@ -369,8 +379,17 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                     build.add(zone, x, y - 0.0, angle, length, wide * 0.5, rng.uniform(8, 14),
                               wing=(wide * 0.3, 18.0), cover=GRAVEL)  # fmt: skip
                 else:
-                    build.add(zone, x, y, angle, length, wide, rng.uniform(8, 13),
-                              rng.uniform(1.5, 3.0) if rng.random() < 0.6 else 0.0, cover=SHEET)
+                    build.add(
+                        zone,
+                        x,
+                        y,
+                        angle,
+                        length,
+                        wide,
+                        rng.uniform(8, 13),
+                        rng.uniform(1.5, 3.0) if rng.random() < 0.6 else 0.0,
+                        cover=SHEET,
+                    )
                 p += length + rng.uniform(9, 16)
 
 
@@ -425,6 +444,9 @@ def _choose_changed(
     for scene in city.scenes:
         local = scene_coordinates(city, scene, boxes[:, :2])
         inside = (np.abs(local) < half_size(scene) - np.array(scene.ragged_m) - 60).all(axis=1)
+        inside &= (local[:, 0] < half_size(scene)[0] - scene.gap_m[0] - 60) | (
+            local[:, 1] > scene.gap_m[1] + 60 - half_size(scene)[1]
+        )
         solid = inside & (boxes[:, 4] * boxes[:, 5] > 22) & (view == 3)
         candidates = np.unique(group[solid])
         count = min(max(4, len(candidates) // 90), 12, len(candidates) // 6)
@@ -465,7 +487,9 @@ def _trees(
     share = np.where((slope > 0.2) & (kind != 8), np.maximum(share, 0.7), share)
     share = np.clip(share * city.character.trees, 0, 0.97)
     # woods have clearings
-    clump = s.broad[(xy[:, 1] / 4).astype(int) % TEXTURE_SIZE, (xy[:, 0] / 4).astype(int) % TEXTURE_SIZE]
+    clump = s.broad[
+        (xy[:, 1] / 4).astype(int) % TEXTURE_SIZE, (xy[:, 0] / 4).astype(int) % TEXTURE_SIZE
+    ]
     share = share * np.clip(1.15 + 0.5 * clump, 0.15, 1.2)
     keep = (rng.random(len(xy)) < share) & (t[:, 0] > s.water + 0.5)
     wood = (share > 0.45)[keep]
@@ -500,7 +524,7 @@ def _trees(
     return trees
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _list_cells(half_x, half_y, xy, x0, y0, ny, nx, first, out, fill):
     """Count (fill False) or list the cells that objects' bounding rectangles touch."""
     for n in range(xy.shape[0]):
@@ -557,7 +581,7 @@ def _build(city: CitySpec) -> Surfaces:
         boxes=np.zeros((0, 8)), box_view=np.zeros(0, np.uint8), box_style=np.zeros((0, 4)),
         trees=np.zeros((0, 5)), box_first=none[0], box_list=none[1], tree_first=none[0],
         tree_list=none[1], cell_top=np.full((ny, nx), -1e9, np.float32),
-        reach_top=np.zeros((ny, nx), np.float32), zones=np.zeros((0, 9)),
+        sun_top=np.zeros((ny, nx), np.float32), lidar_top=np.zeros((ny, nx), np.float32), zones=np.zeros((0, 9)),
         zone_cells=np.zeros((0, 0), np.int32), fine=fine.astype(np.float32),
         broad=broad.astype(np.float32), sun=sun,
     )  # fmt: skip
@@ -590,16 +614,12 @@ def _build(city: CitySpec) -> Surfaces:
     ):
         np.maximum.at(top, np.repeat(cells, np.diff(first)), height[listed])
     top = top.reshape(ny, nx)
-    from scipy.ndimage import maximum_filter1d
-
-    reach = top
-    for axis in (0, 1):
-        reach = maximum_filter1d(reach, 2 * REACH_CELLS + 1, axis=axis, mode="nearest")
+    top = np.nextafter(top.astype(np.float32), np.float32(np.inf))
     s = s._replace(
         boxes=boxes, box_view=view, box_style=style, trees=trees, box_first=box_first,
         box_list=box_list, tree_first=tree_first, tree_list=tree_list,
-        cell_top=np.nextafter(top.astype(np.float32), np.float32(np.inf)),
-        reach_top=np.nextafter(reach.astype(np.float32), np.float32(np.inf)),
+        cell_top=top, sun_top=horizon(top, sun[0] / sun[2], sun[1] / sun[2]),
+        lidar_top=lidar_horizon(top),
     )  # fmt: skip
     log.info(
         "%s: %d building parts (%d in the images only, %d in the LiDAR only), %d trees, "
