@@ -411,12 +411,13 @@ class EpipolarModel:
             report=dict(values["report"]),
         )
 
-    def save(self, path: str | Path) -> None:
-        """Write the model as JSON; the file appears when it is whole."""
+    def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write the model and its provenance as JSON; the file appears when it is whole."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_name(path.name + ".partial")
-        scratch.write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
+        record = self.to_dict() | {"provenance": dict(provenance or {})}
+        scratch.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         scratch.replace(path)
 
     @classmethod

@@ -448,5 +448,5 @@ def rectify(
                 source, image, arrays["image"], workers=workers, what=f"{view} epipolar image"
             )
             zarr.open_group(folder, mode="r+").attrs["resampling"] = facts
-        model.save(epipolar_json)
+        model.save(epipolar_json, provenance)
     return model

@@ -93,9 +93,9 @@ def point_stores(wildcards):
     )
 
 
-def complaints(snakemake_log):
+def complaints(snakemake_logs):
     """The errors that the failed jobs of a run have logged, one line each."""
-    text = Path(snakemake_log).read_text()
+    text = "".join(Path(file).read_text() for file in snakemake_logs)
     logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
     found = []
     for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
