@@ -128,7 +128,7 @@ def _ground(s, x, y, slope):
         )
     if kind == 7:  # under trees: litter, grass
         return 0.12 + 0.035 * fine + 0.025 * mid + 0.015 * broad
-    return 0.27 + 0.06 * fine + 0.05 * mid + 0.03 * broad
+    return 0.21 + 0.05 * fine + 0.045 * mid + 0.03 * broad
 
 
 @inlined

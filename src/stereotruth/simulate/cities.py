@@ -88,147 +88,77 @@ class CitySpec:
         raise KeyError(f"{self.name} has no scene {name}")
 
 
-def _one(name: str, cols: int, rows: int, seed: int, **more) -> tuple[SceneSpec, ...]:
+def _one(city: str, pose_seed: int, *, ascending: bool = False) -> tuple[SceneSpec, ...]:
+    """The single scene of most cities: 2 by 3 tiles of 1024 px, one of them without its LiDAR."""
     return (
-        SceneSpec(f"{name}-1", (0.0, 0.0), cols, rows, seed, gap_m=(845.0, 748.0), **more),
+        SceneSpec(f"{city}-1", (0.0, 0.0), 2500, 3400, pose_seed, ascending, gap_m=(845.0, 748.0)),
     )
 
 
+# fmt: off
 CITIES: dict[str, CitySpec] = {
     city.name: city
     for city in (
         CitySpec(
-            "Wuhan",
-            114.305,
-            30.593,
-            32650,
-            12.0,
-            11,
-            Character(
-                6,
-                0.2,
-                1500,
-                8,
-                150,
-                1.5,
-                {"towers": 5, "slabs": 4, "lowrise": 2, "industry": 1, "park": 1.2},
-                (45, 98),
-                0.8,
+            "Wuhan", lon=114.305, lat=30.593, epsg=32650, base_height_m=12.0, world_seed=11,
+            character=Character(
+                relief_m=6, valley=0.2, wavelength_m=1500, max_slope_deg=8, river_m=150, lakes=1.5,
+                zones={"towers": 5, "slabs": 4, "lowrise": 2, "industry": 1, "park": 1.2},
+                towers_m=(45, 98), trees=0.8,
             ),
-            _one("Wuhan", 2500, 3400, 101),
+            scenes=_one("Wuhan", 101),
         ),
         CitySpec(
-            "Hengyang",
-            112.572,
-            26.893,
-            32649,
-            48.0,
-            12,
-            Character(
-                18,
-                0.3,
-                1300,
-                12,
-                190,
-                0,
-                {"towers": 1, "slabs": 2, "lowrise": 2, "village": 2, "fields": 5, "park": 1},
-                (30, 60),
-                0.8,
+            "Hengyang", lon=112.572, lat=26.893, epsg=32649, base_height_m=48.0, world_seed=12,
+            character=Character(
+                relief_m=18, valley=0.3, wavelength_m=1300, max_slope_deg=12, river_m=190, lakes=0,
+                zones={"towers": 1, "slabs": 2, "lowrise": 2, "village": 2, "fields": 5, "park": 1},
+                towers_m=(30, 60), trees=0.8,
             ),
-            _one("Hengyang", 2500, 3400, 102),
+            scenes=_one("Hengyang", 102),
             las_format="las-1.2-1",
         ),
         CitySpec(
-            "Shaoguan",
-            113.597,
-            24.811,
-            32649,
-            72.0,
-            13,
-            Character(
-                360, 0.42, 2300, 40,
-                90,
-                0,
-                {"towers": 1, "slabs": 2, "lowrise": 2, "village": 1, "fields": 1, "forest": 3},
-                (28, 55),
-                1.0,
+            "Shaoguan", lon=113.597, lat=24.811, epsg=32649, base_height_m=72.0, world_seed=13,
+            character=Character(
+                relief_m=360, valley=0.42, wavelength_m=2300, max_slope_deg=40, river_m=90, lakes=0,
+                zones={"towers": 1, "slabs": 2, "lowrise": 2, "village": 1, "fields": 1,
+                       "forest": 3},
+                towers_m=(28, 55), trees=1.0,
             ),
-            _one("Shaoguan", 2500, 3400, 103),
+            scenes=_one("Shaoguan", 103),
         ),
         CitySpec(
-            "Kunming",
-            102.712,
-            25.041,
-            32648,
-            1858.0,
-            14,
-            Character(
-                60,
-                0.25,
-                1500,
-                20,
-                0,
-                1.5,
-                {
-                    "towers": 1.5,
-                    "slabs": 3,
-                    "lowrise": 2,
-                    "industry": 2,
-                    "park": 1.5,
-                    "fields": 1.5,
-                    "forest": 1,
-                },
-                (40, 75),
-                1.0,
+            "Kunming", lon=102.712, lat=25.041, epsg=32648, base_height_m=1858.0, world_seed=14,
+            character=Character(
+                relief_m=60, valley=0.25, wavelength_m=1500, max_slope_deg=20, river_m=0, lakes=1.5,
+                zones={"towers": 1.5, "slabs": 3, "lowrise": 2, "industry": 2, "park": 1.5,
+                       "fields": 1.5, "forest": 1},
+                towers_m=(40, 75), trees=1.0,
             ),
-            _one("Kunming", 2500, 3400, 104),
+            scenes=_one("Kunming", 104),
             sun_elevation_deg=58.0,
         ),
         CitySpec(
-            "Yingde",
-            113.405,
-            24.186,
-            32649,
-            36.0,
-            15,
-            Character(
-                400, 0.36, 2500, 42,
-                80,
-                0,
-                {"slabs": 1, "lowrise": 1.5, "village": 2.5, "fields": 3, "forest": 4, "bare": 1},
-                (20, 40),
-                1.15,
+            "Yingde", lon=113.405, lat=24.186, epsg=32649, base_height_m=36.0, world_seed=15,
+            character=Character(
+                relief_m=400, valley=0.5, wavelength_m=2500, max_slope_deg=42, river_m=80, lakes=0,
+                zones={"slabs": 1, "lowrise": 1.5, "village": 4, "fields": 4, "forest": 2,
+                       "bare": 0.6},
+                towers_m=(20, 40), trees=1.1,
             ),
-            _one("Yingde", 2500, 3400, 105, ascending=True),
+            scenes=_one("Yingde", 105, ascending=True),
         ),
         CitySpec(
-            "Qichun",
-            115.433,
-            30.232,
-            32650,
-            18.0,
-            16,
-            Character(
-                70,
-                0.3,
-                1500,
-                24,
-                110,
-                1.0,
-                {
-                    "towers": 0.6,
-                    "slabs": 2,
-                    "lowrise": 2,
-                    "village": 3,
-                    "industry": 1,
-                    "fields": 4.5,
-                    "forest": 2,
-                    "park": 1,
-                },
-                (26, 55),
-                0.9,
+            "Qichun", lon=115.433, lat=30.232, epsg=32650, base_height_m=18.0, world_seed=16,
+            character=Character(
+                relief_m=70, valley=0.3, wavelength_m=1500, max_slope_deg=24, river_m=110,
+                lakes=1.0,
+                zones={"towers": 0.6, "slabs": 2, "lowrise": 2, "village": 3, "industry": 1,
+                       "fields": 4.5, "forest": 2, "park": 1},
+                towers_m=(26, 55), trees=0.9,
             ),
-            (
+            scenes=(
                 SceneSpec("Qichun-1", (-1080.0, 170.0), 3650, 3650, 106, lidar_grid=(3, 2),
                           gap_m=(845.0, 812.0)),
                 SceneSpec("Qichun-2", (1080.0, -170.0), 3650, 3650, 107, lidar_grid=(3, 2),
@@ -237,6 +167,7 @@ CITIES: dict[str, CitySpec] = {
         ),
     )
 }
+# fmt: on
 
 
 def _spec(city: CitySpec | str) -> CitySpec:
