@@ -120,6 +120,11 @@ class Settings:
         return self.method in ("correlation", "both")
 
     @property
+    def uses_top_surface(self) -> bool:
+        """Whether points below the top surface of their pixel count as hidden from the left."""
+        return self.uses_geometry or self.representative == "top"
+
+    @property
     def uses_geometry(self) -> bool:
         """Whether rays are tested against the surface of the points."""
         return self.method in ("geometric", "both")
@@ -262,8 +267,6 @@ def condense(
     uncertainty of the outermost ring of pixels lacks neighbours.
     """
     size = shape[0] * shape[1]
-    if settings.representative == "top":
-        use = top_surface(pixel, disparity, use, size, TOP_SURFACE_PX)
     sums = exact_sums(points, pixel, use, size)
     # Disparities relative to the pixel's height, as integers: exact sums in any order.
     fall = np.zeros(len(points), dtype=np.int64)
@@ -485,10 +488,11 @@ class _Scene:
         use = in_frame(left, right, xy)
         stage = np.where(use, _STAGE[Status.BELOW_MINIMUM_COUNT], _STAGE[Status.OUT_OF_FRAME])
         size = (wide[0].stop - wide[0].start) * (wide[1].stop - wide[1].start)
-        if settings.uses_geometry:
+        if settings.uses_top_surface:
             framed = use
             use = top_surface(pixel, xy[0] - xy[2], framed, size, TOP_SURFACE_PX)
             stage[framed & ~use] = _STAGE[Status.HIDDEN_IN_LEFT]
+        if settings.uses_geometry:
             sums = exact_sums(points, pixel, use, size)
             hidden = hidden_pixels(surface, self.rays, sums, *wide)[pixel]
             stage[use & (hidden == 1)] = _STAGE[Status.HIDDEN_IN_LEFT]

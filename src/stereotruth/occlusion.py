@@ -12,8 +12,8 @@ The paper (section III-C) removes hidden points by the correlation of image wind
    straight track over the ground, runs into a cell.
 
 Nothing is tuned to a scene: ray directions, cell size and tolerances follow from the epipolar
-model. Cells lie on the global lattice of the points and rays depend on the model only, so that results do
-not depend on blocks, files or their order.
+model. Cells lie on the global lattice of the points and rays depend on the model only, so that
+results do not depend on blocks, files or their order.
 """
 
 from __future__ import annotations
@@ -290,6 +290,7 @@ def _is_hidden(
     start: float,
     du: float,
     dv: float,
+    margin: float,
     tolerance: float,
 ) -> bool:
     """Does the ray from place (a, b) in [0, 1)² of cell (i, j) at height ``start`` hit a cell?
@@ -323,7 +324,7 @@ def _is_hidden(
             way = next_v
             next_v += between_v
             j += step_j
-        z = start + (way + MARGIN_CELLS) * rise + tolerance
+        z = start + (way + margin) * rise + tolerance
         if z >= top or i < 0 or j < 0 or i >= cols or j >= rows:
             return False
         if height[j, i] > z:
@@ -340,6 +341,7 @@ def _hidden(
     track: Floats,
     first: tuple[int, int],
     width: int,
+    margin: float,
     tolerance: float,
     out: NDArray[np.uint8],
 ) -> None:
@@ -369,7 +371,18 @@ def _hidden(
             du = t[0, 0] + t[0, 1] * x + t[0, 2] * y
             dv = t[1, 0] + t[1, 1] * x + t[1, 2] * y
             if _is_hidden(
-                height, ceiling, top, i - origin[1], j - origin[0], a, b, start, du, dv, tolerance
+                height,
+                ceiling,
+                top,
+                i - origin[1],
+                j - origin[0],
+                a,
+                b,
+                start,
+                du,
+                dv,
+                margin,
+                tolerance,
             ):
                 out[k] = view + 1
                 break
@@ -395,6 +408,7 @@ def hidden_pixels(
         rays.track / per_cell,
         (rows.start, cols.start),
         cols.stop - cols.start,
+        MARGIN_CELLS,
         TOLERANCE_PX / rays.px_per_m,
         out,
     )

@@ -1,0 +1,386 @@
+"""Projection of points on a textured plane with a box: disparity and hidden parts are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import zarr
+
+from stereotruth.disparity import Status, project_scene
+from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.errors import InputError
+from stereotruth.grid_store import Layer, building, create_grid, open_grid
+from stereotruth.points import PointStore, ingest, query_points
+
+from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
+from .test_points import tree_digest, write_las
+from .test_rectification import pattern
+
+SIZE = (320, 280)  # cols, rows of both original images
+HALF = (16.0, 13.0)  # m east, north: half sides of the box
+ROOF = HEIGHT + 30.0
+UTM = pyproj.CRS("EPSG:32650").to_3d()
+
+
+def model_of(left_angle: float = 90.0) -> EpipolarModel:
+    left = camera(BACKWARD, angle=left_angle, size=SIZE)
+    right = camera(FORWARD, angle=left_angle + 2.0, gsd=0.8, size=SIZE)
+    return fit_epipolar(left, right, SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 50, HEIGHT + 100))
+
+
+def on_ground(sensor, col: np.ndarray, row: np.ndarray, height: float) -> np.ndarray:
+    """[2, ...] east, north (m) of where rays meet a height; the cameras are affine."""
+    lon, lat = sensor.localize(col, row, np.full(col.shape, height))
+    return np.stack([(lon - LON) * METRES[0], (lat - LAT) * METRES[1]])
+
+
+def seen(model: EpipolarModel, view: str, box: bool) -> tuple[np.ndarray, ...]:
+    """East, north, height of the surface that every pixel of a rectified image shows."""
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    to_image, sensor = (
+        (model.epipolar_to_left, model.left)
+        if view == "left"
+        else (model.epipolar_to_right, model.right)
+    )
+    col, row = to_image(x, y)
+    low, high = on_ground(sensor, col, row, HEIGHT), on_ground(sensor, col, row, ROOF)
+    east, north, height = *low, np.full(col.shape, np.nan)
+    for h in np.linspace(ROOF, HEIGHT, 301) if box else [HEIGHT]:
+        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
+        hit = np.isnan(height)
+        if h > HEIGHT:
+            hit &= (abs(e) < HALF[0]) & (abs(n) < HALF[1])
+        east[hit], north[hit], height[hit] = e[hit], n[hit], h
+    return east, north, height
+
+
+def image_of(surface: tuple[np.ndarray, ...]) -> np.ndarray:
+    east, north, height = surface
+    return np.round(pattern(east + 3.0 * height, north - 2.0 * height)).astype(np.uint16)
+
+
+def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray) -> Path:
+    with building(path) as scratch:
+        layer = Layer("uint16", 0, {"units": "1", "long_name": "image"})
+        array = create_grid(
+            scratch,
+            model.shape,
+            {"image": layer},
+            chunk=256,
+            shard=1024,
+            attrs={"epipolar": model.to_dict(), "provenance": {"made": path.name}},
+        )["image"]
+        array[:] = pixels
+    return path
+
+
+def points_on(box: bool, noise: float = 0.0, spacing: float = 0.4) -> np.ndarray:
+    """lon, lat, height of points on the plane and the roof [n, 3]; none on walls.
+
+    A jittered grid without a gap of a pixel.
+    """
+    rng = np.random.default_rng(0)
+    east, north = np.mgrid[-115:115:spacing, -115:115:spacing].reshape(2, -1)
+    east, north = np.stack([east, north]) + rng.uniform(-0.25, 0.25, (2, east.size)) * spacing
+    height = np.full(east.size, HEIGHT)
+    if box:
+        height[(abs(east) < HALF[0]) & (abs(north) < HALF[1])] = ROOF
+    height += rng.normal(0, noise, east.size)
+    return np.column_stack([LON + east / METRES[0], LAT + north / METRES[1], height])
+
+
+def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path:
+    to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
+    folder.mkdir(exist_ok=True)
+    write_las(folder / f"{name}.las", xyz=np.column_stack(to_utm.transform(*points.T)))
+    ingest(folder / f"{name}.las", folder / f"{name}.zarr")
+    return folder / f"{name}.zarr"
+
+
+class Scene:
+    """Rectified images and points of the plane, with or without the box."""
+
+    def __init__(self, folder: Path, box: bool, **options: float) -> None:
+        self.folder = folder
+        self.model = model_of()
+        self.surface = seen(self.model, "left", box)
+        self.images = [
+            write_image(folder / "left.zarr", self.model, image_of(self.surface)),
+            write_image(
+                folder / "right.zarr", self.model, image_of(seen(self.model, "right", box))
+            ),
+        ]
+        self.points = points_on(box, **options)
+        self.store = write_points(folder, self.points)
+        east, north, height = self.surface
+        xy = self.model.ground_to_epipolar(LON + east / METRES[0], LAT + north / METRES[1], height)
+        self.truth = (xy[0] - xy[2]).reshape(self.model.shape)
+
+    def project(self, name: str = "out.zarr", stores: list[Path] | None = None, **options):
+        out = self.folder / name
+        self.summary = project_scene(*self.images, stores or [self.store], out, **options)
+        return open_grid(out)
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("plane"), box=False)
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("box"), box=True)
+
+
+@pytest.mark.parametrize("method", ["none", "correlation", "geometric", "both"])
+@pytest.mark.parametrize("representative", ["top", "paper"])
+def test_disparity_of_a_plane(plane, method, representative) -> None:
+    """Within 1e-3 px at every pixel's centre; all labelled but a frame of half a window."""
+    grid = plane.project(method=method, representative=representative)
+    disparity, status = grid["disparity"].values, grid["status"].values
+    labelled = status == Status.LABELLED
+    assert np.array_equal(labelled, np.isfinite(disparity))
+    assert np.abs(disparity - plane.truth)[labelled].max() < 1e-3
+    has_points = status != Status.NO_POINTS
+    inner = has_points & (plane.truth > -np.inf)
+    edge = 6 + int(np.ceil(np.abs(plane.truth).max()))
+    inner[:edge] = inner[-edge:] = inner[:, :edge] = inner[:, -edge:] = False
+    assert inner.sum() > 30_000
+    assert labelled[inner].mean() > 0.999
+    correlation = grid["correlation"].values[labelled]
+    if method in ("correlation", "both"):
+        assert np.median(correlation) > 0.99
+    else:
+        assert np.isnan(correlation).all()
+
+
+def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, float, int]]:
+    """Disparity, height and count by pixel, point by point in Python from the definition."""
+    points = query_points([scene.store], -180, -90, 180, 90)
+    xy = scene.model.ground_to_epipolar(points.lon, points.lat, points.height)
+    pixels: dict[tuple[int, int], list[int]] = {}
+    for k, (x, y) in enumerate(zip(xy[0], xy[1])):
+        pixels.setdefault((int(np.floor(y + 0.5)), int(np.floor(x + 0.5))), []).append(k)
+    found = {}
+    for pixel, members in pixels.items():
+        if not 40 < pixel[0] < 80 or not 40 < pixel[1] < 120:
+            continue
+        if top:
+            d = xy[0, members] - xy[2, members]
+            members = [k for k, value in zip(members, d) if value >= d.max() - 1.0]
+        highest = points.height[members].max()
+        ground = [
+            points.lon[members].mean(),
+            points.lat[members].mean(),
+            points.height[members].mean() if top else highest,
+        ]
+        there = scene.model.ground_to_epipolar(*ground)
+        found[pixel] = float((there[0] - there[2])[0]), float(highest), len(members)
+    return found
+
+
+@pytest.mark.parametrize("representative", ["top", "paper"])
+def test_representative_is_that_of_its_definition(tmp_path, representative) -> None:
+    """Points of 0.3 m noise on plane and roof, against sums in Python: 1e-5 px."""
+    scene = Scene(tmp_path, box=True, noise=0.3)
+    grid = scene.project(method="none", representative=representative)
+    disparity, height, count = (
+        grid[name].values for name in ("disparity", "height", "point_count")
+    )
+    expected = brute_force(scene, representative == "top")
+    assert len(expected) > 2000
+    for pixel, (d, h, n) in expected.items():
+        assert disparity[pixel] == pytest.approx(d, abs=1e-5)
+        assert height[pixel] == pytest.approx(h, abs=1e-4)
+        assert count[pixel] == n
+
+
+def hidden_truth(scene: Scene) -> np.ndarray:
+    """Pixels of the left image whose surface the box hides from the right camera."""
+    model = scene.model
+    east, north, height = scene.surface
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = model.ground_to_epipolar(lon, lat, height)
+    col, row = model.epipolar_to_right(xy[2], xy[3])
+    hidden = np.zeros(col.size, dtype=bool)
+    low, high = (on_ground(model.right, col, row, h) for h in (HEIGHT, ROOF))
+    for h in np.linspace(HEIGHT, ROOF, 301)[1:]:
+        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
+        inside = (np.abs(e) < HALF[0] - 1e-6) & (np.abs(n) < HALF[1] - 1e-6)
+        hidden |= inside & (h > height.reshape(-1) + 0.11)
+    return hidden.reshape(model.shape)
+
+
+def dilated(mask: np.ndarray, by: int = 1) -> np.ndarray:
+    padded = np.pad(mask, by)
+    out = np.zeros_like(mask)
+    for r in range(2 * by + 1):
+        for c in range(2 * by + 1):
+            out |= padded[r : r + mask.shape[0], c : c + mask.shape[1]]
+    return out
+
+
+@pytest.mark.parametrize("method", ["geometric", "both"])
+def test_box_hides_a_run_of_the_ground(box, method) -> None:
+    """Hidden ground beside the box, walls without points included, to 2 px at its border."""
+    grid = box.project(method=method)
+    status = grid["status"].values
+    hidden = hidden_truth(box)
+    assert 800 < hidden.sum() < 20_000
+    sure = hidden & ~dilated(~hidden, 2)
+    labelled = status == Status.LABELLED
+    assert not labelled[sure].any()
+    with_points = sure & (status != Status.NO_POINTS)
+    assert (status[with_points] == Status.HIDDEN_IN_RIGHT).mean() > 0.99
+    wall = (box.surface[2] > HEIGHT) & (box.surface[2] < ROOF)
+    clear = ~dilated(hidden | wall) & (status != Status.NO_POINTS)
+    assert (status == Status.HIDDEN_IN_RIGHT)[clear].mean() < 1e-3
+    roof = box.surface[2] == ROOF
+    inner = roof & ~dilated(~roof, 5) & (status != Status.NO_POINTS)
+    assert labelled[inner].mean() > 0.999
+    # Along a row: as many px without a label, wall included, as the roof has more disparity.
+    cols = np.flatnonzero((hidden | wall).any(axis=0))
+    run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
+    rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
+    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=1.5)
+
+
+def test_correlation_removes_most_of_what_is_hidden(box) -> None:
+    grid = box.project(method="correlation")
+    labelled = grid["status"].values == Status.LABELLED
+    hidden = hidden_truth(box)
+    assert labelled[hidden].mean() < 0.25
+    none = box.project(method="none")["status"].values == Status.LABELLED
+    assert none[hidden & (box.surface[2] == HEIGHT)].mean() > 0.95
+
+
+def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
+    """Workers, windows, order of stores and of points leave no trace."""
+    middle = LON + 3.0 / METRES[0]
+    west = box.points[box.points[:, 0] < middle]
+    east = box.points[box.points[:, 0] >= middle]
+    shuffled = np.random.default_rng(3).permutation(west)
+    first = [write_points(tmp_path / "first", p, n) for p, n in ((west, "a"), (east, "b"))]
+    second = [write_points(tmp_path / "second", p, n) for p, n in ((shuffled, "a"), (east, "b"))]
+    digests = set()
+    for number, (stores, options) in enumerate(
+        [
+            (first, {"workers": 1}),
+            (first[::-1], {"workers": 2}),
+            (second, {"workers": 2, "max_points": 20_000}),
+            (second, {"scheduler": "sync"}),
+        ]
+    ):
+        box.project(f"{number}.zarr", stores, method="both", **options)
+        digests.add(tree_digest(box.folder / f"{number}.zarr"))
+    assert len(digests) == 1
+
+
+def test_reasons_and_their_order(plane) -> None:
+    """Nodata in either image, constant windows, too few points."""
+    model = plane.model
+    left = zarr.open_group(plane.images[0])["image"][:]
+    right = zarr.open_group(plane.images[1])["image"][:]
+    flat = right.copy()
+    flat[:] = 700
+    folder = plane.folder / "others"
+    grid = project_and_open(plane, folder / "flat", left, flat, method="correlation")
+    assert not (grid["status"].values == Status.LABELLED).any()
+    assert (grid["status"].values == Status.LOW_CORRELATION).sum() > 30_000
+
+    holed = left.copy()
+    holed[100:110, 150:170] = 0
+    grid = project_and_open(plane, folder / "holed", holed, right, method="correlation")
+    status = grid["status"].values
+    # The window reaches 4 px to all sides, and one more for the interpolation.
+    assert (status[96:114, 146:174] == Status.OUT_OF_FRAME).all()
+    assert (status[90:120, 140:180] == Status.LABELLED)[[0, -1]].all()
+    count = grid["point_count"].values
+    assert (count[status == Status.OUT_OF_FRAME] == 0).all()
+
+    grid = project_and_open(plane, folder / "few", left, right, method="none", min_points=4)
+    status, count = grid["status"].values, grid["point_count"].values
+    assert (count[status == Status.LABELLED] >= 4).all()
+    few = status == Status.BELOW_MINIMUM_COUNT
+    assert few.any() and ((count[few] > 0) & (count[few] < 4)).all()
+    assert np.isnan(grid["disparity"].values[few]).all()
+    assert model.shape == status.shape
+
+
+def project_and_open(scene: Scene, folder: Path, left, right, **options):
+    folder.mkdir(parents=True)
+    images = [
+        write_image(folder / f"{name}.zarr", scene.model, pixels)
+        for name, pixels in (("left", left), ("right", right))
+    ]
+    project_scene(*images, [scene.store], folder / "out.zarr", **options)
+    return open_grid(folder / "out.zarr")
+
+
+def test_attributes_and_summary(plane) -> None:
+    grid = plane.project(method="correlation", code="abc", scene="plane-1")
+    for name in ("disparity", "status", "height", "point_count", "correlation", "uncertainty"):
+        assert grid[name].dims == ("y", "x")
+        assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
+    status = grid["status"]
+    assert status.attrs["flag_values"] == list(range(8))
+    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status]
+    assert grid.attrs["provenance"]["code"] == "abc"
+    assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}
+    assert EpipolarModel.from_dict(grid.attrs["epipolar"]).shape == plane.model.shape
+    pixels = plane.summary["pixels"]
+    assert pixels == grid.attrs["summary"]["pixels"]
+    for meaning, value in zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"]):
+        assert pixels[meaning] == int((status.values == value).sum())
+    assert plane.summary["points"]["used"] == int(grid["point_count"].values.sum())
+    json.dumps(dict(grid.attrs))
+
+
+def test_uncertainty_is_the_standard_error_of_the_mean(tmp_path) -> None:
+    """Noise of 0.5 m on a plane: |error| below 1 and 2 standard uncertainties in 68 and 95 %."""
+    scene = Scene(tmp_path, box=False, noise=0.5)
+    grid = scene.project(method="none", representative="paper")
+    points = query_points([scene.store], -180, -90, 180, 90)
+    assert len(points) > 0
+    sigma = grid["uncertainty"].values
+    count = grid["point_count"].values
+    inside = np.isfinite(sigma) & (count >= 2)
+    k = 0.5 * (0.49 + 0.09) / 0.65  # px, noise of one point's disparity
+    ratio = sigma[inside] * np.sqrt(count[inside]) / k
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.08)
+
+
+def refused(scene: Scene, store: Path, match: str) -> None:
+    out = scene.folder / "refused.zarr"
+    with pytest.raises(InputError, match=match):
+        project_scene(*scene.images, [store], out, method="none")
+    assert not list(scene.folder.glob("refused*"))
+
+
+def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
+    """The message tells a survey of another place from a wrong coordinate system."""
+    near = plane.points[:2000] + np.array([0.1, 0, 0])
+    refused(plane, write_points(tmp_path / "near", near), "no overlap between LiDAR and images")
+    far = plane.points[:2000] + np.array([1.5, 3.0, 0])
+    refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
+    with pytest.raises(InputError, match=r"114\.3.*30\.6"):
+        project_scene(
+            *plane.images, [tmp_path / "far" / "points.zarr"], tmp_path / "x.zarr", method="none"
+        )
+
+
+def test_settings_are_checked(plane) -> None:
+    for options in ({"method": "guess"}, {"representative": "mean"}, {"window": 8}):
+        with pytest.raises(InputError, match="Remedy"):
+            plane.project(**options)
+    with pytest.raises(InputError, match="no point store"):
+        project_scene(*plane.images, [], plane.folder / "x.zarr")
+
+
+def test_store_bounds_are_kept(plane) -> None:
+    grid = plane.project(method="none")
+    assert grid.attrs["points_bounds"] == list(PointStore(plane.store).bounds)
