@@ -183,7 +183,7 @@ def reflectance(s, x, y, z, kind, index, face, zx, zy):
                 if rim < 0.55:  # parapet
                     value = value * 0.6 + 0.18
                 elif cover == 0 and s.boxes[index, 4] > 5:  # sheets of bitumen, plants, tanks
-                    cell = _hash(int(math.floor(u / 3.1)), int(math.floor(v / 2.7)), index)
+                    cell = _hash(int(np.floor(u / 3.1)), int(np.floor(v / 2.7)), index)
                     if cell < 0.10:
                         value *= 0.55 + 6 * cell
         else:
@@ -198,7 +198,7 @@ def reflectance(s, x, y, z, kind, index, face, zx, zy):
             storey = z - 3.0 * math.floor(z / 3.0)
             bay = along - 3.4 * math.floor(along / 3.4)
             if storey > 0.9 and storey < 2.4 and bay > 0.7 and bay < 2.6:
-                glass = _hash(int(math.floor(along / 3.4)), int(math.floor(z / 3.0)), index + face)
+                glass = _hash(int(np.floor(along / 3.4)), int(np.floor(z / 3.0)), index + face)
                 value = 0.07 + 0.16 * glass * glass
     light = nx * sun[0] + ny * sun[1] + nz * sun[2]
     if light > 0 and in_shadow(s, x, y, z):

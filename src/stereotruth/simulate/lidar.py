@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import logging
 import math
-import os
 import zlib
 from pathlib import Path
 
@@ -106,9 +105,7 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             slant = ((line + 0.5 - 0.5 * strip) * LINE_SPACING_M - across) / FLYING_HEIGHT_M
             bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
             ax, ay = x - bx * ground, y - by * ground
-            z, kind, index, _, _, _, _ = cast(
-                s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground
-            )
+            z, kind, _, _, _, _, _ = cast(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
             if kind == 0:
                 continue
             chance = rng.random()
@@ -117,7 +114,7 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
             for k in range(returns):
                 if k == 1:
-                    z, kind, index, _, _, _, _ = cast(
+                    z, kind, _, _, _, _, _ = cast(
                         s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, False, ground
                     )
                     if kind == 0:
@@ -303,7 +300,7 @@ def simulate_lidar_tile(
                     record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
                 writer.write_points(record)
                 counts += np.bincount(info[:n, 0], minlength=32)
-        os.replace(scratch, out_laz)
+        scratch.replace(out_laz)
     finally:
         scratch.unlink(missing_ok=True)
     if not counts.sum():

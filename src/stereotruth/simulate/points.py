@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import logging
-import os
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from .cities import CITIES, CitySpec, SceneSpec
 from .kernels import kernel
@@ -51,8 +51,9 @@ def _sizes(ready: Scene) -> np.ndarray:
 def _visible(ready: Scene, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     image = np.empty((len(xyz), 4))
     seen = np.zeros(len(xyz), bool)
-    _see(ready.surfaces, ready.left.horizon, ready.right.horizon, ready.left.cam, ready.right.cam, _sizes(ready),
-         np.ascontiguousarray(xyz), 0.005, image, seen)  # fmt: skip
+    left, right = ready.left, ready.right
+    kernel_args = (ready.surfaces, left.horizon, right.horizon, left.cam, right.cam, _sizes(ready))
+    _see(*kernel_args, np.ascontiguousarray(xyz), 0.005, image, seen)
     return image, seen
 
 
@@ -74,16 +75,15 @@ def _roof_corners(ready: Scene) -> tuple[np.ndarray, np.ndarray]:
             owner.append(use)
     xyz, owner = np.concatenate(corners), np.concatenate(owner)
     free = np.ones(len(xyz), bool)
-    for box in range(len(b)):  # not inside or against another part of a building
-        near = np.flatnonzero(
-            (np.abs(xyz[:, 0] - b[box, 0]) < 70) & (np.abs(xyz[:, 1] - b[box, 1]) < 70)
-            & (owner != box) & free
-        )  # fmt: skip
-        if len(near):
-            dx, dy = xyz[near, 0] - b[box, 0], xyz[near, 1] - b[box, 1]
-            u = np.abs(dx * b[box, 2] + dy * b[box, 3]) - b[box, 4]
-            v = np.abs(dy * b[box, 2] - dx * b[box, 3]) - b[box, 5]
-            free[near[(u < 1.0) & (v < 1.0)]] = False
+    # not inside or against another part of a building
+    reach = np.hypot(b[:, 4], b[:, 5]) + 1.5
+    near = cKDTree(xyz[:, :2]).query_ball_point(b[:, :2], reach)
+    box = np.repeat(np.arange(len(b)), [len(n) for n in near])
+    corner = np.concatenate([np.array(n, int) for n in near])
+    dx, dy = xyz[corner, 0] - b[box, 0], xyz[corner, 1] - b[box, 1]
+    u = np.abs(dx * b[box, 2] + dy * b[box, 3]) - b[box, 4]
+    v = np.abs(dy * b[box, 2] - dx * b[box, 3]) - b[box, 5]
+    free[corner[(u < 1.0) & (v < 1.0) & (owner[corner] != box)]] = False
     return xyz[free], owner[free]
 
 
@@ -121,7 +121,7 @@ def write_table(path: str | Path, rows: list[dict]) -> None:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    os.replace(scratch, path)
+    scratch.replace(path)
 
 
 def make_points(

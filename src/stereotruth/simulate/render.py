@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -219,7 +218,7 @@ def simulate_image(
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
             target.set_band_description(1, "panchromatic, 11 bits")
-        os.replace(scratch, out_tif)
+        scratch.replace(out_tif)
     finally:
         scratch.unlink(missing_ok=True)
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}

@@ -82,7 +82,7 @@ def fit_rpc(
         true = np.column_stack([c.ravel(), r.ravel()])
         return frame.to_geodetic(locate(cam, frame, true, h.ravel())), true
 
-    ground, true = cloud(16, 9, 0.0)
+    ground, true = cloud(11, 6, 0.0)
     middle = (ground.max(axis=0) + ground.min(axis=0)) / 2
     half = (ground.max(axis=0) - ground.min(axis=0)) / 2
     # offsets and scales as they are written, so that rounding enters the fit
@@ -103,7 +103,7 @@ def fit_rpc(
     biased = true @ bias[:, :2].T + bias[:, 2]
     samp = _fit_ratio(a, (biased[:, 0] - offset[0]) / scale[0])
     line = _fit_ratio(a, (biased[:, 1] - offset[1]) / scale[1])
-    ground, true = cloud(13, 6, 7.0)
+    ground, true = cloud(10, 5, 7.0)
     a = design(ground)
     found = np.column_stack([(a @ num) / (a @ den) for num, den in (samp, line)]) * scale + offset
     miss = found - (true @ bias[:, :2].T + bias[:, 2])

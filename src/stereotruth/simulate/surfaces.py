@@ -65,8 +65,8 @@ def terrain_at(s, x, y):
     c = s.terrain
     u = (x - s.x0) / s.step
     v = (y - s.y0) / s.step
-    i = min(max(int(math.floor(u)), 1), c.shape[1] - 3)
-    j = min(max(int(math.floor(v)), 1), c.shape[0] - 3)
+    i = min(max(int(np.floor(u)), 1), c.shape[1] - 3)
+    j = min(max(int(np.floor(v)), 1), c.shape[0] - 3)
     f, g = u - i, v - j
     f1, g1 = 1 - f, 1 - g
     a0, a1 = f1 * f1 * f1 / 6, (4 - 6 * f * f + 3 * f * f * f) / 6

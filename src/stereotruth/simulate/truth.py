@@ -1,4 +1,4 @@
-"""The exact truth of a scene: what each pixel of the left image shows, and where the right has it."""
+"""The exact truth of a scene: what each left pixel shows, and where the right image has it."""
 
 from __future__ import annotations
 
