@@ -1,7 +1,3 @@
-def synthetic_scenes():
-    return [scene for scene in SCENES.values() if is_synthetic(scene)]
-
-
 rule evaluate_truth:
     input:
         disparity="results/project/{city}/{scene}.zarr",
@@ -35,6 +31,10 @@ rule evaluate_truth:
 
 rule evaluate:
     input:
-        [f"results/evaluate/{s.city}/{s.scene}/truth.json" for s in synthetic_scenes()],
+        [
+            f"results/evaluate/{s.city}/{s.scene}/truth.json"
+            for s in SCENES.values()
+            if is_synthetic(s)
+        ],
     message:
         "Exact-truth figures of all synthetic scenes"
