@@ -13,7 +13,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from .kernels import inlined, kernel
 
@@ -279,13 +278,22 @@ def in_shadow(s, x, y, z):
     return False
 
 
+def _widened(cell_top: np.ndarray, cells: int) -> np.ndarray:
+    """Greatest value within so many cells to each side."""
+    ny, nx = cell_top.shape
+    rows = np.pad(cell_top, ((cells, cells), (0, 0)), mode="edge")
+    top = np.max([rows[k : k + ny] for k in range(2 * cells + 1)], axis=0)
+    columns = np.pad(top, ((0, 0), (cells, cells)), mode="edge")
+    return np.max([columns[:, k : k + nx] for k in range(2 * cells + 1)], axis=0)
+
+
 def horizon(cell_top: np.ndarray, lean_x: float, lean_y: float) -> np.ndarray:
     """z above which a ray that passes a cell upwards meets nothing more, float32[ny, nx].
 
     For rays x = ax + lean_x z, y = ay + lean_y z, or a little off (2 degrees in direction).
     """
     lean = math.hypot(lean_x, lean_y)
-    padded = np.pad(maximum_filter(cell_top, 3, mode="nearest"), REACH_CELLS, constant_values=-1e9)
+    padded = np.pad(_widened(cell_top, 1), REACH_CELLS, constant_values=-1e9)
     ny, nx = cell_top.shape
     top = np.full(cell_top.shape, -1e9, np.float32)
     for k in range(REACH_CELLS + 1):
@@ -301,8 +309,7 @@ def lidar_horizon(cell_top: np.ndarray) -> np.ndarray:
     """:func:`horizon` of rays that lean by up to LIDAR_LEAN to any side."""
     top = cell_top.copy()
     for k in range(1, 8):
-        near = maximum_filter(cell_top, 2 * k + 1, mode="nearest")
-        np.maximum(top, near - (k - 1) * CELL_M / LIDAR_LEAN, out=top)
+        np.maximum(top, _widened(cell_top, k) - (k - 1) * CELL_M / LIDAR_LEAN, out=top)
     return top
 
 

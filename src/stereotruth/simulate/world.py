@@ -255,6 +255,7 @@ class _Builder:
 
     def __init__(self, city: CitySpec, s: Surfaces, sites: cKDTree, rng: np.random.Generator):
         self.city, self.s, self.sites, self.rng = city, s, sites, rng
+        self.zone_cells = s.zone_cells.tolist()
         self.around = [
             (*scene.centre_m, *np.concatenate(image_axes(city, scene)), *half_size(scene))
             for scene in city.scenes
@@ -282,6 +283,9 @@ class _Builder:
         ux, uy = math.cos(angle), math.sin(angle)
         a, b = length / 2, width / 2
         if not self._near(cx - a * ux + b * uy, cy - a * uy - b * ux):
+            return False
+        here = self.zone_cells[int((cy - self.s.y0) / CELL_M)][int((cx - self.s.x0) / CELL_M)]
+        if zone >= 0 and here >= 0 and here != zone:
             return False
         parts = [(cx, cy, ux, uy, a, b)]
         if wing is not None:
