@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .kernels import kernel
+from .kernels import inlined, kernel
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563
@@ -35,7 +35,7 @@ def geodetic_to_ecef(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np
     )
 
 
-@kernel
+@inlined
 def ecef_to_geodetic_point(x, y, z):
     """Longitude, latitude (degrees) and ellipsoidal height (m) of one ECEF point.
 
@@ -113,7 +113,7 @@ class LocalFrame:
         return np.concatenate([self.origin, self.axes.ravel()])
 
 
-@kernel
+@inlined
 def world_to_geodetic_point(frame, x, y, z):
     """Longitude, latitude (degrees), ellipsoidal height (m) of one world point."""
     return ecef_to_geodetic_point(

@@ -15,7 +15,7 @@ import pyproj
 from ..errors import InputError
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
-from .kernels import kernel
+from .kernels import inlined, kernel
 from .surfaces import GROUND, IN_LIDAR, ROOF, TREE, WALL, WATER, Surfaces, cast, terrain_at
 from .world import build_surfaces, frame_of, half_size, image_axes
 
@@ -47,7 +47,7 @@ def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
     ])  # fmt: skip
 
 
-@kernel
+@inlined
 def covered(c, x, y):
     """Whether a plan position lies in the LiDAR coverage."""
     dx, dy = x - c[0], y - c[1]

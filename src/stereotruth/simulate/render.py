@@ -18,7 +18,7 @@ from .appearance import reflectance
 from .camera import aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
-from .kernels import kernel
+from .kernels import inlined, kernel
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import IN_IMAGES, Surfaces, cast, horizon, terrain_heights
 from .world import build_surfaces, frame_of, half_size, scene_coordinates
@@ -108,7 +108,7 @@ def _prepare(city: CitySpec, scene: SceneSpec) -> Scene:
     return Scene(city, scene, frame, surfaces, *cameras)
 
 
-@kernel
+@inlined
 def in_collar(left, col, row, cols, rows):
     """Whether an image position lies in the strip without data along the frame.
 

@@ -15,7 +15,7 @@ from ..runlog import progress
 from .camera import SIZE, direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
-from .kernels import kernel
+from .kernels import inlined, kernel
 from .lidar import coverage, covered
 from .render import in_collar, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
@@ -38,7 +38,7 @@ LAYERS = {
 }
 
 
-@kernel
+@inlined
 def seen_from(s, above, cam, x, y, z, row, line, tolerance):
     """(col, row, whether nothing hides it) of a world point in a camera; ``row`` a first guess."""
     col, row = project_point(cam, x, y, z, row, line)
