@@ -1,0 +1,42 @@
+"""A real Pléiades pair through the workflow, against its check points (skipped without the data)."""
+
+from __future__ import annotations
+
+import pytest
+
+from stereotruth.evaluation.checkpoints import evaluate_checkpoints
+from stereotruth.evaluation.warping import evaluate_warping
+
+from .conftest import ROOT
+
+SCENE = ROOT.parent / "shared" / "real" / "marseille"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("real"),
+    pytest.mark.skipif(not SCENE.is_dir(), reason="the real scene is not beside the project"),
+]
+
+
+def test_marseille_agrees_with_its_check_points(project):
+    row = {
+        "scene": "marseille-1",
+        "city": "Marseille",
+        "left_image": str(SCENE / "left.tif"),
+        "right_image": str(SCENE / "right.tif"),
+        "lidar": str(SCENE / "lidar"),
+        "gcps": str(SCENE / "gcps.csv"),
+    }
+    config = project.add_scene("marseille", [row], tiles={"size": 512})
+    run = project.snakemake("tiles/Marseille", "--configfile", config)
+    assert run.status == 0, run.text[-4000:]
+    results = project.folder / "results"
+    grid = results / "project/Marseille/marseille-1.zarr"
+    figures = evaluate_checkpoints(grid, SCENE / "checkpoints.csv")
+    assert figures["count"] > 3000
+    assert abs(figures["median"]) <= 0.08
+    assert figures["nmad"] <= 0.40
+    assert figures["y_parallax_rms"] <= 0.25
+    rectified = results / "rectify/Marseille/marseille-1"
+    warping = evaluate_warping(rectified / "left.zarr", rectified / "right.zarr", grid)
+    assert warping["correlation"] >= 0.98
