@@ -1,4 +1,4 @@
-"""A real Pléiades pair through the workflow, against its check points (skipped without the data)."""
+"""A real Pléiades pair through the workflow, against its check points."""
 
 from __future__ import annotations
 
