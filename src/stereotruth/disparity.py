@@ -7,9 +7,10 @@ d = x_left - x_right (px). A point belongs to the pixel (floor(x_left + 0.5), fl
 
 A pixel's representative is condensed from the points that passed, by exact integer sums:
 
-- ``top``: mean longitude, latitude and height of its top surface (the points at most
-  TOP_SURFACE_PX px of disparity below its highest). No bias by the largest of several noisy
-  heights, and no displacement where a roof edge and the ground share a pixel.
+- ``top``: mean longitude, latitude and height of the points on the top surface at the pixel's
+  centre (:func:`stereotruth.occlusion.seen_surface`). No bias by the largest of several noisy
+  heights, and no mixture where a roof's edge and the ground share a pixel. Points of other surfaces
+  count as hidden from the left, with every method.
 - ``paper``: mean longitude and latitude of all points, height of the highest.
 
 Each pixel has one status, that of its point that got furthest through the tests in the order
@@ -42,13 +43,15 @@ from .epipolar import EpipolarModel
 from .errors import InputError
 from .grid_store import Layer, blocks, building, create_grid, require_complete
 from .occlusion import (
+    EDGE,
+    FILL_RADII,
     METHODS,
-    TOP_SURFACE_PX,
     Rays,
+    box_sum,
     build_surface,
     exact_sums,
     hidden_pixels,
-    top_surface,
+    seen_surface,
 )
 from .points import LATTICE_DEG, LATTICE_M, Points, PointStore, query_points
 from .provenance import describe, digest
@@ -60,6 +63,7 @@ Box = tuple[float, float, float, float]
 
 CHUNK = 256
 SHARD = 1024
+MARGIN = EDGE + 1  # px around a window; one for the uncertainty's 3 x 3 pixels
 REPRESENTATIVES = ("top", "paper")
 MAX_POINTS = 2_500_000  # expected in a window; some 120 bytes each at the peak
 HEIGHT_NOISE_M = 0.05  # what airborne LiDAR has at least; floor of the spread in a pixel
@@ -120,8 +124,8 @@ class Settings:
         return self.method in ("correlation", "both")
 
     @property
-    def uses_top_surface(self) -> bool:
-        """Whether points below the top surface of their pixel count as hidden from the left."""
+    def uses_seen_surface(self) -> bool:
+        """Whether points off the surface that the centre sees count as hidden from the left."""
         return self.uses_geometry or self.representative == "top"
 
     @property
@@ -132,16 +136,16 @@ class Settings:
 
 def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
     """The arrays of a disparity store."""
-    meant = (
-        f"top surface (within {TOP_SURFACE_PX:g} px of disparity below the highest point) of the "
-        "points that were not found hidden"
+    condensed, meant = (
+        (
+            "mean longitude, latitude and height",
+            "points on the surface that the pixel's centre sees and that were not found hidden",
+        )
         if settings.representative == "top"
-        else "points that were not found hidden"
-    )
-    condensed = (
-        "mean longitude, latitude and height"
-        if settings.representative == "top"
-        else "mean longitude and latitude, greatest height"
+        else (
+            "mean longitude and latitude, greatest height",
+            "points that were not found hidden",
+        )
     )
     return {
         "disparity": Layer(
@@ -238,16 +242,6 @@ def _collect(
             out[i, 3] += correlation[k]
 
 
-def _box_sum(values: Floats) -> Floats:
-    """Sum over 3 x 3 pixels; the outermost ring is left zero."""
-    out = np.zeros_like(values)
-    rows, cols = values.shape
-    for r in range(3):
-        for c in range(3):
-            out[1:-1, 1:-1] += values[r : rows - 2 + r, c : cols - 2 + c]
-    return out
-
-
 def condense(
     model: EpipolarModel,
     points: Points,
@@ -293,7 +287,7 @@ def condense(
     squares[found] = (more[found, 2] - fallen * fallen * n[found]) / _PER_PX**2
     freedom = np.zeros(size)
     freedom[found] = n[found] - 1
-    squares, freedom = _box_sum(squares.reshape(shape)), _box_sum(freedom.reshape(shape))
+    squares, freedom = box_sum(squares.reshape(shape)), box_sum(freedom.reshape(shape))
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(freedom > 0, squares / freedom, 0.0).reshape(-1)[found]
     variance = np.maximum(variance, (HEIGHT_NOISE_M * px_per_m) ** 2)
@@ -353,8 +347,8 @@ class _Scene:
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
-        x = np.linspace(cols.start - 2.0, cols.stop + 1.0, 5)
-        y = np.linspace(rows.start - 2.0, rows.stop + 1.0, 5)
+        x = np.linspace(cols.start - MARGIN - 1.0, cols.stop + MARGIN, 5)
+        y = np.linspace(rows.start - MARGIN - 1.0, rows.stop + MARGIN, 5)
         edge_x = np.concatenate([x, x, np.full(5, x[0]), np.full(5, x[-1])])
         edge_y = np.concatenate([np.full(5, y[0]), np.full(5, y[-1]), y, y])
         ground = np.hstack(
@@ -365,7 +359,7 @@ class _Scene:
             return None
         (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
         # Two pixels more, for the curvature of the edges.
-        spare = 2.0 * np.array(self.rays.cell) * LATTICE_DEG
+        spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
         return west - spare[0], south - spare[1], east + spare[0], north + spare[1]
 
     def heights(self, box: Box) -> tuple[float, float] | None:
@@ -388,7 +382,7 @@ class _Scene:
                 return None
             low, high = found
         reach = self.rays.reach(cols, rows)
-        spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
+        spare = (sum(FILL_RADII) + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
         around = box
         for _ in range(3):
             rise = top - low
@@ -427,8 +421,10 @@ class _Scene:
         if len(points) == 0:
             return None
         surface = build_surface(points, self.rays) if settings.uses_geometry else None
-        # One pixel more on all sides, for the uncertainty's neighbours.
-        wide = slice(rows.start - 1, rows.stop + 1), slice(cols.start - 1, cols.stop + 1)
+        wide = (
+            slice(rows.start - MARGIN, rows.stop + MARGIN),
+            slice(cols.start - MARGIN, cols.stop + MARGIN),
+        )
         shape = wide[0].stop - wide[0].start, wide[1].stop - wide[1].start
         xy = self.model.ground_to_epipolar(points.lon, points.lat, points.height)
         with np.errstate(invalid="ignore"):
@@ -464,12 +460,13 @@ class _Scene:
         status[np.isfinite(result["disparity"])] = Status.LABELLED
         result["status"] = status
         own = np.zeros(shape, dtype=np.bool_)
-        own[1:-1, 1:-1] = True
+        inner = slice(MARGIN, -MARGIN)
+        own[inner, inner] = True
         own = own.reshape(-1)[pixel]
         counts = np.array(
             [own.sum(), (own & (stage > _STAGE[Status.OUT_OF_FRAME])).sum(), (own & use).sum()]
         )
-        return {name: layer[1:-1, 1:-1] for name, layer in result.items()}, counts
+        return {name: layer[inner, inner] for name, layer in result.items()}, counts
 
     def judge(
         self,
@@ -488,9 +485,9 @@ class _Scene:
         use = in_frame(left, right, xy)
         stage = np.where(use, _STAGE[Status.BELOW_MINIMUM_COUNT], _STAGE[Status.OUT_OF_FRAME])
         size = (wide[0].stop - wide[0].start) * (wide[1].stop - wide[1].start)
-        if settings.uses_top_surface:
+        if settings.uses_seen_surface:
             framed = use
-            use = top_surface(pixel, xy[0] - xy[2], framed, size, TOP_SURFACE_PX)
+            use = seen_surface(xy, pixel, framed, *wide)
             stage[framed & ~use] = _STAGE[Status.HIDDEN_IN_LEFT]
         if settings.uses_geometry:
             sums = exact_sums(points, pixel, use, size)

@@ -3,13 +3,14 @@
 The paper (section III-C) removes hidden points by the correlation of image windows alone
 (:mod:`stereotruth.correlation`). Here the points decide by themselves:
 
-1. Of the points of one left pixel only the top surface is seen from the left (the nearest to the
-   camera is the one with the largest disparity).
-2. The surface is a grid of ground cells, about one left pixel each, holding the height of the
-   cell's top surface. Below its top a cell counts as solid, so that walls hide although no LiDAR
-   point lies on them.
-3. The top surface of a pixel is hidden in a view if its ray to that camera, which rises along a
-   straight track over the ground, runs into a cell.
+1. A pixel shows the surface that its centre sees. Points that others, nearer to the left camera
+   (of larger disparity), surround in the left image are covered; the uncovered point nearest to
+   the centre tells the surface (:func:`seen_surface`).
+2. The scene is a grid of ground cells, each as high as the top surface of its points. Below its top
+   a cell counts as solid, so that walls hide although no LiDAR point lies on them
+   (:func:`build_surface`).
+3. What a pixel shows is hidden in a view if the ray from there to that camera, which rises along a
+   straight track over the ground, runs into a cell (:func:`hidden_pixels`).
 
 Nothing is tuned to a scene: ray directions, cell size and tolerances follow from the epipolar
 model. Cells lie on the global lattice of the points and rays depend on the model only, so that
@@ -24,21 +25,35 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter
 
 from .points import LATTICE_DEG, LATTICE_M, Points
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+EDGE = 5  # px; see seen_surface
 METHODS = ("correlation", "geometric", "both", "none")
-# Points of one pixel or cell that lie this far below its highest one (px of disparity) still
-# belong to its top surface: a slope of 45° spans 0.6 px over a pixel of GF-7, a storey 3 px.
-TOP_SURFACE_PX = 1.0
-# A ray is stopped by a cell that still reaches above it this far (cells) behind the cell's near
-# edge, and by this height (px of disparity): cells are coarser than roof edges.
-MARGIN_CELLS = 0.5
+# Points that differ by no more than this in disparity (px) belong to one surface: a slope of 45°
+# spans 0.6 px over a pixel of GF-7, a storey 3 px.
+SURFACE_PX = 1.0
+# A point is covered if the higher ones around it leave no gap of more than EMPTY_OCTANTS; looked
+# for within COVER_PX, or further where points are sparse. Outside a straight edge the gap is 180°.
+COVER_PX = 1.0
+MAX_COVER_PX = 2.5
+EMPTY_OCTANTS = 3
+# Cells are finer than pixels, so that walls stand where they are: 0.7 % more of the visible pixels
+# were kept than with cells of a pixel, at equal shares of hidden ones.
+CELL_PX = 0.5
+# A ray is stopped by a cell that reaches TOLERANCE_PX of disparity (as height) above it. A cell
+# with a step of SURFACE_PX before it is taken to begin AHEAD_CELLS earlier (roof edges are sampled
+# on their inner side). The ray's first NEAREST_CELLS do not count (noise would hide itself).
 TOLERANCE_PX = 0.25
-FILL_ROUNDS = 2
+AHEAD_CELLS = 1.0
+NEAREST_CELLS = 0.5
+# Rounds of filling cells without points: radius in cells within which three known ones are needed.
+FILL_RADII = (1, 2, 4)
+_FINE = 4  # parts of a pixel along each axis
 _TILE = 32  # cells, of the coarse grid of maxima that bounds the search
 _PER_M = round(1 / LATTICE_M)
 
@@ -92,6 +107,160 @@ def top_surface(
     _highest(index, value, use, highest)
     out = np.empty(index.size, dtype=np.bool_)
     _below_top(index, value, use, highest, tolerance, out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fine_tops(xy: Floats, use: NDArray[np.bool_], first: tuple[int, int], tops: Floats) -> None:
+    """Greatest disparity in each of _FINE² parts of a pixel; ``tops`` [rows, cols] of parts."""
+    for k in range(xy.shape[1]):
+        if use[k]:
+            i = int(np.floor((xy[0, k] + 0.5 - first[1]) * _FINE))
+            j = int(np.floor((xy[1, k] + 0.5 - first[0]) * _FINE))
+            tops[j, i] = max(tops[j, i], xy[0, k] - xy[2, k])
+
+
+def _surrounded(limit: int) -> NDArray[np.bool_]:
+    """[256] by bit mask of octants: no more than ``limit`` octants in a row are empty."""
+    table = np.zeros(256, dtype=np.bool_)
+    for mask in range(1, 256):
+        ring = "".join(str(mask >> (k % 8) & 1) for k in range(16))
+        table[mask] = max(len(run) for run in ring.split("1")) <= limit
+    return table
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count(pixel: Ints, use: NDArray[np.bool_], out: Ints) -> None:
+    for k in range(pixel.size):
+        if use[k]:
+            out[pixel[k]] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _uncovered(
+    xy: Floats,
+    pixel: Ints,
+    use: NDArray[np.bool_],
+    first: tuple[int, int],
+    tops: Floats,
+    ceiling: Floats,
+    reach: Floats,
+    tolerance: float,
+    surrounded: NDArray[np.bool_],
+    out: NDArray[np.bool_],
+) -> None:
+    """``out``: points in ``use`` that parts of higher disparity do not surround.
+
+    ``ceiling`` and ``reach`` (px) by pixel: no part within reach is higher; where to look.
+    """
+    for k in range(pixel.size):
+        out[k] = use[k]
+        limit = xy[0, k] - xy[2, k] + tolerance
+        if not use[k] or ceiling[pixel[k]] <= limit:
+            continue
+        u = (xy[0, k] + 0.5 - first[1]) * _FINE
+        v = (xy[1, k] + 0.5 - first[0]) * _FINE
+        i, j = int(np.floor(u)), int(np.floor(v))
+        far = reach[pixel[k]] * _FINE
+        n = int(np.ceil(far))
+        octants = 0
+        for b in range(max(j - n, 0), min(j + n + 1, tops.shape[0])):
+            dv = b + 0.5 - v
+            for a in range(max(i - n, 0), min(i + n + 1, tops.shape[1])):
+                du = a + 0.5 - u
+                if tops[b, a] > limit and du * du + dv * dv <= far * far:
+                    # Octants in the order of the angle: quadrant, then its first or second half.
+                    mixed = (du < 0.0) != (dv < 0.0)
+                    octant = (4 if dv < 0.0 else 0) + (2 if mixed else 0)
+                    octants |= 1 << (octant + (1 if (abs(dv) > abs(du)) != mixed else 0))
+        out[k] = not surrounded[octants]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(
+    xy: Floats,
+    use: NDArray[np.bool_],
+    first: tuple[int, int],
+    distance: Floats,
+    disparity: Floats,
+) -> None:
+    """Per pixel: disparity of the point in ``use`` nearest to its centre (ties: the greater)."""
+    rows, cols = distance.shape
+    for k in range(xy.shape[1]):
+        if not use[k]:
+            continue
+        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
+        i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+        d = xy[0, k] - xy[2, k]
+        for b in range(max(j - 1, 0), min(j + 2, rows)):
+            for a in range(max(i - 1, 0), min(i + 2, cols)):
+                q = (x - a) ** 2 + (y - b) ** 2
+                if q < distance[b, a] or (q == distance[b, a] and d > disparity[b, a]):
+                    distance[b, a] = q
+                    disparity[b, a] = d
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _near_surface(
+    xy: Floats,
+    pixel: Ints,
+    use: NDArray[np.bool_],
+    disparity: Floats,
+    tolerance: float,
+    out: NDArray[np.bool_],
+) -> None:
+    for k in range(pixel.size):
+        out[k] = use[k] and abs(xy[0, k] - xy[2, k] - disparity[pixel[k]]) <= tolerance
+
+
+def box_sum(values: NDArray) -> NDArray:
+    """Sum over 3 x 3 pixels, always added in one order; zero beyond the edges."""
+    padded = np.pad(values, 1)
+    rows, cols = values.shape
+    return sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
+
+
+def seen_surface(
+    xy: Floats, pixel: Ints, use: NDArray[np.bool_], rows: slice, cols: slice
+) -> NDArray[np.bool_]:
+    """Which of the points in ``use`` lie on the surface that their pixel's centre sees.
+
+    A point is covered if points of another surface, nearer to the left camera by more than
+    SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
+    distance of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
+    beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
+    within SURFACE_PX. A pixel that only holds points of another surface gets none.
+
+    ``pixel`` is the row-major index into ``rows`` x ``cols``; ``xy`` [4, n] as in
+    :func:`stereotruth.correlation.correlate`. The outermost EDGE rings of pixels lack neighbours.
+    """
+    shape = rows.stop - rows.start, cols.stop - cols.start
+    first = (rows.start, cols.start)
+    tops = np.full((shape[0] * _FINE, shape[1] * _FINE), -np.inf)
+    _fine_tops(xy, use, first, tops)
+    count = np.zeros(shape[0] * shape[1], dtype=np.int64)
+    _count(pixel, use, count)
+    distance = 3.0 / np.sqrt(np.maximum(box_sum(count.reshape(shape)), 1))
+    reach = np.clip(1.7 * distance, COVER_PX, MAX_COVER_PX)
+    highest = tops.reshape(shape[0], _FINE, shape[1], _FINE).max(axis=(1, 3))
+    ceiling = maximum_filter(highest, 2 * int(np.ceil(MAX_COVER_PX)) + 1, mode="nearest")
+    uncovered = np.empty(use.size, dtype=np.bool_)
+    _uncovered(
+        xy,
+        pixel,
+        use,
+        first,
+        tops,
+        ceiling.reshape(-1),
+        reach.reshape(-1),
+        SURFACE_PX,
+        _surrounded(EMPTY_OCTANTS),
+        uncovered,
+    )
+    distance, disparity = np.full(shape, np.inf), np.full(shape, np.nan)
+    _nearest(xy, uncovered, first, distance, disparity)
+    out = np.empty(use.size, dtype=np.bool_)
+    _near_surface(xy, pixel, uncovered, disparity.reshape(-1), SURFACE_PX, out)
     return out
 
 
@@ -178,7 +347,7 @@ class Rays:
         area = abs(
             (lon3[1] - lon3[0]) * (lat3[2] - lat3[0]) - (lon3[2] - lon3[0]) * (lat3[1] - lat3[0])
         )  # degrees²
-        side = np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
+        side = CELL_PX * np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
         cell = (max(round(side / shrink), 1), max(round(side), 1))
         return cls(track, cell, float(np.round(np.nanmedian(disparity) / rise, 9)))
 
@@ -211,7 +380,7 @@ class Surface:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_holes(height: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+def _fill_holes(height: NDArray[np.float32], radius: int, out: NDArray[np.float32]) -> None:
     rows, cols = height.shape
     for j in range(rows):
         for i in range(cols):
@@ -220,8 +389,8 @@ def _fill_holes(height: NDArray[np.float32], out: NDArray[np.float32]) -> None:
                 continue
             known = 0
             lowest = np.float32(np.inf)
-            for b in range(max(j - 1, 0), min(j + 2, rows)):
-                for a in range(max(i - 1, 0), min(i + 2, cols)):
+            for b in range(max(j - radius, 0), min(j + radius + 1, rows)):
+                for a in range(max(i - radius, 0), min(i + radius + 1, cols)):
                     if height[b, a] > -np.inf:
                         known += 1
                         lowest = min(lowest, height[b, a])
@@ -233,26 +402,26 @@ def build_surface(points: Points, rays: Rays) -> Surface | None:
     """The surface of all given points; None if there are none.
 
     A cell's height is the mean of its top surface. Cells without points take the lowest of their
-    neighbours, if three are known, FILL_ROUNDS times over (roofs do not grow).
+    neighbours, if three are known, in rounds of growing radius (roofs do not grow).
     """
     if len(points) == 0:
         return None
     i = points.lon_q // rays.cell[0]
     j = points.lat_q // rays.cell[1]
-    col, row = int(i.min()) - FILL_ROUNDS, int(j.min()) - FILL_ROUNDS
-    shape = (int(j.max()) - row + 1 + FILL_ROUNDS, int(i.max()) - col + 1 + FILL_ROUNDS)
+    col, row = int(i.min()), int(j.min())
+    shape = int(j.max()) - row + 1, int(i.max()) - col + 1
     index = (j - row) * shape[1] + (i - col)
     everyone = np.ones(len(points), dtype=np.bool_)
     size = shape[0] * shape[1]
-    top = top_surface(index, points.height, everyone, size, TOP_SURFACE_PX / rays.px_per_m)
+    top = top_surface(index, points.height, everyone, size, SURFACE_PX / rays.px_per_m)
     sums = exact_sums(points, index, top, size)
     height = np.full(size, -np.inf, dtype=np.float32)
     known = sums[:, 0] > 0
     height[known] = sums[known, 3] / sums[known, 0] / _PER_M
     height = height.reshape(shape)
-    for _ in range(FILL_ROUNDS):
+    for radius in FILL_RADII:
         filled = np.empty_like(height)
-        _fill_holes(height, filled)
+        _fill_holes(height, radius, filled)
         height = filled
     tiles = [-(-n // _TILE) for n in shape]
     padded = np.full([n * _TILE for n in tiles], -np.inf, dtype=np.float32)
@@ -290,13 +459,15 @@ def _is_hidden(
     start: float,
     du: float,
     dv: float,
-    margin: float,
+    ahead: float,
+    nearest: float,
     tolerance: float,
+    step: float,
 ) -> bool:
     """Does the ray from place (a, b) in [0, 1)² of cell (i, j) at height ``start`` hit a cell?
 
     (du, dv): cells per metre of rise; ``top``: no cell is higher (m). The cell of the start does
-    not count: what lies above the start there is the business of :func:`top_surface`.
+    not count: what lies above the start there is the business of :func:`seen_surface`.
     """
     speed = np.hypot(du, dv)
     if speed < 1e-6:  # the camera stands in the zenith
@@ -315,6 +486,7 @@ def _is_hidden(
     next_u = (1.0 - a if du > 0.0 else a) * between_u if du != 0.0 else np.inf
     next_v = (1.0 - b if dv > 0.0 else b) * between_v if dv != 0.0 else np.inf
     rows, cols = height.shape
+    before = height[j, i]
     while True:
         if next_u < next_v:
             way = next_u
@@ -324,11 +496,16 @@ def _is_hidden(
             way = next_v
             next_v += between_v
             j += step_j
-        z = start + (way + margin) * rise + tolerance
-        if z >= top or i < 0 or j < 0 or i >= cols or j >= rows:
+        if i < 0 or j < 0 or i >= cols or j >= rows:
             return False
-        if height[j, i] > z:
+        here = height[j, i]
+        if start + max(way - ahead, nearest) * rise + tolerance >= top:
+            return False
+        if here - before > step:
+            way -= ahead
+        if here > start + max(way, nearest) * rise + tolerance:
             return True
+        before = here
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -341,8 +518,10 @@ def _hidden(
     track: Floats,
     first: tuple[int, int],
     width: int,
-    margin: float,
+    ahead: float,
+    nearest: float,
     tolerance: float,
+    step: float,
     out: NDArray[np.uint8],
 ) -> None:
     """``out`` [bins]: 0 seen in both views, 1 hidden from the left, 2 from the right only.
@@ -381,8 +560,10 @@ def _hidden(
                 start,
                 du,
                 dv,
-                margin,
+                ahead,
+                nearest,
                 tolerance,
+                step,
             ):
                 out[k] = view + 1
                 break
@@ -391,9 +572,9 @@ def _hidden(
 def hidden_pixels(
     surface: Surface, rays: Rays, sums: Ints, rows: slice, cols: slice
 ) -> NDArray[np.uint8]:
-    """Whether the top surface of each pixel of a window is hidden.
+    """Whether what each pixel of a window shows is hidden.
 
-    ``sums`` [pixels, 4] come from :func:`exact_sums` over the top surfaces, pixels in row-major
+    ``sums`` [pixels, 4] come from :func:`exact_sums` over the seen surfaces, pixels in row-major
     order of ``rows`` x ``cols`` of the left epipolar grid. Returns uint8 [pixels]: 0 seen in both
     views (or no point), 1 hidden from the left, 2 hidden from the right.
     """
@@ -408,8 +589,10 @@ def hidden_pixels(
         rays.track / per_cell,
         (rows.start, cols.start),
         cols.stop - cols.start,
-        MARGIN_CELLS,
+        AHEAD_CELLS,
+        NEAREST_CELLS,
         TOLERANCE_PX / rays.px_per_m,
+        SURFACE_PX / rays.px_per_m,
         out,
     )
     return out
