@@ -10,7 +10,7 @@ A pixel's representative is condensed from the points that passed, by exact inte
 - ``top``: mean longitude, latitude and height of the points on the top surface at the pixel's
   centre (:func:`stereotruth.occlusion.seen_surface`). No bias by the largest of several noisy
   heights, and no mixture where a roof's edge and the ground share a pixel. Points of other surfaces
-  count as hidden from the left, with every method.
+  count as hidden from the left, with every method; so do those of pixels right on an edge.
 - ``paper``: mean longitude and latitude of all points, height of the highest.
 
 Each pixel has one status, that of its point that got furthest through the tests in the order
@@ -166,6 +166,8 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
                 "long_name": "why a pixel has a label or none",
                 "flag_values": [int(status) for status in Status],
                 "flag_meanings": " ".join(status.name.lower() for status in Status),
+                "hidden_in_left": "no point is known to lie on the surface that the pixel's centre "
+                "sees (other points cover them, or the centre lies on an edge)",
                 "precedence": "of the point that got furthest through the tests: frame, left "
                 "view, right view, correlation, number of points",
             },

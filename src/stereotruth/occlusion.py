@@ -42,6 +42,10 @@ SURFACE_PX = 1.0
 COVER_PX = 1.0
 MAX_COVER_PX = 2.5
 EMPTY_OCTANTS = 3
+# A pixel gets no label unless the second nearest surface is this much further from its centre than
+# the nearest: in a city 0.16 % instead of 0.43 % of the labels were off by more than 1 px, for 1 %
+# of the visible pixels; in a forest 0.34 % instead of 0.85 %, for 2.5 %.
+CLEAR_PX = 0.2
 # Cells are finer than pixels, so that walls stand where they are: 0.7 % more of the visible pixels
 # were kept than with cells of a pixel, at equal shares of hidden ones.
 CELL_PX = 0.5
@@ -201,6 +205,30 @@ def _nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_other(
+    xy: Floats,
+    use: NDArray[np.bool_],
+    first: tuple[int, int],
+    disparity: Floats,
+    tolerance: float,
+    distance: Floats,
+) -> None:
+    """Per pixel: squared distance of its centre to the nearest point of another surface."""
+    rows, cols = distance.shape
+    for k in range(xy.shape[1]):
+        if not use[k]:
+            continue
+        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
+        i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+        d = xy[0, k] - xy[2, k]
+        for b in range(max(j - 1, 0), min(j + 2, rows)):
+            for a in range(max(i - 1, 0), min(i + 2, cols)):
+                if abs(d - disparity[b, a]) > tolerance:
+                    q = (x - a) ** 2 + (y - b) ** 2
+                    distance[b, a] = min(distance[b, a], q)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _near_surface(
     xy: Floats,
     pixel: Ints,
@@ -229,7 +257,8 @@ def seen_surface(
     SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
     distance of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
     beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
-    within SURFACE_PX. A pixel that only holds points of another surface gets none.
+    within SURFACE_PX. There are none if the pixel only holds points of another surface, or if
+    the centre lies on an edge: another surface no more than CLEAR_PX further away.
 
     ``pixel`` is the row-major index into ``rows`` x ``cols``; ``xy`` [4, n] as in
     :func:`stereotruth.correlation.correlate`. The outermost EDGE rings of pixels lack neighbours.
@@ -259,6 +288,9 @@ def seen_surface(
     )
     distance, disparity = np.full(shape, np.inf), np.full(shape, np.nan)
     _nearest(xy, uncovered, first, distance, disparity)
+    other = np.full(shape, np.inf)
+    _nearest_other(xy, uncovered, first, disparity, SURFACE_PX, other)
+    disparity[np.sqrt(other) < np.sqrt(distance) + CLEAR_PX] = np.nan
     out = np.empty(use.size, dtype=np.bool_)
     _near_surface(xy, pixel, uncovered, disparity.reshape(-1), SURFACE_PX, out)
     return out

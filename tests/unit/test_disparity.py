@@ -136,6 +136,11 @@ def box(tmp_path_factory) -> Scene:
     return Scene(tmp_path_factory.mktemp("box"), box=True)
 
 
+@pytest.fixture(scope="module")
+def noisy_box(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("noisy"), box=True, noise=0.1)
+
+
 @pytest.mark.parametrize("method", ["none", "correlation", "geometric", "both"])
 @pytest.mark.parametrize("representative", ["top", "paper"])
 def test_disparity_of_a_plane(plane, method, representative) -> None:
@@ -159,19 +164,27 @@ def test_disparity_of_a_plane(plane, method, representative) -> None:
 
 
 def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, float, int]]:
-    """Disparity, height and count by pixel, point by point in Python from the definition."""
+    """Disparity, height and count by pixel, point by point in Python from the definition.
+
+    With ``top``, only pixels around which all points are of one surface.
+    """
     points = query_points([scene.store], -180, -90, 180, 90)
     xy = scene.model.ground_to_epipolar(points.lon, points.lat, points.height)
     pixels: dict[tuple[int, int], list[int]] = {}
     for k, (x, y) in enumerate(zip(xy[0], xy[1])):
         pixels.setdefault((int(np.floor(y + 0.5)), int(np.floor(x + 0.5))), []).append(k)
     found = {}
-    for pixel, members in pixels.items():
-        if not 40 < pixel[0] < 80 or not 40 < pixel[1] < 120:
+    for (row, col), members in pixels.items():
+        if not 110 < row < 200 or not 90 < col < 220:
             continue
-        if top:
-            d = xy[0, members] - xy[2, members]
-            members = [k for k, value in zip(members, d) if value >= d.max() - 1.0]
+        around = [
+            k
+            for r in range(row - 2, row + 3)
+            for c in range(col - 2, col + 3)
+            for k in pixels.get((r, c), [])
+        ]
+        if top and np.ptp(xy[0, around] - xy[2, around]) > 0.9:
+            continue
         highest = points.height[members].max()
         ground = [
             points.lon[members].mean(),
@@ -179,24 +192,40 @@ def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, f
             points.height[members].mean() if top else highest,
         ]
         there = scene.model.ground_to_epipolar(*ground)
-        found[pixel] = float((there[0] - there[2])[0]), float(highest), len(members)
+        found[row, col] = float((there[0] - there[2])[0]), float(highest), len(members)
     return found
 
 
 @pytest.mark.parametrize("representative", ["top", "paper"])
-def test_representative_is_that_of_its_definition(tmp_path, representative) -> None:
-    """Points of 0.3 m noise on plane and roof, against sums in Python: 1e-5 px."""
-    scene = Scene(tmp_path, box=True, noise=0.3)
-    grid = scene.project(method="none", representative=representative)
+def test_representative_is_that_of_its_definition(noisy_box, representative) -> None:
+    """Points of 0.1 m noise on plane and roof, against sums in Python: 1e-5 px."""
+    grid = noisy_box.project(method="none", representative=representative)
     disparity, height, count = (
         grid[name].values for name in ("disparity", "height", "point_count")
     )
-    expected = brute_force(scene, representative == "top")
-    assert len(expected) > 2000
+    expected = brute_force(noisy_box, representative == "top")
+    assert len(expected) > 5000
     for pixel, (d, h, n) in expected.items():
         assert disparity[pixel] == pytest.approx(d, abs=1e-5)
         assert height[pixel] == pytest.approx(h, abs=1e-4)
         assert count[pixel] == n
+
+
+def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
+    """Each label is that of the roof or of the ground, and the wrong one less often."""
+    levels = [box.truth[box.surface[2] == h].mean() for h in (HEIGHT, ROOF)]
+    off = {}
+    for representative in ("top", "paper"):
+        grid = box.project(method="none", representative=representative)
+        d = grid["disparity"].values
+        d = d[np.isfinite(d)]
+        off[representative] = (np.minimum(abs(d - levels[0]), abs(d - levels[1])) > 0.05).sum()
+        right = abs(grid["disparity"].values - box.truth) < 1
+        seen_by_both = (box.surface[2] == HEIGHT) | (box.surface[2] == ROOF)
+        known = np.isfinite(grid["disparity"].values) & seen_by_both
+        off[representative + " wrong"] = (known & ~right).sum()
+    assert off["top"] == 0
+    assert off["top wrong"] < 0.5 * off["paper wrong"]
 
 
 def hidden_truth(scene: Scene) -> np.ndarray:
@@ -246,7 +275,8 @@ def test_box_hides_a_run_of_the_ground(box, method) -> None:
     cols = np.flatnonzero((hidden | wall).any(axis=0))
     run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
     rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
-    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=1.5)
+    tolerance = 1.5 if method == "geometric" else 4.5  # windows reach over edges
+    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=tolerance)
 
 
 def test_correlation_removes_most_of_what_is_hidden(box) -> None:
@@ -340,18 +370,17 @@ def test_attributes_and_summary(plane) -> None:
     json.dumps(dict(grid.attrs))
 
 
-def test_uncertainty_is_the_standard_error_of_the_mean(tmp_path) -> None:
-    """Noise of 0.5 m on a plane: |error| below 1 and 2 standard uncertainties in 68 and 95 %."""
-    scene = Scene(tmp_path, box=False, noise=0.5)
-    grid = scene.project(method="none", representative="paper")
-    points = query_points([scene.store], -180, -90, 180, 90)
-    assert len(points) > 0
-    sigma = grid["uncertainty"].values
-    count = grid["point_count"].values
-    inside = np.isfinite(sigma) & (count >= 2)
-    k = 0.5 * (0.49 + 0.09) / 0.65  # px, noise of one point's disparity
-    ratio = sigma[inside] * np.sqrt(count[inside]) / k
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.08)
+def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box) -> None:
+    """Noise of 0.1 m is 0.09 px: uncertainty as known from it, and as the errors are."""
+    grid = noisy_box.project(method="none")
+    sigma, count = grid["uncertainty"].values, grid["point_count"].values
+    roof = noisy_box.surface[2] == ROOF
+    clear = np.isfinite(sigma) & ~dilated(roof | (noisy_box.surface[2] > HEIGHT), 30)
+    known = 0.1 * (FORWARD[1] - BACKWARD[1]) / 0.65  # px, of one point
+    assert np.median((sigma * np.sqrt(count))[clear]) == pytest.approx(abs(known), rel=0.05)
+    ratio = np.abs(grid["disparity"].values - noisy_box.truth)[clear] / sigma[clear]
+    assert (ratio < 1).mean() == pytest.approx(0.68, abs=0.04)
+    assert (ratio < 2).mean() == pytest.approx(0.95, abs=0.03)
 
 
 def refused(scene: Scene, store: Path, match: str) -> None:
