@@ -10,11 +10,12 @@ A pixel's representative is condensed from the points that passed, by exact inte
 - ``top``: mean longitude, latitude and height of the points on the top surface at the pixel's
   centre (:func:`stereotruth.occlusion.seen_surface`). No bias by the largest of several noisy
   heights, and no mixture where a roof's edge and the ground share a pixel. Points of other surfaces
-  count as hidden from the left, with every method; so do those of pixels right on an edge.
+  count as hidden from the left, with every method. Where an edge passes within ``edge_margin_px``
+  of the centre, noise of the alignment decides which surface it meets: no label.
 - ``paper``: mean longitude and latitude of all points, height of the highest.
 
 Each pixel has one status, that of its point that got furthest through the tests in the order
-frame, left view, right view, correlation, number of points; see :class:`Status`.
+frame, left view, right view, correlation, edge, number of points; see :class:`Status`.
 
 The grid is worked on in blocks of one shard, each independent of the others; a block is cut into
 windows of a bounded number of points. The result has the same bytes for any number of workers, size
@@ -82,6 +83,7 @@ class Status(IntEnum):
     CHANGED = 5
     OUT_OF_FRAME = 6
     BELOW_MINIMUM_COUNT = 7
+    EDGE_IN_PIXEL = 8
 
 
 # The tests in their order; a point's stage is the test that it failed. Higher got further.
@@ -91,6 +93,7 @@ _ORDER = (
     Status.HIDDEN_IN_LEFT,
     Status.HIDDEN_IN_RIGHT,
     Status.LOW_CORRELATION,
+    Status.EDGE_IN_PIXEL,
     Status.BELOW_MINIMUM_COUNT,
 )
 _STAGE = {status: np.uint8(stage) for stage, status in enumerate(_ORDER)}
@@ -105,6 +108,7 @@ class Settings:
     window: int = 9
     correlation_threshold: float = 0.5
     representative: str = "top"
+    edge_margin_px: float = 0.25
     min_points: int = 1
 
     def __post_init__(self) -> None:
@@ -169,7 +173,7 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
                 "hidden_in_left": "no point is known to lie on the surface that the pixel's centre "
                 "sees (other points cover them, or the centre lies on an edge)",
                 "precedence": "of the point that got furthest through the tests: frame, left "
-                "view, right view, correlation, number of points",
+                "view, right view, correlation, edge, number of points",
             },
         ),
         "height": Layer(
@@ -489,7 +493,7 @@ class _Scene:
         size = (wide[0].stop - wide[0].start) * (wide[1].stop - wide[1].start)
         if settings.uses_seen_surface:
             framed = use
-            use = seen_surface(xy, pixel, framed, *wide)
+            use, edge = seen_surface(xy, pixel, framed, *wide, settings.edge_margin_px)
             stage[framed & ~use] = _STAGE[Status.HIDDEN_IN_LEFT]
         if settings.uses_geometry:
             sums = exact_sums(points, pixel, use, size)
@@ -504,6 +508,9 @@ class _Scene:
             fail = use & ~(correlation >= settings.correlation_threshold)
             stage[fail] = _STAGE[Status.LOW_CORRELATION]
             use &= ~fail
+        if settings.representative == "top":
+            stage[use & edge] = _STAGE[Status.EDGE_IN_PIXEL]
+            use &= ~edge
         return stage, use, correlation
 
     # -- one block
@@ -616,6 +623,7 @@ def project_scene(
     window: int = 9,
     correlation_threshold: float = 0.5,
     representative: str = "top",
+    edge_margin_px: float = 0.25,
     min_points: int = 1,
     workers: int = 1,
     scheduler: Any = "threads",
@@ -640,7 +648,9 @@ def project_scene(
 
     Raises InputError if no point falls into both images.
     """
-    settings = Settings(method, window, correlation_threshold, representative, min_points)
+    settings = Settings(
+        method, window, correlation_threshold, representative, edge_margin_px, min_points
+    )
     paths = sorted(Path(path) for path in point_stores)
     if not paths:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")

@@ -42,10 +42,6 @@ SURFACE_PX = 1.0
 COVER_PX = 1.0
 MAX_COVER_PX = 2.5
 EMPTY_OCTANTS = 3
-# A pixel gets no label unless the second nearest surface is this much further from its centre than
-# the nearest: in a city 0.16 % instead of 0.43 % of the labels were off by more than 1 px, for 1 %
-# of the visible pixels; in a forest 0.34 % instead of 0.85 %, for 2.5 %.
-CLEAR_PX = 0.2
 # Cells are finer than pixels, so that walls stand where they are: 0.7 % more of the visible pixels
 # were kept than with cells of a pixel, at equal shares of hidden ones.
 CELL_PX = 0.5
@@ -249,16 +245,24 @@ def box_sum(values: NDArray) -> NDArray:
 
 
 def seen_surface(
-    xy: Floats, pixel: Ints, use: NDArray[np.bool_], rows: slice, cols: slice
-) -> NDArray[np.bool_]:
+    xy: Floats,
+    pixel: Ints,
+    use: NDArray[np.bool_],
+    rows: slice,
+    cols: slice,
+    edge_margin_px: float,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which of the points in ``use`` lie on the surface that their pixel's centre sees.
 
     A point is covered if points of another surface, nearer to the left camera by more than
     SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
     distance of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
     beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
-    within SURFACE_PX. There are none if the pixel only holds points of another surface, or if
-    the centre lies on an edge: another surface no more than CLEAR_PX further away.
+    within SURFACE_PX. There are none if the pixel only holds points of another surface.
+
+    The second result tells which of them lie in a pixel on an edge: half-way between the nearest
+    points of its surface and of another one, the edge passes within ``edge_margin_px`` of the
+    centre, so that it may as well see the other one.
 
     ``pixel`` is the row-major index into ``rows`` x ``cols``; ``xy`` [4, n] as in
     :func:`stereotruth.correlation.correlate`. The outermost EDGE rings of pixels lack neighbours.
@@ -290,10 +294,10 @@ def seen_surface(
     _nearest(xy, uncovered, first, distance, disparity)
     other = np.full(shape, np.inf)
     _nearest_other(xy, uncovered, first, disparity, SURFACE_PX, other)
-    disparity[np.sqrt(other) < np.sqrt(distance) + CLEAR_PX] = np.nan
+    edge = np.sqrt(other) < np.sqrt(distance) + 2.0 * edge_margin_px
     out = np.empty(use.size, dtype=np.bool_)
     _near_surface(xy, pixel, uncovered, disparity.reshape(-1), SURFACE_PX, out)
-    return out
+    return out, out & edge.reshape(-1)[pixel]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -357,7 +357,7 @@ def test_attributes_and_summary(plane) -> None:
         assert grid[name].dims == ("y", "x")
         assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
     status = grid["status"]
-    assert status.attrs["flag_values"] == list(range(8))
+    assert status.attrs["flag_values"] == list(range(9))
     assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status]
     assert grid.attrs["provenance"]["code"] == "abc"
     assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}

@@ -7,7 +7,7 @@ import pytest
 
 from stereotruth.epipolar import fit_epipolar
 from stereotruth.occlusion import (
-    TOP_SURFACE_PX,
+    SURFACE_PX,
     Rays,
     build_surface,
     exact_sums,
@@ -72,7 +72,7 @@ def test_ray_directions_and_scale(tilts) -> None:
         assert metres == pytest.approx([-tilt[0], -tilt[1]], abs=1e-5)
         assert np.abs(rays.track[view, :, 1:]).max() * 300 * METRES.max() < 1e-5
     size = np.array(rays.cell) * LATTICE_DEG * METRES
-    assert size == pytest.approx([0.65, 0.65], rel=0.02)
+    assert size == pytest.approx([0.325, 0.325], rel=0.02)
     base = np.hypot(*np.subtract(*tilts)) / 0.65
     assert rays.px_per_m == pytest.approx(base, rel=1e-3)
 
@@ -106,13 +106,13 @@ def test_shadow_of_a_box_in_both_views(tilts) -> None:
 
 
 def test_slopes_hide_themselves_only_beyond_the_ray() -> None:
-    """A slope facing away from the forward camera is seen to 60 degrees and hidden at 67.
+    """A slope facing away from the forward camera, whose rays rise by 63.9 degrees.
 
-    The ray rises by 1 / 0.49 m per m: 63.9 degrees.
+    Cells hold one or two points each, so that verdicts near that angle are uncertain.
     """
     model = model_of((0.0, 0.09), (0.0, -0.49))
     rng = np.random.default_rng(2)
-    for degrees, hidden in ((0, False), (30, False), (45, False), (58, False), (70, True)):
+    for degrees, hidden in ((0, False), (30, False), (48, False), (70, True)):
         east, north = rng.uniform(-30, 30, (2, 60_000))
         slope = np.tan(np.radians(degrees))
         # Its ray runs north: ground that rises to the north comes into its way.
@@ -120,7 +120,7 @@ def test_slopes_hide_themselves_only_beyond_the_ray() -> None:
         points = points_at(east, north, height)
         probe = abs(north) < 10
         found = verdicts(model, points, east[probe][:300], north[probe][:300], height[probe][:300])
-        assert (found == 2).mean() == pytest.approx(float(hidden), abs=0.05), degrees
+        assert (found == 2).mean() == pytest.approx(float(hidden), abs=0.01), degrees
 
 
 def test_flat_and_noisy_ground_is_seen() -> None:
@@ -145,8 +145,8 @@ def test_surface_has_no_small_holes_and_no_grown_roofs() -> None:
     surface = build_surface(points, rays)
     inner = surface.height[5:-5, 5:-5]
     assert np.isfinite(inner).all()
-    roof = (inner > HEIGHT + 15).mean() * inner.size * 0.65**2
-    assert roof == pytest.approx(16.0**2, rel=0.12)
+    roof = (inner > HEIGHT + 15).sum() * 0.325**2
+    assert roof == pytest.approx(16.0**2, rel=0.15)
     assert build_surface(points_at(np.empty(0), np.empty(0), np.empty(0)), rays) is None
 
 
@@ -154,5 +154,5 @@ def test_top_surface_of_bins() -> None:
     index = np.array([0, 0, 0, 1, 1, 3])
     value = np.array([5.0, 4.5, 3.0, 7.0, 7.0, 1.0])
     use = np.array([True, True, True, False, True, True])
-    top = top_surface(index, value, use, 4, TOP_SURFACE_PX)
+    top = top_surface(index, value, use, 4, SURFACE_PX)
     assert top.tolist() == [True, True, False, False, True, True]

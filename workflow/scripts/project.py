@@ -16,6 +16,7 @@ if __name__ == "__main__":
             window=occlusion["window"],
             correlation_threshold=occlusion["correlation_threshold"],
             representative=settings["representative"],
+            edge_margin_px=settings["edge_margin_px"],
             min_points=settings["min_points_per_px"],
             workers=snakemake.threads,
             code=snakemake.params.code,
