@@ -44,13 +44,19 @@ class Run:
 
 @dataclass
 class Project:
-    """A working directory with the workflow's files, and a source tree of its own."""
+    """A working directory with the workflow's files, and a source tree of its own.
+
+    ``edited``: use that source tree, instead of the installed package, whose code is compiled.
+    """
 
     folder: Path
+    edited: bool = False
 
     def snakemake(self, *arguments: str, cores: int = 2) -> Run:
-        source = self.folder / "src"
-        environment = {**os.environ, "PYTHONPATH": str(source)}
+        environment = dict(os.environ)
+        if self.edited:
+            environment["PYTHONPATH"] = str(self.folder / "src")
+            environment.pop("NUMBA_CACHE_DIR", None)
         done = subprocess.run(
             [sys.executable, "-m", "snakemake", "--cores", str(cores), *arguments],
             cwd=self.folder,

@@ -169,6 +169,7 @@ def test_another_tile_size_runs_export_only(made):
 def test_edited_code_runs_its_stage_and_what_follows(made, module, rules):
     file = made.folder / f"src/stereotruth/{module}.py"
     before = file.read_text()
+    made.edited = True
     try:
         file.write_text(before + "\n# a remark is no change\n")
         assert plan(made) == {}
@@ -176,6 +177,7 @@ def test_edited_code_runs_its_stage_and_what_follows(made, module, rules):
         assert set(plan(made)) == rules
     finally:
         file.write_text(before)
+        made.edited = False
 
 
 def test_a_new_lidar_file_is_the_only_one_read(made):
