@@ -170,8 +170,7 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
                 "long_name": "why a pixel has a label or none",
                 "flag_values": [int(status) for status in Status],
                 "flag_meanings": " ".join(status.name.lower() for status in Status),
-                "hidden_in_left": "no point is known to lie on the surface that the pixel's centre "
-                "sees (other points cover them, or the centre lies on an edge)",
+                "hidden_in_left": "no point of the pixel lies on the surface that its centre sees",
                 "precedence": "of the point that got furthest through the tests: frame, left "
                 "view, right view, correlation, edge, number of points",
             },

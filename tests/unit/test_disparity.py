@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pyproj
 import pytest
 import zarr
 
-from stereotruth.disparity import Status, project_scene
+from stereotruth.disparity import MAX_POINTS, Settings, Status, _Scene, project_scene
 from stereotruth.epipolar import EpipolarModel, fit_epipolar
 from stereotruth.errors import InputError
 from stereotruth.grid_store import Layer, building, create_grid, open_grid
@@ -308,6 +309,34 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
         box.project(f"{number}.zarr", stores, method="both", **options)
         digests.add(tree_digest(box.folder / f"{number}.zarr"))
     assert len(digests) == 1
+
+
+def test_blocks_can_go_to_other_processes(plane) -> None:
+    """A block's task is made of plain values, whatever has been opened before."""
+    job = _Scene(*plane.images, (plane.store,), Settings(), 0.0, MAX_POINTS)
+    window = slice(100, 140), slice(120, 170)
+    first = job.label(*window)
+    second = pickle.loads(pickle.dumps(job)).label(*window)
+    assert len(pickle.dumps(job)) < 2000
+    for name, layer in first[0].items():
+        assert np.array_equal(layer, second[0][name], equal_nan=True)
+
+
+def test_edge_margin_trades_labels_for_certainty(box) -> None:
+    """Wider margins leave fewer labels and none of the wrong surface."""
+    shares, wrong = [], []
+    for margin in (0.0, 0.1, 0.25, 0.5):
+        grid = box.project(method="geometric", edge_margin_px=margin)
+        disparity = grid["disparity"].values
+        known = np.isfinite(disparity) & np.isin(box.surface[2], (HEIGHT, ROOF))
+        shares.append(known.mean())
+        wrong.append(int((np.abs(disparity - box.truth)[known] > 1).sum()))
+        edge = grid["status"].values == Status.EDGE_IN_PIXEL
+        assert edge.any() == (margin > 0.0)
+        assert np.isnan(disparity[edge]).all()
+    assert shares == sorted(shares, reverse=True)
+    assert wrong == sorted(wrong, reverse=True)
+    assert wrong[-1] == 0
 
 
 def test_reasons_and_their_order(plane) -> None:
