@@ -35,7 +35,6 @@ from typing import Any
 import dask
 import numpy as np
 import zarr
-from dask.callbacks import Callback
 from numba import njit
 from numpy.typing import NDArray
 
@@ -56,6 +55,7 @@ from .occlusion import (
 )
 from .points import LATTICE_DEG, LATTICE_M, Points, PointStore, query_points
 from .provenance import describe, digest
+from .runlog import BlockProgress
 
 log = logging.getLogger("stereotruth")
 
@@ -559,19 +559,6 @@ class _Scene:
 # ----------------------------------------------------------------------------------------- stage
 
 
-class _Progress(Callback):
-    """Logs about every tenth of the blocks done (local schedulers only)."""
-
-    def __init__(self, total: int) -> None:
-        super().__init__()
-        self.done, self.total = 0, total
-
-    def _posttask(self, *_: object) -> None:
-        self.done += 1
-        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
-            log.info("disparity: %d of %d blocks", min(self.done, self.total), self.total)
-
-
 def _apart(a: Box, b: Box) -> bool:
     return a[0] > b[2] or b[0] > a[2] or a[1] > b[3] or b[1] > a[3]
 
@@ -703,7 +690,7 @@ def project_scene(
             )
             for number, (rows, cols) in enumerate(blocks(model.shape, SHARD))
         ]
-        with _Progress(len(tasks)):
+        with BlockProgress(len(tasks), "disparity"):
             counts = np.sum(
                 dask.compute(*tasks, scheduler=scheduler, num_workers=workers), axis=0
             ).tolist()

@@ -18,7 +18,6 @@ import dask
 import numpy as np
 import rasterio
 import zarr
-from dask.callbacks import Callback
 from numba import njit
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -28,6 +27,7 @@ from .epipolar import EpipolarModel, Floats, ImageModel, fit_epipolar
 from .errors import InputError
 from .grid_store import Layer, blocks, building, create_grid
 from .rpc import SensorModel
+from .runlog import BlockProgress
 
 log = logging.getLogger("stereotruth")
 
@@ -288,19 +288,6 @@ def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
     return tuple(span if span > ANTIALIAS else 1.0 for span in spans)
 
 
-class _Progress(Callback):
-    """Logs about every tenth of the tasks done."""
-
-    def __init__(self, total: int, what: str) -> None:
-        super().__init__()
-        self.done, self.total, self.what = 0, total, what
-
-    def _posttask(self, *_: object) -> None:
-        self.done += 1
-        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
-            log.info("%s: %d of %d blocks", self.what, self.done, self.total)
-
-
 def rectify_image(
     source: Source,
     model: ImageModel,
@@ -359,7 +346,7 @@ def rectify_image(
         dask.delayed(run)(rows, cols, dask_key_name=f"block-{i:07d}")
         for i, (_, rows, cols) in enumerate(todo)
     ]
-    with _Progress(len(tasks), what):
+    with BlockProgress(len(tasks), what):
         counts = dask.compute(*tasks, scheduler="threads", num_workers=workers)
     valid = int(sum(counts))
     if valid == 0:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
+from dask.callbacks import Callback
 
 from .errors import InputError
 
@@ -55,3 +56,16 @@ def progress(items: Iterable, total: int, what: str) -> Iterator:
         if tenth > last:
             last = tenth
             log.info("%s: %d of %d", what, done, total)
+
+
+class BlockProgress(Callback):
+    """Logs about every tenth of the blocks done while Dask computes (local schedulers only)."""
+
+    def __init__(self, total: int, what: str) -> None:
+        super().__init__()
+        self.done, self.total, self.what = 0, total, what
+
+    def _posttask(self, *_: object) -> None:
+        self.done += 1
+        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
+            log.info("%s: %d of %d blocks", self.what, self.done, self.total)

@@ -44,7 +44,9 @@ def defects(folder: str | Path) -> list[str]:
                 found.append(f"{name}: missing")
             elif file_sha256(folder / name) != row[f"{kind}_sha256"]:
                 found.append(f"{name}: changed")
-    present = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    files = (p for p in folder.rglob("*") if p.is_file())
+    # a workflow manager may leave a hidden time stamp of its own
+    present = {p.relative_to(folder).as_posix() for p in files if not p.name.startswith(".")}
     found += [f"{name}: not in the manifest" for name in sorted(present - listed - LOOSE)]
     if (record := folder / "export.json").is_file():
         wanted = json.loads(record.read_text(encoding="utf-8"))["manifest_sha256"]

@@ -121,7 +121,8 @@ def test_disparity_agrees_with_the_exact_truth(made, data):
     assert figures["errors"]["mean_absolute"] <= 0.25
     assert figures["errors"]["share_over_1_px"] <= 0.005
     assert figures["y_parallax"]["rms"] <= 0.25
-    assert figures["share_of_visible_labelled"] >= 0.9
+    assert figures["share_of_visible_labelled"] >= 0.85  # narrow courts: many edges
+    assert figures["share_of_hidden_labelled"] <= 0.1
 
 
 def test_a_second_call_runs_nothing(made):

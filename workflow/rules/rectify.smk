@@ -18,7 +18,7 @@ rule rectify:
         mem_mb=2000,
         runtime=120,
     params:
-        code=source_digest("rectification"),
+        code=source_digest("rectification", "alignment"),
     message:
         "Making epipolar images of scene {wildcards.scene}"
     script:
