@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import rioxarray
 
 from stereotruth.simulate.__main__ import make_scene
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
@@ -108,6 +109,9 @@ def test_tiles_are_made_with_all_their_files(made):
         with rasterio.open(files[0]) as tile:
             assert (tile.width, tile.height, tile.dtypes[0]) == (128, 128, dtype)
     assert len(list((folder / "disp").iterdir())) == len(labelled)
+    disparity = rioxarray.open_rasterio(next((folder / "disp").iterdir()), masked=True)
+    assert disparity.isnull().any() and disparity.notnull().any()
+    assert abs(disparity).max() < 200
     assert len(list((folder / "orientation").iterdir())) >= len(labelled)
 
 
