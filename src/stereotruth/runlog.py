@@ -20,15 +20,15 @@ log = logging.getLogger("stereotruth")
 def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     """Run one job: log to terminal and file; end with one clear line where the input is at fault.
 
-    InputError becomes ``error: <name>: …`` and exit status 1; anything else is a defect and keeps
-    its traceback.
+    ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1;
+    anything else is a defect and keeps its traceback.
     """
     cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, mode="w")
     terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
-    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     handlers = (terminal, file)
     for handler in handlers:
         log.addHandler(handler)

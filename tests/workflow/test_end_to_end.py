@@ -332,7 +332,9 @@ def test_a_mistake_ends_in_one_clear_message(data, tmp_path, mistake, words):
     errors = {line.partition("error: ")[2] for line in message if "error: " in line}
     # one, or one for each of the two LiDAR files that are read at the same time
     assert 1 <= len(errors) <= (2 if mistake is lidar_without_crs else 1), run.text[-3000:]
-    assert "Tiny-1" in run.text
+    said = [line for line in message if "error: " in line]
+    assert all("Tiny-1: error: " in line for line in said)  # the scene, at the time and at the end
+    assert len(said) == 2 * len(errors)
     for error in errors:
         for word in ["Remedy:", *words]:
             assert word in error, error

@@ -99,7 +99,7 @@ def complaints(snakemake_logs):
     logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
     found = []
     for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
-        found += re.findall(r"ERROR (error: .*)", file.read_text())
+        found += re.findall(r"ERROR (.*?: error: .*)", file.read_text())
     return "\n".join(found)
 
 
