@@ -35,7 +35,7 @@ lint: $(READY)
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:
 	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra dev --universal \
-	  --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --quiet \
+	  --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 
 clean:
