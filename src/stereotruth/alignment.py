@@ -27,6 +27,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from .control_points import ControlPoints, read_gcps
 from .errors import InputError
+from .grid_store import replacing
 from .provenance import describe, source_digest
 from .robust_fit import (
     BLUNDER_FLOOR,
@@ -195,7 +196,8 @@ class Alignment:
     def save(self, path: str | Path) -> None:
         """Write JSON; the file appears when it is whole."""
         text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-        _replace(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
+        with replacing(path) as scratch:
+            scratch.write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> Alignment:
@@ -729,24 +731,14 @@ def align(
 # -------------------------------------------------------------------------------------- output
 
 
-def _replace(path: str | Path, write: Any) -> None:
-    """Write a sibling of the file by ``write(scratch)``, then rename it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        write(scratch)
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
-
-
 def write_alignment(
     alignment: Alignment, json_file: str | Path, csv_file: str | Path, png_file: str | Path
 ) -> None:
     """Write the alignment (JSON), the residuals of every GCP (CSV, px) and their figure (PNG)."""
-    _replace(csv_file, lambda scratch: _write_table(alignment, scratch))
-    _replace(png_file, lambda scratch: _draw(alignment, scratch))
+    with replacing(csv_file) as scratch:
+        _write_table(alignment, scratch)
+    with replacing(png_file) as scratch:
+        _draw(alignment, scratch)
     alignment.save(json_file)
 
 

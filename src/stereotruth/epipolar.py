@@ -31,6 +31,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .grid_store import replacing
 from .rpc import SensorModel, project_point
 
 log = logging.getLogger("stereotruth")
@@ -413,12 +414,9 @@ class EpipolarModel:
 
     def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model and its provenance as JSON; the file appears when it is whole."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_name(path.name + ".partial")
         record = self.to_dict() | {"provenance": dict(provenance or {})}
-        scratch.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-        scratch.replace(path)
+        with replacing(path) as scratch:
+            scratch.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> EpipolarModel:

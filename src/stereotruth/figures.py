@@ -83,17 +83,6 @@ def panels(rows: Sequence[Sequence[Picture]], gap: int = 4) -> Picture:
     return sheet
 
 
-def save_png(path: str | Path, picture: Picture) -> None:
-    """Write a grey or RGB picture."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    bgr = picture if picture.ndim == 2 else picture[..., ::-1]
-    ok, data = cv2.imencode(".png", bgr)
-    if not ok:
-        raise OSError(f"{path}: picture could not be encoded")
-    path.write_bytes(data.tobytes())
-
-
 def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     """Write a matplotlib figure without any global state; no time or version goes into the file."""
     path = Path(path)

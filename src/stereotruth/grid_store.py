@@ -1,4 +1,4 @@
-"""Zarr stores that are either whole or absent: pixel grids, and the folder handling of every store.
+"""Products that are either whole or absent: files, and Zarr stores (pixel grids and others).
 
 A store is built beside its final place (``<name>.partial``), gets the attribute ``complete`` last
 and is then renamed, so that a killed run never leaves something that looks finished; the one
@@ -43,6 +43,22 @@ class Layer:
 def compressor() -> BloscCodec:
     """The lossless codec of every store: the same bytes on every machine."""
     return BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.shuffle)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A scratch file beside ``path``, of its suffix, that takes its place if the block ends well.
+
+    The folder is made. If the block fails, the scratch file goes and ``path`` stays as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        yield scratch
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 @contextmanager

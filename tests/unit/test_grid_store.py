@@ -6,7 +6,7 @@ import xarray as xr
 import zarr
 
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, blocks, building, create_grid, open_grid
+from stereotruth.grid_store import Layer, blocks, building, create_grid, open_grid, replacing
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
 
@@ -58,3 +58,23 @@ def test_blocks_cover_a_grid_once():
 def test_shards_must_hold_whole_chunks(tmp_path):
     with pytest.raises(ValueError, match="multiple"):
         create_grid(tmp_path / "d.zarr", (8, 8), LAYERS, chunk=5, shard=8, attrs={})
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path):
+    path = tmp_path / "new" / "a.json"
+    with replacing(path) as scratch:
+        scratch.write_text("{}")
+        assert scratch.suffix == ".json"
+        assert not path.exists()
+    assert path.read_text() == "{}"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), replacing(path) as scratch:
+        scratch.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

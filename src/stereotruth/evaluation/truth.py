@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from ..epipolar import EpipolarModel
 from ..errors import InputError
-from ..grid_store import blocks, require_complete
+from ..grid_store import blocks, replacing, require_complete
 from ..runlog import progress
 from .statistics import LIMITS, ErrorSum
 from .warping import read_tile
@@ -407,23 +407,16 @@ def table(result: SceneComparison) -> list[dict[str, Any]]:
 
 def write_rows(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """A CSV file, whole or absent."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(path.name + ".partial")
-    with scratch.open("w", newline="", encoding="utf-8") as stream:
+    with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, list(columns), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    scratch.replace(path)
 
 
 def write_json(path: str | Path, values: Mapping[str, Any]) -> None:
     """A JSON file, whole or absent."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(path.name + ".partial")
-    scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    scratch.replace(path)
+    with replacing(path) as scratch:
+        scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def evaluate_truth(

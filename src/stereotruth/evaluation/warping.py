@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
 from ..errors import InputError
-from ..grid_store import blocks, require_complete
+from ..grid_store import blocks, replacing, require_complete
 
 Floats = NDArray[np.float64]
 BLOCK = 1024  # px
@@ -177,8 +177,6 @@ def draw_panels(tile: WarpedTile, path: str | Path) -> None:
     """
     from matplotlib.figure import Figure
 
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(15, 14.4), layout="constrained")
     axes = figure.subplots(2, 2)
     low, high = np.percentile(tile.left, (1, 99))
@@ -201,6 +199,5 @@ def draw_panels(tile: WarpedTile, path: str | Path) -> None:
         ax.set_title(f"{tile.name}: {title}")
         if style is not gray:
             figure.colorbar(shown, ax=ax, shrink=0.7)
-    scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
-    figure.savefig(scratch, dpi=75)
-    scratch.replace(path)
+    with replacing(path) as scratch:
+        figure.savefig(scratch, dpi=75)

@@ -13,10 +13,11 @@ import numpy as np
 import pyproj
 
 from ..errors import InputError
+from ..grid_store import replacing
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .kernels import inlined, kernel
-from .surfaces import GROUND, IN_LIDAR, ROOF, TREE, WALL, WATER, Surfaces, cast, terrain_at
+from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
 from .world import build_surfaces, frame_of, half_size, image_axes
 
 log = logging.getLogger("stereotruth")
@@ -28,8 +29,6 @@ NOISE_SHARE = 1.5e-4
 WATER_RETURNS = 0.15
 SECOND_RETURNS = 0.45
 PULSES_A_CHUNK = 1_000_000
-CLASS_OF = {GROUND: 2, ROOF: 6, WALL: 6, TREE: 5, WATER: 9}
-NAN = float("nan")
 
 
 def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
@@ -276,37 +275,30 @@ def simulate_lidar_tile(
         work += [(strip, a, min(a + lines, last)) for a in range(first, last, lines)]
     xyz = np.empty((2 * per_line * lines, 3))
     info = np.empty((len(xyz), 6), np.int32)
-    out_laz = Path(out_laz)
-    out_laz.parent.mkdir(parents=True, exist_ok=True)
-    scratch = out_laz.with_name(f".{out_laz.stem}.partial{out_laz.suffix}")
     header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
     counts = np.zeros(32, np.int64)
     modern = header.point_format.id >= 6
-    try:
-        with laspy.open(
-            scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
-        ) as writer:  # fmt: skip
-            for strip, first, last in work:
-                n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
-                if not n:
-                    continue
-                record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-                east, north, height = grid(xyz[:n]).T
-                record.x, record.y, record.z = east, north, height
-                record.classification = info[:n, 0].astype(np.uint8)
-                record.return_number = info[:n, 1].astype(np.uint8)
-                record.number_of_returns = info[:n, 2].astype(np.uint8)
-                record.intensity = info[:n, 3].astype(np.uint16)
-                record.point_source_id = info[:n, 5].astype(np.uint16)
-                if modern:
-                    record.scan_angle = info[:n, 4].astype(np.int16)
-                else:
-                    record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
-                writer.write_points(record)
-                counts += np.bincount(info[:n, 0], minlength=32)
-        scratch.replace(out_laz)
-    finally:
-        scratch.unlink(missing_ok=True)
+    with replacing(out_laz) as scratch, laspy.open(
+        scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
+    ) as writer:  # fmt: skip
+        for strip, first, last in work:
+            n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
+            if not n:
+                continue
+            record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+            east, north, height = grid(xyz[:n]).T
+            record.x, record.y, record.z = east, north, height
+            record.classification = info[:n, 0].astype(np.uint8)
+            record.return_number = info[:n, 1].astype(np.uint8)
+            record.number_of_returns = info[:n, 2].astype(np.uint8)
+            record.intensity = info[:n, 3].astype(np.uint16)
+            record.point_source_id = info[:n, 5].astype(np.uint16)
+            if modern:
+                record.scan_angle = info[:n, 4].astype(np.int16)
+            else:
+                record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
+            writer.write_points(record)
+            counts += np.bincount(info[:n, 0], minlength=32)
     if not counts.sum():
         raise RuntimeError(
             f"{tile_name}: no point lies in this tile; change the scene's lidar_grid"

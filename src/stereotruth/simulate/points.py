@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..grid_store import replacing
 from .cities import CITIES, CitySpec, SceneSpec
 from .kernels import kernel
 from .render import Scene, prepare
@@ -114,14 +115,10 @@ def _table(ready: Scene, names: list[str], xyz: np.ndarray, image: np.ndarray) -
 
 def write_table(path: str | Path, rows: list[dict]) -> None:
     """Write points as CSV with the columns of FIELDS."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.partial")
-    with scratch.open("w", newline="", encoding="utf-8") as stream:
+    with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    scratch.replace(path)
 
 
 def make_points(

@@ -13,6 +13,7 @@ import rasterio
 from rasterio.rpc import RPC as RPCMetadata
 
 from ..errors import InputError
+from ..grid_store import replacing
 from ..runlog import progress
 from .appearance import reflectance
 from .camera import aim, direction, pose, rays
@@ -188,9 +189,6 @@ def simulate_image(
         "%s %s: %d x %d px; RPCs follow the camera within %.1e px rms (bias apart)",
         scene.name, view, camera.cols, camera.rows, camera.rpc.rms_px,
     )  # fmt: skip
-    out_tif = Path(out_tif)
-    out_tif.parent.mkdir(parents=True, exist_ok=True)
-    scratch = out_tif.with_name(f".{out_tif.stem}.partial.tif")
     dark, gain = RADIOMETRY[view]
     cols, rows = camera.cols, camera.rows
     profile = dict(
@@ -200,7 +198,7 @@ def simulate_image(
     )  # fmt: skip
     col_index = np.arange(cols, dtype=np.float64)[None, :]
     strips = range(0, rows, STRIP_ROWS)
-    try:
+    with replacing(out_tif) as scratch:
         image = np.zeros((rows, cols), np.uint16)
         for first in progress(strips, len(strips), f"{scene.name} {view}"):
             count = min(STRIP_ROWS, rows - first)
@@ -218,9 +216,6 @@ def simulate_image(
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
             target.set_band_description(1, "panchromatic, 11 bits")
-        scratch.replace(out_tif)
-    finally:
-        scratch.unlink(missing_ok=True)
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
 
 
