@@ -84,6 +84,11 @@ def right_image(wildcards):
     return with_rpc_files(SCENES[wildcards.scene].right_image)
 
 
+def alignment_of(wildcards):
+    """The alignment that the scene's rectified images and labels are made with."""
+    return f"results/align/{wildcards.city}/{wildcards.scene}/alignment.json"
+
+
 def point_stores(wildcards):
     return expand(
         "results/ingest/{city}/{scene}/{lidar}.zarr",

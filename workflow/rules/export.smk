@@ -1,8 +1,6 @@
 rule export:
     input:
-        alignment=lambda w: [
-            f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
-        ],
+        alignment=lambda w: [alignment_of(s) for s in scenes_of(w.city)],
         left=lambda w: [f"results/rectify/{w.city}/{s.scene}/left.zarr" for s in scenes_of(w.city)],
         right=lambda w: [
             f"results/rectify/{w.city}/{s.scene}/right.zarr" for s in scenes_of(w.city)

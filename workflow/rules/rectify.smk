@@ -2,7 +2,7 @@ rule rectify:
     input:
         left=left_image,
         right=right_image,
-        alignment=rules.align.output.alignment,
+        alignment=alignment_of,
     output:
         epipolar="results/rectify/{city}/{scene}/epipolar.json",
         left=directory("results/rectify/{city}/{scene}/left.zarr"),
