@@ -1,3 +1,26 @@
+rule grid_truth:
+    input:
+        epipolar=rules.rectify.output.epipolar,
+    output:
+        truth=directory("results/truth/{city}/{scene}.zarr"),
+    log:
+        "logs/grid_truth/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/grid_truth/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=3000,
+        runtime=60,
+    params:
+        code=source_digest("evaluation.grid_truth"),
+    message:
+        "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
+    script:
+        "../scripts/grid_truth.py"
+
+
 rule evaluate_truth:
     input:
         disparity="results/project/{city}/{scene}.zarr",

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..grid_store import replacing
+from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .kernels import kernel
 from .render import Scene, prepare
@@ -32,8 +33,10 @@ def _see(s, above_left, above_right, left, right, size, xyz, tolerance, image, s
     line = np.empty(12)
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        lc, lr, free = seen_from(s, above_left, left, x, y, z, 0.5 * size[1], line, tolerance)
-        rc, rr, both = seen_from(s, above_right, right, x, y, z, 0.5 * size[3], line, tolerance)
+        lc, lr = project_point(left, x, y, z, 0.5 * size[1], line)
+        free = seen_from(s, above_left, x, y, z, line, IN_IMAGES, tolerance)
+        rc, rr = project_point(right, x, y, z, 0.5 * size[3], line)
+        both = seen_from(s, above_right, x, y, z, line, IN_IMAGES, tolerance)
         image[n, 0], image[n, 1], image[n, 2], image[n, 3] = lc, lr, rc, rr
         m = FRAME_MARGIN_PX
         seen[n] = (

@@ -12,7 +12,7 @@ from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..grid_store import building
 from ..runlog import progress
-from .camera import SIZE, direction, pose, project_point
+from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
 from .kernels import inlined, kernel
@@ -25,6 +25,7 @@ log = logging.getLogger("stereotruth")
 CHUNK = 512
 SEEN_TOLERANCE_M = 0.02
 SURFACES = "none ground roof wall tree water"
+CHANGES = "unchanged in_lidar_only in_images_only"
 LAYERS = {
     "lon": ("float64", "degrees_east", "WGS 84 longitude of the surface point"),
     "lat": ("float64", "degrees_north", "WGS 84 latitude of the surface point"),
@@ -32,66 +33,109 @@ LAYERS = {
     "right_col": ("float64", "px", "column of the surface point in the right image"),
     "right_row": ("float64", "px", "row of the surface point in the right image"),
     "visible_right": ("uint8", "1", "1 where the right image shows the surface point"),
+    "hidden_right": (
+        "uint8",
+        "1",
+        "1 where the surface point lies in the right frame, behind something",
+    ),
     "surface": ("uint8", "1", "kind of surface that the pixel shows"),
-    "changed": ("uint8", "1", "1 where LiDAR and images differ by design"),
+    "changed": ("uint8", "1", "whether the pixel would show another surface in the LiDAR's world"),
+    "changed_right": (
+        "uint8",
+        "1",
+        "1 where the LiDAR's world is unchanged, but hides the point from the right view and that "
+        "of the images does not, or the other way round",
+    ),
     "covered": ("uint8", "1", "1 inside the LiDAR coverage"),
 }
+FLAGS = {"surface": SURFACES, "changed": CHANGES}
+REALS = [name for name, (dtype, _, _) in LAYERS.items() if dtype == "float64"]
 
 
 @inlined
-def seen_from(s, above, cam, x, y, z, row, line, tolerance):
-    """(col, row, whether nothing hides it) of a world point in a camera; ``row`` a first guess."""
-    col, row = project_point(cam, x, y, z, row, line)
+def seen_from(s, above, x, y, z, line, view, tolerance):
+    """Whether nothing hides a world point from the position in ``line``, a camera's pose."""
     depth = line[2] - z
     bx, by = (line[0] - x) / depth, (line[1] - y) / depth
-    hit, kind, _, _, _, _, _ = cast(s, above, x - bx * z, y - by * z, bx, by, IN_IMAGES, True, z)
-    return col, row, kind != NONE and hit <= z + tolerance
+    hit, kind, _, _, _, _, _ = cast(s, above, x - bx * z, y - by * z, bx, by, view, True, z)
+    return kind != NONE and hit <= z + tolerance
 
 
 @kernel
-def _truth_rows(s, above_left, above_right, left, right, frame, cover, size, first, real, flags):
-    """Rows of the truth from left image row ``first``.
+def _truth_points(
+    s, above_left, above_right, left, right, frame, cover, size, image_col, image_row, real, flags
+):
+    """The truth at left image positions [n]; neighbours should follow each other.
 
-    ``size``: left cols, rows, right cols, rows. real[5, r, c]: lon, lat, height, right col, row;
-    flags[4, r, c]: visible, surface, changed, covered.
+    ``size``: left cols, rows, right cols, rows. real[5, n] and flags[6, n]: values of LAYERS in
+    their order. Positions outside the left frame, in its collar, or NaN get NaN and 0.
     """
     line, other = np.empty(12), np.empty(12)
     guess = 0.0
     right_row = 0.5 * size[3]
-    for r in range(real.shape[1]):
-        row = float(first + r)
-        pose(left, row, line)
-        for c in range(real.shape[2]):
-            if in_collar(True, float(c), row, size[0], size[1]):
-                real[:, r, c] = np.nan
-                flags[:, r, c] = 0
-                continue
-            dx, dy, dz = direction(left, line, float(c))
-            bx, by = dx / dz, dy / dz
-            ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-            z, kind, _, _, ground, _, _ = cast(
-                s, above_left, ax, ay, bx, by, IN_IMAGES, True, guess
-            )
-            guess = ground
-            x, y = ax + bx * z, ay + by * z
-            lon, lat, height = world_to_geodetic_point(frame, x, y, z)
-            col, right_row, free = seen_from(
-                s, above_right, right, x, y, z, right_row, other, SEEN_TOLERANCE_M
-            )
-            inside = (
-                col >= 0
-                and right_row >= 0
-                and col <= size[2] - 1
-                and right_row <= size[3] - 1
-                and not in_collar(False, col, right_row, size[2], size[3])
-            )
-            scanned, _, _, _, _, _, _ = cast(s, above_left, ax, ay, bx, by, IN_LIDAR, True, guess)
-            real[0, r, c], real[1, r, c], real[2, r, c] = lon, lat, height
-            real[3, r, c], real[4, r, c] = col, right_row
-            flags[0, r, c] = free and inside
-            flags[1, r, c] = kind
-            flags[2, r, c] = abs(scanned - z) > 0.01
-            flags[3, r, c] = covered(cover, x, y)
+    posed = np.nan
+    for k in range(image_col.size):
+        c, row = image_col[k], image_row[k]
+        if not (
+            c >= -0.5 and row >= -0.5 and c <= size[0] - 0.5 and row <= size[1] - 0.5
+        ) or in_collar(True, c, row, size[0], size[1]):
+            real[:, k] = np.nan
+            flags[:, k] = 0
+            continue
+        if row != posed:
+            pose(left, row, line)
+            posed = row
+        dx, dy, dz = direction(left, line, c)
+        bx, by = dx / dz, dy / dz
+        ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
+        z, kind, _, _, ground, _, _ = cast(s, above_left, ax, ay, bx, by, IN_IMAGES, True, guess)
+        guess = ground
+        x, y = ax + bx * z, ay + by * z
+        lon, lat, height = world_to_geodetic_point(frame, x, y, z)
+        col, right_row = project_point(right, x, y, z, right_row, other)
+        free = seen_from(s, above_right, x, y, z, other, IN_IMAGES, SEEN_TOLERANCE_M)
+        inside = (
+            col >= 0
+            and right_row >= 0
+            and col <= size[2] - 1
+            and right_row <= size[3] - 1
+            and not in_collar(False, col, right_row, size[2], size[3])
+        )
+        scanned, _, _, _, _, _, _ = cast(s, above_left, ax, ay, bx, by, IN_LIDAR, True, guess)
+        changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
+        real[0, k], real[1, k], real[2, k] = lon, lat, height
+        real[3, k], real[4, k] = col, right_row
+        flags[0, k] = free and inside
+        flags[1, k] = inside and not free
+        flags[2, k] = kind
+        flags[3, k] = changed
+        flags[4, k] = (
+            changed == 0
+            and inside
+            and seen_from(s, above_right, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M) != free
+        )
+        flags[5, k] = covered(cover, x, y)
+
+
+def truth_at(
+    city: CitySpec, scene: SceneSpec, col: np.ndarray, row: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The layers of LAYERS at positions (col, row) of the left image, px, of any one shape.
+
+    Rays go through the very positions given, by the rigorous camera. Where the left image shows
+    nothing (outside its frame, in its collar, NaN) the layers hold NaN and 0.
+    """
+    ready = prepare(city, scene)
+    left, right = ready.left, ready.right
+    size = np.array([left.cols, left.rows, right.cols, right.rows], dtype=np.float64)
+    at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
+    real = np.empty((len(REALS), at[0].size))
+    flags = np.empty((len(LAYERS) - len(REALS), at[0].size), np.uint8)
+    _truth_points(
+        ready.surfaces, left.horizon, right.horizon, left.cam, right.cam, ready.frame.packed(),
+        coverage(city, scene), size, *at, real, flags,
+    )  # fmt: skip
+    return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
 
 
 def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> dict[str, float]:
@@ -101,14 +145,8 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
     (13 µm), heights and image coordinates to 2^-20: far below any use, and they pack well. Returns
     the shares of pixels that are visible, hidden and changed.
     """
-    ready = prepare(city, scene)
-    left, right = ready.left, ready.right
-    kernel = (ready.surfaces, left.horizon, right.horizon, left.cam, right.cam)
-    size = np.array([left.cols, left.rows, right.cols, right.rows], dtype=np.float64)
-    cover = coverage(city, scene)
-    frame = ready.frame.packed()
+    left = prepare(city, scene).left
     totals = np.zeros(3)
-    assert left.cam.size == SIZE
     with building(out_zarr) as scratch:
         group = zarr.open_group(scratch, mode="w", zarr_format=3)
         group.attrs.update({
@@ -119,8 +157,9 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
         arrays = {}
         for name, (dtype, units, long_name) in LAYERS.items():
             attributes = {"units": units, "long_name": long_name}
-            if name == "surface":
-                attributes |= {"flag_values": list(range(6)), "flag_meanings": SURFACES}
+            if name in FLAGS:
+                values = list(range(len(FLAGS[name].split())))
+                attributes |= {"flag_values": values, "flag_meanings": FLAGS[name]}
             arrays[name] = group.create_array(
                 name, shape=(left.rows, left.cols), dtype=dtype, chunks=(CHUNK, CHUNK),
                 fill_value=np.nan if dtype == "float64" else 0,
@@ -128,19 +167,19 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
                 dimension_names=("row", "col"), attributes=attributes,
             )  # fmt: skip
         strips = range(0, left.rows, CHUNK)
-        steps = np.array([2.0**33, 2.0**33, 2.0**20, 2.0**20, 2.0**20])[:, None, None]
+        steps = {"lon": 2.0**33, "lat": 2.0**33}
         for first in progress(strips, len(strips), f"{scene.name} truth"):
-            count = min(CHUNK, left.rows - first)
-            real = np.empty((5, count, left.cols))
-            flags = np.empty((4, count, left.cols), np.uint8)
-            _truth_rows(*kernel, frame, cover, size, first, real, flags)
-            real *= steps
-            np.rint(real, out=real)
-            real /= steps
-            for name, values in zip(LAYERS, [*real, *flags]):
-                arrays[name][first : first + count] = values
-            shown = flags[1] > 0
-            totals += [(flags[0] & shown).sum(), (shown & (flags[0] == 0)).sum(), flags[2].sum()]
+            rows = slice(first, min(first + CHUNK, left.rows))
+            row, col = np.mgrid[rows, 0 : left.cols].astype(np.float64)
+            found = truth_at(city, scene, col, row)
+            for name in REALS:
+                step = steps.get(name, 2.0**20)
+                found[name] = np.rint(found[name] * step) / step
+            for name, values in found.items():
+                arrays[name][rows] = values
+            shown = found["surface"] > 0
+            seen = found["visible_right"] > 0
+            totals += [(seen & shown).sum(), (shown & ~seen).sum(), (found["changed"] > 0).sum()]
     shares = totals / (left.cols * left.rows)
     log.info(
         "%s: the right image shows %.1f %% of the left's pixels, not %.1f %%; %.2f %% changed",

@@ -1,0 +1,19 @@
+"""The exact truth of one synthetic scene on its left epipolar grid."""
+
+from stereotruth.evaluation.grid_truth import write_grid_truth
+from stereotruth.provenance import describe
+from stereotruth.runlog import job
+from stereotruth.simulate.cities import CITIES
+
+if __name__ == "__main__":
+    city = CITIES[snakemake.wildcards.city]
+    scene = city.scene(snakemake.wildcards.scene)
+    with job(snakemake.log[0], f"truth of {scene.name}"):
+        write_grid_truth(
+            city,
+            scene,
+            snakemake.input.epipolar,
+            snakemake.output.truth,
+            workers=snakemake.threads,
+            provenance=describe([snakemake.input.epipolar], {}, snakemake.params.code),
+        )
