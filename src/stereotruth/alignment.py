@@ -10,23 +10,31 @@ WGS 84 longitude, latitude in degrees and ellipsoidal height in m.
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import math
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import ArrayLike, NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from .control_points import ControlPoints, read_gcps
 from .errors import InputError
+from .gcp_checks import (
+    View,
+    check_frame,
+    check_ground,
+    check_heights,
+    check_swapped,
+    footprint,
+    open_view,
+    refuse_fit,
+    refuse_misfit,
+    tilt,
+)
 from .grid_store import replacing
 from .provenance import describe, source_digest
 from .robust_fit import (
@@ -38,27 +46,16 @@ from .robust_fit import (
     opencv_inliers,
     studentised,
 )
-from .rpc import SensorModel, read_rpc
-
-__all__ = ["Alignment", "GcpResidual", "ViewFit", "align", "read_gcps", "write_alignment"]
+from .rpc import SensorModel
 
 log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# One more than determines the model is asked for: with fewer, no residual tells of an error.
-NEEDED = {model: n + 1 for model, n in MINIMAL.items()}
-MAX_LEFT_OUT = 1 / 3  # share of blunders beyond which nobody knows which points are right
-MAX_SIGMA = 5.0  # px: beyond, GCPs and image do not belong together
 POOR_SIGMA = 2.0  # px
-UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder among them
 LARGE_SHIFT = 200.0  # px: RPCs err by some 1 to 50 px
-MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 LARGE_TILT = 0.005  # change of scale, rotation or shear; RPCs err by less than 0.001
-MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
-MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
-FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 UNITS = {
     "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
     "lon, lat": "degrees, WGS 84",
@@ -271,263 +268,11 @@ def _fit_from_dict(view: str, values: Mapping[str, Any]) -> ViewFit:
     )
 
 
-# ----------------------------------------------------------------------------------- refusals
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One view's input: rows of the GCP table that it sees, and where."""
-
-    name: str
-    image: Path
-    size: tuple[int, int]
-    sensor: SensorModel
-    index: NDArray[np.intp]
-    predicted: Floats
-    measured: Floats
-
-
-def _plural(n: int) -> str:
-    return f"{n} GCP" if n == 1 else f"{n} GCPs"
-
-
-def _some(ids: Sequence[str]) -> str:
-    return ", ".join(ids[:6]) + (f" and {len(ids) - 6} more" if len(ids) > 6 else "")
-
-
-def _spreads(points: Floats) -> tuple[float, float]:
-    """Standard deviations in px of points [n, 2] along their main axis and across it."""
-    if len(points) < 2:
-        return 0.0, 0.0
-    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    return float(values[0]), float(values[1])
-
-
-def _defect(model: str, points: Floats) -> str:
-    """Why GCPs at these positions [n, 2] cannot carry the model, or an empty string."""
-    n, (along, across) = len(points), _spreads(points)
-    if n < NEEDED[model]:
-        return (
-            f"{_plural(n)}, the model {model!r} needs {NEEDED[model]} "
-            f"({MINIMAL[model]} determine it, one more shows an error)"
-        )
-    if model == "shift":
-        return ""
-    if along < MIN_SPREAD:
-        return f"GCPs within {2 * along:.1f} px of one spot, too close for the model {model!r}"
-    if model == "affine" and across < MIN_WIDTH_RATIO * along:
-        return (
-            f"GCPs along one line ({along:.0f} px deviation along, {across:.1f} px across), which "
-            "does not determine an affine"
-        )
-    return ""
-
-
-def _remedy(model: str, points: Floats) -> str:
-    """What to do about a defect, naming the models that these points can carry."""
-    simpler = list(MINIMAL)[list(MINIMAL).index(model) + 1 :]
-    carried = [other for other in simpler if not _defect(other, points)]
-    more = "measure more GCPs, spread over the image"
-    if not carried:
-        return more
-    names = " or ".join(repr(name) for name in carried)
-    return f"{more}, or set alignment.model to {names}, which these GCPs can carry"
-
-
-def _open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
-    """The RPC of an image and its size (cols, rows)."""
-    sensor = SensorModel(read_rpc(image))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(image) as dataset:
-                return sensor, (dataset.width, dataset.height)
-    except RasterioError as error:
-        raise InputError(
-            f"cannot be opened as the {name} image{of} ({error})",
-            file=image,
-            remedy="check the file",
-        ) from None
-
-
-def _footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
-    """(lon_min, lat_min, lon_max, lat_max) of an image over its RPC's heights, widened by half."""
-    heights = np.array([-1.0, 0.0, 1.0]) * abs(sensor.rpc.height_scale) + sensor.rpc.height_off
-    col, row, height = np.meshgrid([0, size[0] - 1], [0, size[1] - 1], heights)
-    lon, lat = sensor.localize(col, row, height)
-    if not np.isfinite(lon).any():
-        box = sensor.rpc.ground_box
-        low, high = np.array(box[:2]), np.array(box[2:4])
-    else:
-        low = np.array([np.nanmin(lon), np.nanmin(lat)])
-        high = np.array([np.nanmax(lon), np.nanmax(lat)])
-    margin = (high - low) / 2 + 0.01
-    return np.concatenate([low - margin, high + margin])
-
-
-def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
-    turns = np.round((lon - (box[0] + box[2]) / 2) / 360.0)
-    lon = lon - 360.0 * turns
-    return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
-
-
-def _check_ground(points: ControlPoints, boxes: Iterable[Floats], of: str) -> Bools:
-    """bool[n]: near either image's footprint. Refuses the file if most points are elsewhere."""
-    boxes = list(boxes)
-    near = np.any([_in_box(box, points.lon, points.lat) for box in boxes], axis=0)
-    if 2 * near.sum() > len(near):
-        return near
-    swapped = np.any([_in_box(box, points.lat, points.lon) for box in boxes], axis=0)
-    low, high = boxes[0][:2], boxes[0][2:]
-    where = (
-        f"lon {np.median(points.lon):.4f}, lat {np.median(points.lat):.4f} in the middle, while "
-        f"the left image shows about lon {(low[0] + high[0]) / 2:.4f}, "
-        f"lat {(low[1] + high[1]) / 2:.4f}"
-    )
-    if 2 * swapped.sum() > len(near):
-        raise InputError(
-            f"lon and lat of the GCPs seem to be swapped: {where}{of}",
-            file=points.file,
-            remedy="exchange the columns lon and lat",
-        )
-    raise InputError(
-        f"the GCPs lie far from the ground that the images show: {where}{of}",
-        file=points.file,
-        remedy="check that the file is that of this scene, and its coordinates WGS 84 degrees",
-    )
-
-
-def _check_heights(points: ControlPoints, sensor: SensorModel) -> str:
-    """A warning if heights leave the RPC's range by more than half of it, else nothing."""
-    low, high = sensor.rpc.ground_box[4:]
-    margin = (high - low) / 4
-    outside = (points.height < low - margin) | (points.height > high + margin)
-    if not outside.any():
-        return ""
-    ids = [name for name, out in zip(points.ids, outside) if out]
-    return (
-        f"heights of {_some(ids)} are outside the {low:.0f} to {high:.0f} m of the RPC: are they "
-        "ellipsoidal metres?"
-    )
-
-
-def _check_swapped(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
-) -> None:
-    """Refuse a pair whose GCPs fit only with left and right exchanged."""
-    both = near & points.in_left & points.in_right
-    if both.sum() < 3:
-        return
-    ground = points.lon[both], points.lat[both], points.height[both]
-    projected = [np.stack(sensor.project(*ground), axis=1) for sensor in sensors]
-
-    def misfit(measured: tuple[Floats, Floats]) -> float:
-        """Median distance from the median shift, the worse of both images."""
-        worst = 0.0
-        for there, here in zip(projected, measured):
-            delta = here - there
-            worst = max(worst, float(np.median(np.hypot(*(delta - np.median(delta, axis=0)).T))))
-        return worst
-
-    given = misfit((points.left[both], points.right[both]))
-    exchanged = misfit((points.right[both], points.left[both]))
-    if given > 10.0 and exchanged < given / 5:
-        raise InputError(
-            "left_image and right_image seem to be swapped in the scenes sheet: the GCPs miss by "
-            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged{of}",
-            file=points.file,
-            remedy="exchange the columns left_image and right_image of this scene; left is the "
-            "backward view (or exchange the left and right columns of the GCP file, if it is that)",
-        )
-
-
-def _check_frame(points: ControlPoints, view: _View, of: str) -> None:
-    limit = np.array(view.size) - 0.5 + FRAME_MARGIN
-    outside = ~((view.measured >= -0.5 - FRAME_MARGIN) & (view.measured <= limit)).all(axis=1)
-    if outside.any():
-        first = int(np.flatnonzero(outside)[0])
-        name = points.ids[view.index[first]]
-        others = int(outside.sum()) - 1
-        col, row = view.measured[first]
-        raise InputError(
-            f"GCP {name} (line {points.line[view.index[first]]}) is measured at col {col:.1f}, row "
-            f"{row:.1f}, outside the {view.name} image {view.image.name} of {view.size[0]} x "
-            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else "") + of,
-            file=points.file,
-            remedy="correct the measurement, or leave both cells empty where the image does not "
-            "show the point",
-        )
-
-
 # ------------------------------------------------------------------------------------ one view
 
 
-def _refuse_fit(model: str, view: _View, points: ControlPoints, used: Bools, of: str) -> None:
-    """Refuse a view whose used GCPs cannot carry the model."""
-    defect = _defect(model, view.predicted[used])
-    if not defect:
-        return
-    out = [points.ids[i] for i in view.index[~used]]
-    rest = f" after {_some(out)} were left out" if out else ""
-    raise InputError(
-        f"{view.name} image {view.image.name}: {defect}{rest}{of}",
-        file=points.file,
-        remedy=_remedy(model, view.predicted[used]),
-    )
-
-
-def _refuse_misfit(
-    model: str, view: _View, system: System, points: ControlPoints, used: Bools, of: str
-) -> float:
-    """Refuse GCPs that contradict each other; sigma0 in px of those used."""
-    n, kept = len(used), int(used.sum())
-    redundancy = 2 * kept - system.design.shape[2]
-    residuals = system.residuals(system.solve(used))[used]
-    sigma = float(np.sqrt(np.sum(residuals**2) / redundancy))
-    where = f"{view.name} image {view.image.name}"
-    if n - kept > MAX_LEFT_OUT * n:
-        out = [points.ids[i] for i in view.index[~used]]
-        raise InputError(
-            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
-            file=points.file,
-            remedy="check these GCPs, and that the file belongs to these images",
-        )
-    if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
-        delta = system.delta
-        far = np.hypot(*(delta - np.median(delta, axis=0)).T)
-        suspect = points.ids[view.index[int(np.argmax(far))]]
-        raise InputError(
-            f"{where}: the {n} GCPs contradict each other by {sigma:.1f} px, and so few do not "
-            f"tell which is wrong ({suspect} differs most from the others' shift){of}",
-            file=points.file,
-            remedy=f"check {suspect} first; measure more GCPs: among "
-            f"{system.minimal + 3} or more a blunder is found and left out",
-        )
-    if sigma > MAX_SIGMA:
-        raise InputError(
-            f"{where}: the GCPs do not fit the image (sigma {sigma:.1f} px after the {model} "
-            f"correction){of}",
-            file=points.file,
-            remedy="check that GCP file, image and RPC belong together, and that heights are "
-            "metres above the ellipsoid",
-        )
-    if (tilt := _tilt(system.affine(system.solve(used)))) > MAX_TILT:
-        raise InputError(
-            f"{where}: the GCPs ask for a change of scale or angle by {100 * tilt:.0f} %{of}",
-            file=points.file,
-            remedy="check that columns count from the left and rows from the top, and that GCP "
-            "file, image and RPC belong together",
-        )
-    return sigma
-
-
-def _tilt(affine: Floats) -> float:
-    """Largest relative change of a distance by the linear part of an affine."""
-    return float(np.linalg.norm(affine[:, :2] - np.eye(2), ord=2))
-
-
 def _view_fit(
-    view: _View,
+    view: View,
     system: System,
     points: ControlPoints,
     used: Bools,
@@ -583,9 +328,9 @@ def _doubts(fit: ViewFit, model: str) -> list[str]:
             f"{fit.view} image: the RPC is off by {np.hypot(*shift):.0f} px; check that heights "
             "are ellipsoidal and that RPC and image belong together"
         )
-    if (tilt := _tilt(fit.affine)) > LARGE_TILT:
+    if (change := tilt(fit.affine)) > LARGE_TILT:
         found.append(
-            f"{fit.view} image: the {model} changes scale or angle by {100 * tilt:.2f} %, more "
+            f"{fit.view} image: the {model} changes scale or angle by {100 * change:.2f} %, more "
             "than RPCs err; check the GCPs at the ends, or take a simpler alignment.model"
         )
     if fit.sigma0 > POOR_SIGMA:
@@ -631,12 +376,12 @@ def align(
     of = f" (scene {scene})" if scene else ""
     images = Path(left_image), Path(right_image)
     points = read_gcps(gcps_csv, scene)
-    opened = [_open_view(n, image, of) for n, image in zip(("left", "right"), images)]
+    opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
-    near = _check_ground(points, (_footprint(*item) for item in opened), of)
-    _check_swapped(points, sensors, near, of)
+    near = check_ground(points, (footprint(*item) for item in opened), of)
+    check_swapped(points, sensors, near, of)
 
-    doubts = [text for text in {_check_heights(points, sensor): None for sensor in sensors} if text]
+    doubts = [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]
     for name, ok in zip(points.ids, near):
         if not ok:
             doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
@@ -648,10 +393,10 @@ def align(
         seen = np.isfinite(measured[:, 0])
         projected = np.stack(sensor.project(points.lon, points.lat, points.height), axis=1)
         index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
-        view = _View(name, image, size, sensor, index, projected[index], measured[index])
-        _check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
+        view = View(name, image, size, sensor, index, projected[index], measured[index])
+        check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
         everything = np.ones(len(index), dtype=bool)
-        _refuse_fit(model, view, points, everything, of)
+        refuse_fit(model, view, points, everything, of)
         system = System.of(model, view.predicted, view.measured)
         if estimator == "opencv":
             kept = opencv_inliers(model, view.predicted, view.measured, blunder_floor)
@@ -675,8 +420,8 @@ def align(
     fits = []
     out = [set(view.index[~kept].tolist()) for view, kept in zip(views, used)]
     for k, (view, system, kept) in enumerate(zip(views, systems, used)):
-        _refuse_fit(model, view, points, kept, of)
-        sigma = _refuse_misfit(model, view, system, points, kept, of)
+        refuse_fit(model, view, points, kept, of)
+        sigma = refuse_misfit(model, view, system, points, kept, of)
         misses = np.hypot(*system.residuals(system.solve(kept)).T)
         reasons = {}
         for j, i in enumerate(view.index):
@@ -726,92 +471,3 @@ def align(
         warnings=tuple(doubts),
         provenance=dict(provenance),
     )
-
-
-# -------------------------------------------------------------------------------------- output
-
-
-def write_alignment(
-    alignment: Alignment, json_file: str | Path, csv_file: str | Path, png_file: str | Path
-) -> None:
-    """Write the alignment (JSON), the residuals of every GCP (CSV, px) and their figure (PNG)."""
-    with replacing(csv_file) as scratch:
-        _write_table(alignment, scratch)
-    with replacing(png_file) as scratch:
-        _draw(alignment, scratch)
-    alignment.save(json_file)
-
-
-def _write_table(alignment: Alignment, path: Path) -> None:
-    pairs = ("measured", "predicted", "before", "after", "leave_one_out")
-    header = ["view", "id", "used", "lon_deg", "lat_deg", "height_m"]
-    header += [f"{name}_{axis}_px" for name in pairs for axis in ("col", "row")] + ["reason"]
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(header)
-        for fit in alignment.fits:
-            for g in fit.gcps:
-                numbers = [f"{v:.4f}" for name in pairs for v in getattr(g, name)]
-                ground = [f"{g.lon:.10f}", f"{g.lat:.10f}", f"{g.height:.4f}"]
-                writer.writerow(
-                    [fit.view, g.id, "yes" if g.used else "no", *ground, *numbers, g.reason]
-                )
-
-
-def _nice(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten below a positive value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * 1.0000001) * power
-
-
-def _draw(alignment: Alignment, path: Path) -> None:
-    """Vectors of the residuals on both images' frames, before and after the correction."""
-    import matplotlib
-
-    matplotlib.use("Agg", force=False)
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 10.5), layout="constrained")
-    axes = figure.subplots(2, 2)
-    figure.suptitle(
-        f"{alignment.scene or 'alignment'}: residuals of the ground control points, measured − "
-        f"projected ({alignment.model})"
-    )
-    for k, fit in enumerate(alignment.fits):
-        cols, rows = fit.size
-        side = max(cols, rows)
-        for ax, which, word in zip(axes[:, k], ("before", "after"), ("RPC alone", "corrected")):
-            used = [g for g in fit.gcps if g.used]
-            at = np.array([g.measured for g in used])
-            vector = np.array([getattr(g, which) for g in used])
-            longest = max(float(np.hypot(*vector.T).max()), 1e-3)
-            key = _nice(longest)
-            # image px of the frame per px of residual: the longest takes an eighth of the frame
-            width = {"angles": "xy", "scale_units": "xy", "scale": longest * 8 / side}
-            arrows = ax.quiver(*at.T, *vector.T, color="C0", width=0.005, zorder=3, **width)
-            ax.quiverkey(arrows, 0.80, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
-            ax.plot(*at.T, "o", color="black", markersize=3, zorder=4)
-            for g in fit.gcps:
-                ax.annotate(
-                    g.id,
-                    g.measured,
-                    xytext=(4, 4),
-                    textcoords="offset points",
-                    fontsize=8,
-                    color="0.25" if g.used else "C3",
-                )
-                if not g.used:
-                    ax.plot(*g.measured, "x", color="C3", markersize=9, mew=2, zorder=4)
-            out = f", {len(fit.left_out)} left out (×)" if fit.left_out else ""
-            ax.set_title(
-                f"{fit.view}, {word}: rms {fit.rms(which):.3f} px{out}", loc="left", fontsize=10
-            )
-            ax.add_patch(
-                matplotlib.patches.Rectangle((-0.5, -0.5), cols, rows, fill=False, color="0.6")
-            )
-            ax.set_xlim(-0.06 * side, cols + 0.06 * side)
-            ax.set_ylim(rows + 0.06 * side, -0.06 * side)
-            ax.set_aspect("equal")
-            ax.set_xlabel("col (px)")
-            ax.set_ylabel("row (px)")
-    figure.savefig(path, dpi=110)

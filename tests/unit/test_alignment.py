@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereotruth.alignment import Alignment, align, read_gcps, write_alignment
-from stereotruth.control_points import COLUMNS
+from stereotruth.alignment import Alignment, align
+from stereotruth.alignment_report import write_alignment
+from stereotruth.control_points import COLUMNS, read_gcps
 from stereotruth.errors import InputError
 from stereotruth.robust_fit import System, find_blunders
 from stereotruth.rpc import RPC, SensorModel

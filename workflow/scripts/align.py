@@ -1,6 +1,7 @@
 """One scene's images to its ground control points."""
 
-from stereotruth.alignment import align, write_alignment
+from stereotruth.alignment import align
+from stereotruth.alignment_report import write_alignment
 from stereotruth.provenance import describe
 from stereotruth.runlog import job
 
