@@ -17,7 +17,7 @@ from stereotruth import grid_store
 from stereotruth.epipolar import EpipolarModel, fit_epipolar
 from stereotruth.errors import InputError
 from stereotruth.evaluation import checkpoints, truth, warping
-from stereotruth.evaluation.statistics import ErrorSum, median_and_nmad
+from stereotruth.evaluation.statistics import Calibration, ErrorSum, median_and_nmad
 from stereotruth.rpc import SensorModel
 
 from .test_alignment import LAT, LON, linear_rpc
@@ -27,9 +27,13 @@ ROOF = (slice(150, 230), slice(180, 290))  # raw rows, cols
 GROUND, ROOF_CLASS, WATER = 1, 2, 5
 
 
+STATUSES = "no_points labelled hidden_in_left hidden_in_right"
+
+
 class Scene(NamedTuple):
     model: EpipolarModel
     truth: Path
+    raw_truth: Path
     folder: Path
 
 
@@ -59,43 +63,59 @@ def ground_at(left: SensorModel, col, row):
     return (*left.localize(col, row, height), height)
 
 
+def write_store(path: Path, layers: dict[str, np.ndarray], **attrs) -> Path:
+    with grid_store.building(path) as scratch:
+        group = zarr.open_group(scratch, mode="w", zarr_format=3)
+        group.attrs.update(attrs)
+        for name, values in layers.items():
+            group.create_array(name, data=values, chunks=(100, 100))
+    return path
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
     folder = tmp_path_factory.mktemp("scene")
     left, right = sensor("left"), sensor("right")
     model = fit_epipolar(left, right, SIZE["left"], SIZE["right"], 65.0)
-    cols, rows = SIZE["left"]
-    row, col = np.mgrid[0:rows, 0:cols].astype(float)
+    row, col = np.mgrid[0:380, 0:420].astype(float)
     lon, lat, height = ground_at(left, col, row)
     right_col, right_row = right.project(lon, lat, height)
-    surface = np.where(on_roof(col, row), ROOF_CLASS, GROUND).astype("uint8")
+    visible = (np.abs(right_col - 189.5) <= 190) & (np.abs(right_row - 209.5) <= 210)
+    raw = {"lon": lon, "lat": lat, "height": height, "right_col": right_col}
+    raw |= {"right_row": right_row, "visible_right": visible.astype("uint8")}
+    write_store(folder / "raw.zarr", raw)
+
+    y, x = np.mgrid[0 : model.shape[0], 0 : model.shape[1]].astype(float)
+    col, row = model.epipolar_to_left(x, y)
+    shown = (np.abs(col - 209.5) <= 210) & (np.abs(row - 189.5) <= 190)
+    lon, lat, height = ground_at(left, col, row)
+    right_col, right_row = right.project(lon, lat, height)
+    right_x, right_y = model.right_to_epipolar(right_col, right_row)
+    surface = np.where(on_roof(col, row), ROOF_CLASS, GROUND)
     surface[300:330, 60:120] = WATER
-    surface[0:20, 0:30] = 0
-    visible = (
-        (np.abs(right_col - 189.5) <= 190) & (np.abs(right_row - 209.5) <= 210) & (surface > 0)
-    )
-    visible[230:250, 180:290] = False  # behind the roof
-    changed, covered = np.zeros_like(surface), np.ones_like(surface)
-    changed[60:90, 60:90] = 1
-    covered[:, 340:] = 0
-    for array in (lon, lat, height, right_col, right_row):
-        array[surface == 0] = np.nan
+    surface[~shown] = 0
+    behind = np.zeros(shown.shape, bool)
+    behind[230:250, 180:290] = True
+    inside = (np.abs(right_col - 189.5) <= 190) & (np.abs(right_row - 209.5) <= 210)
+    changed, edge, covered = (np.zeros(shown.shape, "uint8") for _ in range(3))
+    changed[60:90, 60:90], changed[60:90, 100:120] = 1, 2
+    edge[140:160], edge[100:110] = 1, 2
+    covered[:, :340] = 1
+    changed_right = np.zeros(shown.shape, "uint8")
+    changed_right[200:260, 200:240] = 1
     layers = {
-        "lon": lon,
-        "lat": lat,
-        "height": height,
-        "right_col": right_col,
-        "right_row": right_row,
-        "visible_right": visible.astype("uint8"),
-        "surface": surface,
-        "changed": changed,
-        "covered": covered,
+        "disparity": np.where(shown, x - right_x, np.nan).astype("float32"),
+        "y_parallax": np.where(shown, right_y - y, np.nan).astype("float32"),
+        "visible": (shown & inside & ~behind).astype("uint8"),
+        "hidden": (shown & inside & behind).astype("uint8"),
+        "changed": np.where(shown, changed, 0).astype("uint8"),
+        "changed_right": np.where(shown & (changed == 0), changed_right, 0).astype("uint8"),
+        "covered": np.where(shown, covered, 0).astype("uint8"),
+        "surface": surface.astype("uint8"),
+        "edge": edge,
     }
-    with grid_store.building(folder / "truth.zarr") as scratch:
-        group = zarr.open_group(scratch, mode="w", zarr_format=3)
-        for name, values in layers.items():
-            group.create_array(name, data=values, chunks=(100, 100))
-    return Scene(model, folder / "truth.zarr", folder)
+    write_store(folder / "truth.zarr", layers, kind="truth", epipolar=model.to_dict())
+    return Scene(model, folder / "truth.zarr", folder / "raw.zarr", folder)
 
 
 def perfect_labels(scene: Scene, model: EpipolarModel | None = None) -> np.ndarray:
@@ -110,18 +130,29 @@ def perfect_labels(scene: Scene, model: EpipolarModel | None = None) -> np.ndarr
     return labels
 
 
-def write_disparity(scene: Scene, path: Path, labels: np.ndarray) -> Path:
-    layer = grid_store.Layer("float32", np.nan, {"units": "px", "long_name": "disparity"})
+def write_disparity(
+    scene: Scene, path: Path, labels: np.ndarray, sigma: float = 0.1, lost: int = 0
+) -> Path:
+    """A disparity store; pixels without a label have the status ``lost``."""
+    status = np.where(np.isfinite(labels), 1, lost)
+    layers = {
+        "disparity": ("float32", np.nan, labels),
+        "uncertainty": ("float32", np.nan, np.where(np.isfinite(labels), sigma, np.nan)),
+        "status": ("uint8", 0, status),
+    }
+    attrs = {"units": "px", "long_name": "see the name"}
+    flags = {"flag_values": [0, 1, 2, 3], "flag_meanings": STATUSES}
     with grid_store.building(path) as scratch:
         arrays = grid_store.create_grid(
             scratch,
             scene.model.shape,
-            {"disparity": layer},
+            {n: grid_store.Layer(d, f, attrs | flags) for n, (d, f, _) in layers.items()},
             chunk=128,
             shard=256,
             attrs={"epipolar": scene.model.to_dict()},
         )
-        arrays["disparity"][:] = labels.astype("float32")
+        for name, (dtype, _, values) in layers.items():
+            arrays[name][:] = values.astype(dtype)
     return path
 
 
@@ -144,6 +175,8 @@ def test_error_sum_agrees_with_numpy():
     assert figures["median"] == pytest.approx(np.median(errors), abs=0.0021)
     assert figures["median_absolute"] == pytest.approx(np.median(np.abs(errors)), abs=0.0021)
     assert figures["share_over_1_px"] == pytest.approx((np.abs(errors) > 1).mean(), abs=1e-6)
+    nmad = median_and_nmad(errors)[1]
+    assert figures["nmad"] == pytest.approx(nmad, abs=0.004)
     assert ErrorSum().figures()["mean_absolute"] is None
 
 
@@ -152,50 +185,69 @@ def test_nmad_of_a_normal_distribution_is_its_deviation():
     assert median_and_nmad(errors) == pytest.approx((0.3, 0.5), abs=0.02)
 
 
+def test_calibration_of_a_normal_distribution_and_of_another_by_decile():
+    rng = np.random.default_rng(3)
+    sigma = rng.uniform(0.05, 0.5, 200_000)
+    calibration, part = Calibration(), Calibration()
+    calibration.add(rng.normal(0, sigma[:50_000]), sigma[:50_000])
+    part.add(rng.normal(0, sigma[50_000:]), sigma[50_000:])
+    calibration.merge(part)
+    figures = calibration.figures()
+    assert figures["count"] == 200_000
+    assert figures["share_below_1"] == pytest.approx(0.6827, abs=0.005)
+    assert figures["share_below_2"] == pytest.approx(0.9545, abs=0.003)
+    assert figures["mean_uncertainty"] == pytest.approx(0.275, abs=0.002)
+    for k, decile in enumerate(figures["deciles"]):
+        assert decile["count"] == pytest.approx(20_000, rel=0.1)
+        assert decile["mean_uncertainty"] == pytest.approx(0.0725 + 0.045 * k, rel=0.02)
+        assert decile["rms_error"] == pytest.approx(decile["mean_uncertainty"], rel=0.04)
+        assert decile["share_below_1"] == pytest.approx(0.6827, abs=0.02)
+    assert sum(d["count"] for d in figures["deciles"]) == 200_000
+
+    # half of the uncertainties, the small ones, are too small by a factor of two
+    wrong = Calibration()
+    wrong.add(rng.normal(0, np.where(sigma < 0.275, 2 * sigma, sigma)), sigma)
+    deciles = wrong.figures()["deciles"]
+    assert deciles[0]["share_below_1"] == pytest.approx(0.3829, abs=0.02)
+    assert deciles[0]["share_below_2"] == pytest.approx(0.6827, abs=0.02)
+    assert deciles[-1]["share_below_1"] == pytest.approx(0.6827, abs=0.02)
+    assert Calibration().figures() == {
+        "count": 0, "share_below_1": None, "share_below_2": None, "deciles": []
+    }  # fmt: skip
+
+
 # -------------------------------------------------------------------------------------- truth
 
 
-def test_perfect_labels_have_no_error(scene):
-    labels = perfect_labels(scene)
-    true = truth.true_labels(
-        scene.model,
-        truth.open_truth(scene.truth),
-        slice(0, labels.shape[0]),
-        slice(0, labels.shape[1]),
-    )
-    errors = (labels - true.disparity)[true.smooth]
-    assert errors.size > 100_000
-    assert np.abs(errors).max() < 1e-4  # of bilinear interpolation on the curved slope
-    edge = np.isfinite(true.disparity) & np.isfinite(labels) & ~true.smooth
-    # The nearest raw pixel is half a pixel away at most, on a slope of 0.02 px per px.
-    assert np.abs((labels - true.disparity)[edge]).max() < 0.05
-    assert np.nanmax(np.abs(true.y_parallax)) < 1e-3
-    either = truth.compare(labels, true).either.figures()
-    assert either["max"] < 0.05
-    assert not true.visible[true.surface == 0].any()
-    assert not (true.visible & true.hidden).any()
+def compared(scene: Scene, store: Path, workers: int = 2) -> truth.SceneComparison:
+    return truth.compare_scene(store, scene.truth, None, scene="S-1", workers=workers)
 
 
-def test_errors_are_those_of_the_alignment(scene):
+def test_perfect_labels_have_no_error(scene, tmp_path):
+    store = write_disparity(scene, tmp_path / "d.zarr", perfect_labels(scene))
+    figures = compared(scene, store).whole.figures()
+    assert figures["errors"]["count"] > 60_000
+    assert figures["errors"]["max"] < 1e-4
+    assert figures["y_parallax"]["max"] < 1e-3
+    assert figures["calibration"]["share_below_1"] == 1.0
+    assert figures["share_of_visible_labelled"] == 1.0
+    assert figures["share_of_hidden_labelled"] == 1.0
+
+
+def test_errors_are_those_of_the_alignment(scene, tmp_path):
     """Labels by a right sensor that is off by (0.3, -0.4) px: parallax runs along raw rows."""
     off = sensor("right", (0.3, -0.4))
     wrong = replace(scene.model, right=off)
-    labels = perfect_labels(scene, wrong)
-    true = truth.true_labels(
-        scene.model,
-        truth.open_truth(scene.truth),
-        slice(0, labels.shape[0]),
-        slice(0, labels.shape[1]),
-    )
+    store = write_disparity(scene, tmp_path / "d.zarr", perfect_labels(scene, wrong))
     at = np.array([189.0, 209.0])
     before = np.array(scene.model.right_to_epipolar(*at))
     moved = np.array(scene.model.right_to_epipolar(*(at + np.array([0.3, -0.4])))) - before
-    errors = (labels - true.disparity)[true.smooth]
-    assert np.median(errors) == pytest.approx(-moved[0], abs=0.003)
-    disparity, parallax = truth.geometry_errors(wrong, scene.truth, step=5)
+    errors = compared(scene, store).whole.figures()["errors"]
+    assert errors["bias"] == pytest.approx(-moved[0], abs=0.003)
+    disparity, parallax = truth.geometry_errors(wrong, scene.raw_truth, step=5)
     assert disparity.figures()["bias"] == pytest.approx(-moved[0], abs=0.003)
     assert parallax.figures()["rms"] < 1e-3  # measured in the images, whatever the sensor says
-    disparity, parallax = truth.geometry_errors(scene.model, scene.truth, step=5)
+    disparity, parallax = truth.geometry_errors(scene.model, scene.raw_truth, step=5)
     assert disparity.figures()["max"] < 1e-6
     assert disparity.count > 4000
 
@@ -204,74 +256,75 @@ def test_counts_are_those_of_a_plain_loop(scene, tmp_path, monkeypatch):
     rng = np.random.default_rng(4)
     labels = perfect_labels(scene) + rng.normal(0, 0.8, scene.model.shape)
     labels[rng.random(labels.shape) < 0.4] = np.nan
-    store = write_disparity(scene, tmp_path / "disparity.zarr", labels)
+    store = write_disparity(scene, tmp_path / "disparity.zarr", labels, sigma=0.8, lost=3)
     labels = labels.astype("float32")
     t = {n: a[:] for n, a in zarr.open_group(scene.truth, mode="r").arrays()}
-    keys = (
-        "visible",
-        "visible labelled",
-        "hidden",
-        "hidden labelled",
-        "changed",
-        "changed labelled",
-    )
-    expected, errors = dict.fromkeys(keys, 0), 0
-    for y in range(0, labels.shape[0]):
-        col, row = scene.model.epipolar_to_left(np.arange(labels.shape[1]), y)
-        for x in range(labels.shape[1]):
-            r, c = round(float(row[x])), round(float(col[x]))
-            if not (0 <= r < 380 and 0 <= c < 420) or not t["surface"][r, c]:
-                continue
-            labelled = bool(np.isfinite(labels[y, x]))
-            errors += labelled and bool(t["visible_right"][r, c]) and not t["changed"][r, c]
-            if not t["covered"][r, c]:
-                continue
-            if t["changed"][r, c]:
-                kind = "changed"
-            elif t["surface"][r, c] == WATER:
-                continue
-            elif t["visible_right"][r, c]:
-                kind = "visible"
-            elif (
-                abs(t["right_col"][r, c] - 189.5) <= 190
-                and abs(t["right_row"][r, c] - 209.5) <= 210
-            ):
-                kind = "hidden"
-            else:
-                continue
-            expected[kind] += 1
-            expected[kind + " labelled"] += labelled
-    assert min(expected.values()) > 300
+    groups = ("visible", "hidden", "in_lidar_only", "in_images_only", "visible_lost",
+              "hidden_bared")  # fmt: skip
+    counts = {(c, g, s): 0 for c in truth.CLASSES for g in groups for s in (True, False)}
+    errors = dict.fromkeys(truth.CLASSES, 0)
+    for y, x in np.ndindex(labels.shape):
+        surface, edge = t["surface"][y, x], t["edge"][y, x]
+        if not surface or not t["covered"][y, x]:
+            continue
+        name = truth.CLASSES[surface]
+        if edge == 1 and name in ("ground", "roof"):
+            name = "roof_edge"
+        elif edge == 2 and name == "ground":
+            name = "tree_edge"
+        labelled = bool(np.isfinite(labels[y, x]))
+        if t["changed"][y, x]:
+            counts[name, ("in_lidar_only", "in_images_only")[t["changed"][y, x] - 1], labelled] += 1
+            continue
+        for group, extra in (("visible", "visible_lost"), ("hidden", "hidden_bared")):
+            if t[group][y, x]:
+                counts[name, group, labelled] += 1
+                counts[name, extra, labelled] += bool(t["changed_right"][y, x])
+                errors[name] += labelled and group == "visible"
 
     for block in (1024, 96):
         monkeypatch.setattr(truth, "BLOCK", block)
-        result = truth.compare_scene(store, scene.truth, None, scene="S-1", workers=2)
-        for kind in ("visible", "hidden", "changed"):
-            assert result.whole.pixels[kind] == expected[kind]
-            assert result.whole.labelled[kind] == expected[kind + " labelled"]
-        assert result.whole.errors.count == errors
-        assert result.surfaces.keys() == {"ground", "roof", "water"}
-        assert sum(c.errors.count for c in result.surfaces.values()) == errors
-        assert result.whole.errors.figures()["mean_absolute"] == pytest.approx(0.638, abs=0.01)
+        result = compared(scene, store)
+        classes = result.whole.figures()["surfaces"]
+        assert classes.keys() == {"ground", "roof", "water", "roof_edge", "tree_edge"}
+        for name, figures in classes.items():
+            for group in groups:
+                with_label, without = (counts[name, group, flag] for flag in (True, False))
+                assert figures["pixels"][group] == with_label + without
+                assert figures["labelled"][group] == with_label
+                assert figures["status"][group].get("hidden_in_right", 0) == without
+            assert figures["errors"]["count"] == figures["calibration"]["count"] == errors[name]
+        whole = result.whole.figures()
+        for group in groups:
+            expected = [
+                sum(counts[c, group, flag] for c in truth.CLASSES if c != "water")
+                for flag in (True, False)
+            ]
+            assert min(expected) > 100
+            assert whole["pixels"][group] == sum(expected)
+            assert whole["labelled"][group] == expected[0]
+        assert whole["errors"]["count"] == sum(errors.values()) - errors["water"]
+        assert whole["errors"]["mean_absolute"] == pytest.approx(0.638, abs=0.01)
+        assert whole["calibration"]["share_below_1"] == pytest.approx(0.6827, abs=0.01)
+        assert whole["labels"] == np.isfinite(labels[t["surface"] != WATER]).sum()
 
 
 def write_tile(folder: Path, scene: Scene, labels: np.ndarray) -> None:
     size, row0, col0, offset = 128, 100, 120, 7
     part = labels[row0 : row0 + size, col0 : col0 + size] - offset
-    (folder / "disp").mkdir(parents=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(
-            folder / "disp/T_disparity_1.tiff",
-            "w",
-            driver="GTiff",
-            width=size,
-            height=size,
-            count=1,
-            dtype="float32",
-            nodata=-999,
-        ) as dataset:
-            dataset.write(np.where(np.isfinite(part), part, -999).astype("float32"), 1)
+    known = np.isfinite(part)
+    images = {
+        "disp": np.where(known, part, -999).astype("float32"),
+        "status": np.where(known, 1, 3).astype("uint8"),
+    }
+    for kind, image in images.items():
+        (folder / kind).mkdir(parents=True)
+        profile = {"driver": "GTiff", "width": size, "height": size, "count": 1}
+        profile |= {"dtype": image.dtype, "nodata": -999 if kind == "disp" else 0}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(folder / kind / f"T_{kind}_1.tiff", "w", **profile) as dataset:
+                dataset.write(image, 1)
     rows = [
         {
             "tile": "T_1",
@@ -281,7 +334,8 @@ def write_tile(folder: Path, scene: Scene, labels: np.ndarray) -> None:
             "size": size,
             "right_offset_px": offset,
             "complete": complete,
-            "disp": "disp/T_disparity_1.tiff",
+            "disp": "disp/T_disp_1.tiff",
+            "status": "status/T_status_1.tiff",
         }
         for scene_id, complete in (("S-1", "yes"), ("S-1", "no"), ("S-2", "yes"))
     ]
@@ -297,25 +351,34 @@ def test_rule_writes_figures_of_scene_and_tiles(scene, tmp_path):
     store = write_disparity(scene, tmp_path / "disparity.zarr", labels)
     write_tile(tmp_path / "tiles", scene, labels)
     files = tmp_path / "out" / "truth.json", tmp_path / "out" / "truth.csv"
-    truth.evaluate_truth(store, scene.truth, tmp_path / "tiles", *files, scene="S-1", workers=2)
+    made = truth.MadeScene("S-1", store, scene.truth, tmp_path / "tiles")
+    truth.evaluate_truth("S-1", [made], *files, workers=2)
     figures = json.loads(files[0].read_text())
     assert figures["whole_scene"]["errors"]["mean_absolute"] < 1e-3
-    assert figures["exported_tiles"]["pixels"]["labels"] == 128 * 118
-    assert figures["exported_tiles"]["errors"]["max"] < 0.05
+    assert figures["exported_tiles"]["labels"] == 128 * 118
+    assert figures["exported_tiles"]["errors"]["max"] < 1e-4
+    assert figures["exported_tiles"]["status"]["visible"]["hidden_in_right"] > 500
     assert list(figures["tiles"]) == ["T_1"]
     table = list(csv.DictReader(files[1].open()))
     assert [row["scope"] for row in table] == [
-        "scene",
-        "surface ground",
-        "surface roof",
-        "surface water",
-        "tiles",
+        *(f"scene{c}" for c in ("", ": ground", ": roof", ": water", ": roof_edge", ": tree_edge")),
+        *(f"tiles{c}" for c in ("", ": ground", ": roof", ": roof_edge", ": tree_edge")),
         "tile T_1",
     ]
     assert sorted(p.name for p in files[0].parent.iterdir()) == ["truth.csv", "truth.json"]
 
+    # a city of two scenes: their figures together
+    (tmp_path / "other").mkdir()
+    shifted = write_disparity(scene, tmp_path / "other" / "d.zarr", perfect_labels(scene) + 0.5)
+    both = [made, replace(made, name="S-2", disparity=shifted)]
+    city = truth.evaluate_truth("S", both, *files).whole.figures()
+    one = figures["whole_scene"]
+    assert city["pixels"] == {group: 2 * n for group, n in one["pixels"].items()}
+    two = city["errors"]["count"] - one["errors"]["count"]
+    assert city["errors"]["bias"] == pytest.approx(0.5 * two / city["errors"]["count"], abs=1e-4)
 
-def test_missing_stores_are_refused(scene, tmp_path):
+
+def test_missing_and_unlike_stores_are_refused(scene, tmp_path):
     store = write_disparity(scene, tmp_path / "disparity.zarr", perfect_labels(scene))
     with pytest.raises(InputError, match="no such Zarr store"):
         truth.compare_scene(store, tmp_path / "none.zarr", None, scene="S-1")
@@ -323,6 +386,11 @@ def test_missing_stores_are_refused(scene, tmp_path):
         truth.compare_scene(store, store, None, scene="S-1")
     with pytest.raises(InputError, match="no manifest"):
         truth.compare_scene(store, scene.truth, tmp_path, scene="S-1")
+    moved = replace(scene.model, left_image=scene.model.left_image.shifted(0.1, 0.0))
+    other = scene._replace(model=moved)
+    store = write_disparity(other, tmp_path / "moved.zarr", perfect_labels(scene))
+    with pytest.raises(InputError, match="another epipolar model"):
+        truth.compare_scene(store, scene.truth, None, scene="S-1")
 
 
 # ------------------------------------------------------------------------------- check points

@@ -23,6 +23,11 @@ def is_synthetic(scene):
     return city is not None and scene.left_image == f"{made_here}/left.tif"
 
 
+def synthetic_scenes(city):
+    """Names of a city's synthetic scenes, in the order of the sheet."""
+    return [s.scene for s in SCENES.values() if s.city == city and is_synthetic(s)]
+
+
 def read_sheets():
     """Cities and scenes by name, and the LiDAR files of each scene by store name."""
     sheets.check(config, "config", SCHEMAS, "config")

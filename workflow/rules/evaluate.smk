@@ -23,9 +23,9 @@ rule grid_truth:
 
 rule evaluate_truth:
     input:
-        disparity="results/project/{city}/{scene}.zarr",
+        disparity=rules.project.output.disparity,
         tiles="tiles/{city}",
-        truth="data/synthetic/{city}/{scene}/truth.zarr",
+        truth=rules.grid_truth.output.truth,
     output:
         figures="results/evaluate/{city}/{scene}/truth.json",
         table=report(
@@ -52,6 +52,42 @@ rule evaluate_truth:
         "../scripts/evaluate_truth.py"
 
 
+rule evaluate_truth_city:
+    input:
+        disparity=lambda w: expand(
+            rules.project.output.disparity, city=w.city, scene=synthetic_scenes(w.city)
+        ),
+        tiles="tiles/{city}",
+        truth=lambda w: expand(
+            rules.grid_truth.output.truth, city=w.city, scene=synthetic_scenes(w.city)
+        ),
+    output:
+        figures="results/evaluate/{city}/truth.json",
+        table=report(
+            "results/evaluate/{city}/truth.csv",
+            caption="../report/truth.rst",
+            category="Exact truth",
+            labels={"city": "{city}"},
+        ),
+    log:
+        "logs/evaluate_truth_city/{city}.log",
+    benchmark:
+        "benchmarks/evaluate_truth_city/{city}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=3000,
+        runtime=60,
+    params:
+        scenes=lambda w: synthetic_scenes(w.city),
+        code=source_digest("evaluation.truth"),
+    message:
+        "Comparing city {wildcards.city} with its exact truth"
+    script:
+        "../scripts/evaluate_truth_city.py"
+
+
 rule evaluate:
     input:
         [
@@ -59,5 +95,6 @@ rule evaluate:
             for s in SCENES.values()
             if is_synthetic(s)
         ],
+        [f"results/evaluate/{city}/truth.json" for city in CITIES if synthetic_scenes(city)],
     message:
-        "Exact-truth figures of all synthetic scenes"
+        "Exact-truth figures of all synthetic scenes and cities"

@@ -1,18 +1,19 @@
 """One synthetic scene's disparities against the exact truth."""
 
-from stereotruth.evaluation.truth import evaluate_truth
+from pathlib import Path
+
+from stereotruth.evaluation.truth import MadeScene, evaluate_truth
 from stereotruth.runlog import job
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
+    made = (snakemake.input[key] for key in ("disparity", "truth", "tiles"))
     with job(snakemake.log[0], f"evaluate {scene}"):
         evaluate_truth(
-            snakemake.input.disparity,
-            snakemake.input.truth,
-            snakemake.input.tiles,
+            scene,
+            [MadeScene(scene, *map(Path, made))],
             snakemake.output.figures,
             snakemake.output.table,
-            scene=scene,
             workers=snakemake.threads,
             provenance={"code": snakemake.params.code},
         )

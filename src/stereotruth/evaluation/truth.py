@@ -1,23 +1,8 @@
 """Disparities of a synthetic scene against its exact truth.
 
-The truth holds, for the ray through the centre of each raw left pixel, where the ground point that
-it meets appears in the raw right image, by the rigorous camera. The epipolar model brings both
-raw positions to the epipolar grid; no sensor model of the pipeline takes part. So an error of the
-alignment is an error of the label, as it is for a matcher that is trained on it.
-
-The true disparity at an epipolar pixel, whose raw left position falls between four raw pixels:
-
-- interpolated bilinearly, if all four see one class of surface and their disparities differ by
-  ``SMOOTH_PX`` at most;
-- else that of the nearest raw pixel, which is right to half a pixel: on an edge, a label of the one
-  surface may be held against the other although the ray through the epipolar pixel's centre meets
-  the first. ``errors_either`` takes the surface of the four raw pixels that is closest to the
-  label instead. Against rays cast through the epipolar pixels' centres (a scene full of trees)
-  the rule is fair: 0.104 px mean and 0.64 % over 1 px, where the rays gave 0.100 px and 0.57 %;
-  ``errors_either`` is too kind: 0.068 px and 0.12 %.
-
-Visibility, change and class are those of the nearest raw pixel. Everything is done in blocks of the
-grid.
+The truth lies on the same grid, from rays through the centres of its pixels
+(:mod:`stereotruth.evaluation.grid_truth`), so labels are compared with it pixel by pixel.
+Everything is done in blocks of the grid.
 """
 
 from __future__ import annotations
@@ -39,243 +24,268 @@ from ..epipolar import EpipolarModel
 from ..errors import InputError
 from ..grid_store import blocks, replacing, require_complete
 from ..runlog import progress
-from .statistics import LIMITS, ErrorSum
+from .statistics import LIMITS, Calibration, ErrorSum
 from .warping import read_tile
 
 log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+Flags = NDArray[np.uint8]
 
-SMOOTH_PX = 1.0  # px of disparity: a plane of 45 degrees has 0.8 px across four pixels of GF-7
 BLOCK = 1024  # px
-SURFACES = {0: "none", 1: "ground", 2: "roof", 3: "wall", 4: "tree", 5: "water"}
-WATER = 5
+# Classes of pixels: the truth's surfaces by number, and what lies beside height edges.
+CLASSES = ("none", "ground", "roof", "wall", "tree", "water", "roof_edge", "tree_edge")
+GROUND, ROOF, WATER, ROOF_EDGE, TREE_EDGE = (
+    CLASSES.index(name) for name in ("ground", "roof", "water", "roof_edge", "tree_edge")
+)
+UNCHANGED, IN_LIDAR_ONLY, IN_IMAGES_ONLY = range(3)
+GROUPS = ("visible", "hidden", "in_lidar_only", "in_images_only", "visible_lost", "hidden_bared")
+SHARES = tuple(f"share_of_{group}_labelled" for group in GROUPS[:4])
 MEANING = {
-    "errors": "label less true disparity, px; labelled pixels that both views see and that LiDAR "
-    "and images agree on",
-    "errors_smooth": "of these, where the truth is interpolated on one surface",
-    "errors_edge": "of these, where the truth is that of the nearest raw pixel",
-    "errors_either": "as errors, but on edges against the closest of the four raw pixels around",
-    "errors_with_changed": "as errors, with pixels where LiDAR and images disagree by design",
-    "y_parallax": "y of the true right position less y of the left one, px; all pixels that both "
-    "views see",
-    "visible": "pixels that both views see, inside the LiDAR's coverage, unchanged, no water",
+    "errors": "label less true disparity, px; labelled pixels of the group visible",
+    "y_parallax": "y of the true right position less y of the left one, px; all pixels of the "
+    "group visible, with or without label",
+    "calibration": "errors against the uncertainty stated for them: shares of |error| below one "
+    "and two uncertainties, as a whole and by deciles of the uncertainty (px)",
+    "visible": "pixels that both views see, inside the LiDAR's coverage, unchanged, no water (the "
+    "surface water: water, but for that)",
     "hidden": "pixels of the left image that another surface hides from the right view, inside "
-    "the LiDAR's coverage, unchanged, no water",
-    "changed": "pixels whose surface exists in the LiDAR only or in the images only",
+    "the right frame and the LiDAR's coverage, unchanged, no water",
+    "in_lidar_only": "pixels that would show a building that exists in the LiDAR only",
+    "in_images_only": "pixels that show a building that exists in the images only",
+    "visible_lost": "of the visible ones, those hidden from the right view by a building that "
+    "exists in the LiDAR only",
+    "hidden_bared": "of the hidden ones, those hidden by a building that exists in the images only",
+    "status": "pixels of each group by their status",
+    "surfaces": "by what the pixel shows; roof_edge: roof or ground within 1 px of a step of more "
+    "than 1 px of disparity at a roof or wall; tree_edge: ground beside any other such step",
 }
-COUNTS = ("labels", "labels_without_truth", "visible", "hidden", "changed")
 
 
 @dataclass(frozen=True, eq=False)
-class TrueLabels:
+class Truth:
     """The truth in a window of the left epipolar grid; arrays [h, w].
 
     ``disparity`` (x_left − x_right) and ``y_parallax`` (y_right − y_left) float64 px, NaN where
-    the left image shows nothing that is known; ``around`` [4, h, w]: disparities of the four raw
-    pixels around; ``smooth``: interpolated on one surface;
-    ``visible``: seen in the right view; ``hidden``: inside the right frame, but not seen;
-    ``changed``, ``covered`` (by LiDAR); ``surface`` uint8 class.
+    the left image shows nothing; ``visible``: seen in the right view; ``hidden``: inside the right
+    frame, but not seen; ``changed``, ``changed_right``, ``covered``: see grid_truth; ``kind``:
+    index into CLASSES.
     """
 
     disparity: Floats
-    around: Floats
     y_parallax: Floats
-    smooth: Bools
-    visible: Bools
-    hidden: Bools
-    changed: Bools
-    covered: Bools
-    surface: NDArray[np.uint8]
+    visible: Flags
+    hidden: Flags
+    changed: Flags
+    changed_right: Flags
+    covered: Flags
+    kind: Flags
+
+    @classmethod
+    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Truth:
+        """The truth in a window [rows, cols]."""
+        flags = ("visible", "hidden", "changed", "changed_right", "covered")
+        surface, edge = store["surface"][rows, cols], store["edge"][rows, cols]
+        kind = surface.copy()
+        kind[((surface == GROUND) | (surface == ROOF)) & (edge == 1)] = ROOF_EDGE
+        kind[(surface == GROUND) & (edge == 2)] = TREE_EDGE
+        return cls(
+            *(store[name][rows, cols].astype(np.float64) for name in ("disparity", "y_parallax")),
+            *(store[name][rows, cols] for name in flags),
+            kind=kind,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labels in a window; arrays [h, w].
+
+    ``disparity`` and its standard ``uncertainty`` float64 px, NaN where there is none; ``status``
+    as in the disparity store.
+    """
+
+    disparity: Floats
+    status: Flags
+    uncertainty: Floats
+
+    @classmethod
+    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Labels:
+        """The labels of a disparity store in a window [rows, cols]."""
+        return cls(
+            store["disparity"][rows, cols].astype(np.float64),
+            store["status"][rows, cols],
+            store["uncertainty"][rows, cols].astype(np.float64),
+        )
+
+
+def status_names(store: zarr.Group) -> tuple[str, ...]:
+    """Names of the status values of a disparity store, by value."""
+    attrs = store["status"].attrs
+    names = dict(zip(attrs["flag_values"], attrs["flag_meanings"].split()))
+    return tuple(names.get(value, f"status_{value}") for value in range(max(names) + 1))
 
 
 @dataclass
 class Comparison:
-    """Figures of labels against the truth; see ``MEANING``."""
+    """Figures of labels against the truth; see ``MEANING``.
 
+    ``statuses``: names by value, "labelled" among them; ``counts`` int64[groups, statuses].
+    """
+
+    statuses: tuple[str, ...]
+    labels: int = 0
     errors: ErrorSum = field(default_factory=ErrorSum)
-    smooth: ErrorSum = field(default_factory=ErrorSum)
-    edge: ErrorSum = field(default_factory=ErrorSum)
-    either: ErrorSum = field(default_factory=ErrorSum)
-    with_changed: ErrorSum = field(default_factory=ErrorSum)
+    calibration: Calibration = field(default_factory=Calibration)
     parallax: ErrorSum = field(default_factory=ErrorSum)
-    pixels: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTS, 0))
-    labelled: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTS[2:], 0))
+    counts: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.counts = np.zeros((len(GROUPS), len(self.statuses)), np.int64)
 
     def merge(self, other: Comparison) -> None:
-        """Add the figures of other pixels."""
-        for name in ("errors", "smooth", "edge", "either", "with_changed", "parallax"):
-            getattr(self, name).merge(getattr(other, name))
-        for mine, others in ((self.pixels, other.pixels), (self.labelled, other.labelled)):
-            for key, value in others.items():
-                mine[key] += value
+        """Add the figures of other pixels. Raises ValueError if their statuses are others."""
+        if self.statuses != other.statuses:
+            raise ValueError(f"statuses {self.statuses} and {other.statuses}")
+        self.labels += other.labels
+        self.errors.merge(other.errors)
+        self.calibration.merge(other.calibration)
+        self.parallax.merge(other.parallax)
+        self.counts += other.counts
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready; px and shares 0 … 1 (null where there are no such pixels)."""
-        shares = {
-            f"share_of_{key}_labelled": (
-                round(self.labelled[key] / self.pixels[key], 6) if self.pixels[key] else None
-            )
-            for key in self.labelled
-        }
+        pixels = dict(zip(GROUPS, self.counts.sum(axis=1).tolist()))
+        labelled = dict(zip(GROUPS, self.counts[:, self.statuses.index("labelled")].tolist()))
         return {
+            "labels": self.labels,
             "errors": self.errors.figures(),
-            "errors_smooth": self.smooth.figures(),
-            "errors_edge": self.edge.figures(),
-            "errors_either": self.either.figures(),
-            "errors_with_changed": self.with_changed.figures(),
+            "calibration": self.calibration.figures(),
             "y_parallax": self.parallax.figures(),
-            "pixels": self.pixels,
-            "labelled": self.labelled,
-            **shares,
+            "pixels": pixels,
+            "labelled": labelled,
+            **{
+                share: round(labelled[group] / pixels[group], 6) if pixels[group] else None
+                for share, group in zip(SHARES, GROUPS)
+            },
+            "status": {
+                group: {name: n for name, n in zip(self.statuses, row) if n}
+                for group, row in zip(GROUPS, self.counts.tolist())
+            },
         }
 
 
 @dataclass
-class SceneComparison:
-    """Figures of one scene: as a whole, by class of surface, and of its exported tiles."""
+class ByClass:
+    """Comparisons of the pixels of some windows, by class."""
 
-    scene: str
-    whole: Comparison = field(default_factory=Comparison)
-    surfaces: dict[str, Comparison] = field(default_factory=dict)
-    all_tiles: Comparison = field(default_factory=Comparison)
+    parts: dict[str, Comparison] = field(default_factory=dict)
+
+    def merge(self, other: ByClass) -> None:
+        """Add the figures of other pixels."""
+        for name, part in other.parts.items():
+            self.parts.setdefault(name, Comparison(part.statuses)).merge(part)
+
+    @property
+    def total(self) -> Comparison:
+        """All classes but water."""
+        statuses = next(iter(self.parts.values())).statuses if self.parts else ("labelled",)
+        result = Comparison(statuses)
+        for name in self.classes:
+            if name != "water":
+                result.merge(self.parts[name])
+        return result
+
+    @property
+    def classes(self) -> list[str]:
+        """The classes that there are, in the order of CLASSES."""
+        return [name for name in CLASSES if name in self.parts]
+
+    def figures(self) -> dict[str, Any]:
+        """JSON-ready: the total, and ``surfaces``."""
+        surfaces = {name: self.parts[name].figures() for name in self.classes if name != "none"}
+        return self.total.figures() | {"surfaces": surfaces}
+
+
+@dataclass
+class SceneComparison:
+    """Figures of scenes: their whole grids, their exported tiles, and each tile."""
+
+    name: str
+    whole: ByClass = field(default_factory=ByClass)
+    all_tiles: ByClass = field(default_factory=ByClass)
     tiles: dict[str, Comparison] = field(default_factory=dict)
+
+    def merge(self, other: SceneComparison) -> None:
+        """Add another scene."""
+        self.whole.merge(other.whole)
+        self.all_tiles.merge(other.all_tiles)
+        self.tiles |= other.tiles
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready."""
         return {
-            "scene": self.scene,
-            "what": "disparities against the exact truth of a synthetic scene",
+            "name": self.name,
+            "what": "disparities against the exact truth of synthetic scenes",
             "units": "px; shares 0 to 1",
             "meaning": MEANING,
             "whole_scene": self.whole.figures(),
-            "surfaces": {name: c.figures() for name, c in self.surfaces.items()},
             "exported_tiles": self.all_tiles.figures(),
             "tiles": {name: c.figures() for name, c in self.tiles.items()},
         }
 
 
-# --------------------------------------------------------------------------------------- truth
+# ---------------------------------------------------------------------------------- comparison
 
 
-def open_truth(path: str | Path) -> zarr.Group:
-    """The truth store of a synthetic scene. Raises InputError if it is missing or unfinished."""
+def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> zarr.Group:
+    """The truth of a synthetic scene on its epipolar grid.
+
+    Raises InputError if it is missing, unfinished, or of another epipolar model than ``epipolar``.
+    """
     group = require_complete(path)
-    wanted = ("right_col", "right_row", "visible_right", "surface", "changed", "covered")
-    missing = [name for name in wanted if name not in group]
-    if missing:
+    if group.attrs.get("kind") != "truth":
+        raise InputError("no truth store", file=path, remedy="run the rule grid_truth")
+    if epipolar is not None and group.attrs["epipolar"] != epipolar:
         raise InputError(
-            f"no truth store: {', '.join(missing)} missing",
+            "truth on the grid of another epipolar model than the disparities'",
             file=path,
-            remedy="make the synthetic city again",
+            remedy="run the workflow again",
         )
     return group
 
 
-def true_labels(
-    model: EpipolarModel, truth: zarr.Group | Mapping[str, Any], rows: slice, cols: slice
-) -> TrueLabels:
-    """The truth in a window of the left epipolar grid."""
-    y, x = np.mgrid[rows, cols].astype(np.float64)
-    col, row = model.epipolar_to_left(x, y)
-    height, width = truth["right_col"].shape
-    inside = (col >= -0.5) & (col <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
-    if not inside.any():
-        nothing, no = np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
-        four = np.full((4, *x.shape), np.nan)
-        return TrueLabels(nothing, four, nothing, *[no] * 5, np.zeros(x.shape, np.uint8))
-    top, bottom = _reach(row[inside], height)
-    first, last = _reach(col[inside], width)
-    window = np.s_[top:bottom, first:last]
-    raw_row, raw_col = np.mgrid[window].astype(np.float64)
-    right_col, right_row = (np.asarray(truth[n][window], float) for n in ("right_col", "right_row"))
-    surface = np.asarray(truth["surface"][window])
-    seen = np.asarray(truth["visible_right"][window]) == 1
-    x_left, y_left = model.left_to_epipolar(raw_col, raw_row)
-    x_right, y_right = model.right_to_epipolar(right_col, right_row)
-    known = np.isfinite(x_right) & (surface != 0)
-    disparity = np.where(known, x_left - x_right, np.nan)
-    parallax = np.where(known, y_right - y_left, np.nan)
-    frame_cols, frame_rows = model.right_size
-    in_frame = (np.abs(right_col - (frame_cols - 1) / 2) <= frame_cols / 2) & (
-        np.abs(right_row - (frame_rows - 1) / 2) <= frame_rows / 2
+def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
+    """Labels against the truth of the same window; ``statuses``: names by value."""
+    labelled = np.isfinite(labels.disparity)
+    steady = (truth.covered == 1) & (truth.changed == UNCHANGED)
+    seen, hidden = steady & (truth.visible == 1), steady & (truth.hidden == 1)
+    shown = (truth.covered == 1) & (truth.kind > 0)
+    groups = (
+        seen,
+        hidden,
+        shown & (truth.changed == IN_LIDAR_ONLY),
+        shown & (truth.changed == IN_IMAGES_ONLY),
+        seen & (truth.changed_right == 1),
+        hidden & (truth.changed_right == 1),
     )
-
-    def clipped(values: Floats, limit: int) -> NDArray[np.intp]:
-        return np.clip(np.where(inside, values, 0.0), 0, limit).astype(np.intp)
-
-    h, w = disparity.shape
-    v, u = row - top, col - first
-    at = clipped(np.rint(v), h - 1), clipped(np.rint(u), w - 1)
-    j, i = clipped(np.floor(v), max(h - 2, 0)), clipped(np.floor(u), max(w - 2, 0))
-    below, beside = np.minimum(j + 1, h - 1), np.minimum(i + 1, w - 1)
-    corners = [(j, i), (j, beside), (below, i), (below, beside)]
-    four = np.stack([disparity[c] for c in corners])
-    with np.errstate(invalid="ignore"):
-        smooth = inside & (four.max(axis=0) - four.min(axis=0) <= SMOOTH_PX)
-    for corner in corners[1:]:
-        smooth &= surface[corner] == surface[corners[0]]
-    smooth &= (v >= 0) & (u >= 0) & (v <= h - 1) & (u <= w - 1)
-    fv, fu = v - j, u - i
-    weights = np.stack([(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu])
-
-    def interpolated(values: Floats, at_corners: Floats) -> Floats:
-        nearest = np.where(inside, values[at], np.nan)
-        return np.where(smooth, (weights * at_corners).sum(axis=0), nearest)
-
-    return TrueLabels(
-        disparity=interpolated(disparity, four),
-        around=np.where(inside, four, np.nan),
-        y_parallax=interpolated(parallax, np.stack([parallax[c] for c in corners])),
-        smooth=smooth,
-        visible=inside & seen[at],
-        hidden=inside & known[at] & in_frame[at] & ~seen[at],
-        changed=inside & (np.asarray(truth["changed"][window])[at] == 1),
-        covered=inside & (np.asarray(truth["covered"][window])[at] == 1),
-        surface=np.where(inside, surface[at], 0).astype(np.uint8),
-    )
-
-
-def _reach(values: Floats, size: int) -> tuple[int, int]:
-    """Range of raw pixels around positions, for reading."""
-    low, high = int(np.floor(values.min())) - 1, int(np.ceil(values.max())) + 2
-    return max(min(low, size - 2), 0), min(max(high, 2), size)
-
-
-def compare(labels: Floats, truth: TrueLabels, where: Bools | None = None) -> Comparison:
-    """Labels float64[h, w] (px, NaN where there is none) against the truth, of the pixels where."""
-    within = np.ones(labels.shape, dtype=bool) if where is None else where
-    labelled = within & np.isfinite(labels)
-    known = within & np.isfinite(truth.disparity)
-    seen = known & truth.visible
-    steady = known & truth.covered & ~truth.changed & (truth.surface != WATER)
-    errors = labels - truth.disparity
-    good = labelled & seen & ~truth.changed
-    result = Comparison()
-    result.errors.add(errors[good])
-    result.smooth.add(errors[good & truth.smooth])
-    result.edge.add(errors[good & ~truth.smooth])
-    edge = good & ~truth.smooth
-    either = np.fmin.reduce(np.abs(labels[edge] - truth.around[:, edge]), axis=0)
-    result.either.add(errors[good & truth.smooth])
-    result.either.add(np.where(np.isfinite(either), either, np.abs(errors[edge])))
-    result.with_changed.add(errors[labelled & seen])
-    result.parallax.add(truth.y_parallax[seen])
-    groups = {
-        "visible": steady & truth.visible,
-        "hidden": steady & truth.hidden,
-        "changed": known & truth.covered & truth.changed,
-    }
-    result.pixels["labels"] = int(labelled.sum())
-    result.pixels["labels_without_truth"] = int((labelled & ~known).sum())
-    for name, group in groups.items():
-        result.pixels[name] = int(group.sum())
-        result.labelled[name] = int((group & labelled).sum())
+    size = len(statuses)
+    index = truth.kind.astype(np.intp) * size + labels.status
+    counts = np.stack(
+        [np.bincount(index[group], minlength=size * len(CLASSES)) for group in groups]
+    ).reshape(len(GROUPS), len(CLASSES), size)
+    good = seen & labelled
+    stated = good & np.isfinite(labels.uncertainty)
+    errors = labels.disparity - truth.disparity
+    result = ByClass()
+    for kind in np.unique(truth.kind):
+        here = truth.kind == kind
+        part = result.parts[CLASSES[kind]] = Comparison(statuses)
+        part.labels = int((here & labelled).sum())
+        part.errors.add(errors[good & here])
+        part.calibration.add(errors[stated & here], labels.uncertainty[stated & here])
+        part.parallax.add(truth.y_parallax[seen & here])
+        part.counts += counts[:, kind]
     return result
-
-
-# --------------------------------------------------------------------------------------- scene
 
 
 def _tile_rows(tiles: Path, scene: str) -> list[dict[str, str]]:
@@ -291,9 +301,22 @@ def _tile_rows(tiles: Path, scene: str) -> list[dict[str, str]]:
     return [row for row in rows if row["scene"] == scene and row["complete"] == "yes"]
 
 
-def read_tile_disparity(tiles: Path, row: Mapping[str, str]) -> Floats:
-    """Disparity of an exported tile in px of the scene's grid: its right offset is added."""
-    return read_tile(tiles / row["disp"]) + float(row["right_offset_px"])
+def read_tile_labels(tiles: Path, row: Mapping[str, str], store: zarr.Group) -> Labels:
+    """Labels of an exported tile, ``row`` its line of the manifest.
+
+    Its right offset is added to the disparity, px of the scene's grid. The uncertainty, which is
+    not exported, is that of the disparity store.
+    """
+    return Labels(
+        read_tile(tiles / row["disp"]) + float(row["right_offset_px"]),
+        np.nan_to_num(read_tile(tiles / row["status"])).astype(np.uint8),
+        store["uncertainty"][_window(row)].astype(np.float64),
+    )
+
+
+def _window(row: Mapping[str, str]) -> tuple[slice, slice]:
+    r, c, size = int(row["row0"]), int(row["col0"]), int(row["size"])
+    return slice(r, r + size), slice(c, c + size)
 
 
 def _mapped(work: Any, items: Sequence[Any], workers: int, what: str) -> Iterator[Any]:
@@ -309,57 +332,38 @@ def compare_scene(
     *,
     scene: str,
     workers: int = 1,
-    model: EpipolarModel | None = None,
 ) -> SceneComparison:
     """Compare disparity.zarr, and the scene's tiles under ``tiles`` if given, with the truth.
 
-    ``model`` defaults to that in the store's attributes. Raises InputError for missing or
-    unfinished stores.
+    Raises InputError for missing, unfinished or unlike stores.
     """
-    store, true = require_complete(disparity), open_truth(truth)
-    model = model or EpipolarModel.from_dict(store.attrs["epipolar"])
-    expected = (model.left_size[1], model.left_size[0])
-    if true["right_col"].shape != expected:
-        raise InputError(
-            f"truth of {true['right_col'].shape} px, left image of {expected}",
-            file=truth,
-            remedy="make the synthetic city again, then run the workflow",
-        )
-    labels = store["disparity"]
-    meanings = true["surface"].attrs.get("flag_meanings", "")
-    meanings = meanings.split() if isinstance(meanings, str) else list(meanings)
-    names = SURFACES | dict(zip(true["surface"].attrs.get("flag_values", []), meanings))
+    store = require_complete(disparity)
+    true = open_truth(truth, store.attrs["epipolar"])
+    statuses = status_names(store)
 
-    def block(window: tuple[slice, slice]) -> tuple[Comparison, dict[int, Comparison]]:
-        here = true_labels(model, true, *window)
-        values = labels[window].astype(np.float64)
-        classes = [int(k) for k in np.unique(here.surface) if k]
-        return compare(values, here), {k: compare(values, here, here.surface == k) for k in classes}
+    def block(window: tuple[slice, slice]) -> ByClass:
+        return compare(Labels.read(store, *window), Truth.read(true, *window), statuses)
 
     result = SceneComparison(scene)
-    by_class: dict[int, Comparison] = {}
-    windows = blocks(labels.shape, BLOCK)
-    for whole, classes in _mapped(block, windows, workers, f"{scene}: blocks compared"):
-        result.whole.merge(whole)
-        for k, comparison in classes.items():
-            by_class.setdefault(k, Comparison()).merge(comparison)
-    result.surfaces = {names[k]: by_class[k] for k in sorted(by_class)}
-
+    windows = blocks(store["disparity"].shape, BLOCK)
+    for part in _mapped(block, windows, workers, f"{scene}: blocks compared"):
+        result.whole.merge(part)
     if tiles is not None:
         folder = Path(tiles)
 
-        def tile(row: Mapping[str, str]) -> Comparison:
-            r, c, size = int(row["row0"]), int(row["col0"]), int(row["size"])
-            here = true_labels(model, true, slice(r, r + size), slice(c, c + size))
-            return compare(read_tile_disparity(folder, row), here)
+        def tile(row: Mapping[str, str]) -> ByClass:
+            here = Truth.read(true, *_window(row))
+            return compare(read_tile_labels(folder, row, store), here, statuses)
 
         rows = _tile_rows(folder, scene)
         done = _mapped(tile, rows, workers, f"{scene}: tiles compared")
-        for row, comparison in zip(rows, done):
-            result.tiles[row["tile"]] = comparison
-            result.all_tiles.merge(comparison)
+        for row, part in zip(rows, done):
+            result.tiles[row["tile"]] = part.total
+            result.all_tiles.merge(part)
     return result
 
+
+# ---------------------------------------------------------------------------------------- files
 
 TABLE = (
     "scope",
@@ -367,13 +371,14 @@ TABLE = (
     "mean_absolute_px",
     "median_px",
     "rms_px",
+    "nmad_px",
     *(f"share_over_{limit:g}_px" for limit in LIMITS),
-    "share_of_visible_labelled",
-    "share_of_hidden_labelled",
-    "share_of_changed_labelled",
+    *SHARES,
     "y_parallax_rms_px",
     "y_parallax_mean_px",
     "y_parallax_max_px",
+    "share_below_1_uncertainty",
+    "share_below_2_uncertainties",
 )
 
 
@@ -383,26 +388,33 @@ def table_row(scope: str, comparison: Comparison) -> dict[str, Any]:
     errors, parallax = figures["errors"], figures["y_parallax"]
     return {
         "scope": scope,
-        "labels": figures["pixels"]["labels"],
+        "labels": figures["labels"],
         "mean_absolute_px": errors["mean_absolute"],
         "median_px": errors["median"],
         "rms_px": errors["rms"],
+        "nmad_px": errors["nmad"],
         **{f"share_over_{limit:g}_px": errors[f"share_over_{limit:g}_px"] for limit in LIMITS},
-        **{key: value for key, value in figures.items() if key.startswith("share_of_")},
+        **{share: figures[share] for share in SHARES},
         "y_parallax_rms_px": parallax["rms"],
         "y_parallax_mean_px": parallax["bias"],
         "y_parallax_max_px": parallax["max"],
+        "share_below_1_uncertainty": figures["calibration"]["share_below_1"],
+        "share_below_2_uncertainties": figures["calibration"]["share_below_2"],
     }
 
 
 def table(result: SceneComparison) -> list[dict[str, Any]]:
-    """The scene, its classes of surface, all its tiles, and each."""
-    rows = [table_row("scene", result.whole)]
-    rows += [table_row(f"surface {name}", c) for name, c in result.surfaces.items()]
-    if result.tiles:
-        rows.append(table_row("tiles", result.all_tiles))
-        rows += [table_row(f"tile {name}", c) for name, c in result.tiles.items()]
-    return rows
+    """The whole grid, all its tiles, both also by class, and each tile."""
+    rows = []
+    for scope, part in (("scene", result.whole), ("tiles", result.all_tiles)):
+        if part.parts:
+            rows.append(table_row(scope, part.total))
+            rows += [
+                table_row(f"{scope}: {name}", part.parts[name])
+                for name in part.classes
+                if name != "none"
+            ]
+    return rows + [table_row(f"tile {name}", c) for name, c in result.tiles.items()]
 
 
 def write_rows(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
@@ -419,25 +431,39 @@ def write_json(path: str | Path, values: Mapping[str, Any]) -> None:
         scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+@dataclass(frozen=True)
+class MadeScene:
+    """Name and products of a scene: disparity store, truth on its grid, folder of tiles."""
+
+    name: str
+    disparity: Path
+    truth: Path
+    tiles: Path | None = None
+
+
 def evaluate_truth(
-    disparity: str | Path,
-    truth: str | Path,
-    tiles: str | Path | None,
+    name: str,
+    scenes: Sequence[MadeScene],
     json_file: str | Path,
     csv_file: str | Path,
     *,
-    scene: str,
     workers: int = 1,
     provenance: Mapping[str, Any] | None = None,
 ) -> SceneComparison:
-    """The ``evaluate_truth`` rule: compare a scene with its truth, write figures and table."""
-    result = compare_scene(disparity, truth, tiles, scene=scene, workers=workers)
+    """Compare scenes with their truth, pooled under ``name``; write figures and table."""
+    result = SceneComparison(name)
+    for scene in scenes:
+        result.merge(
+            compare_scene(
+                scene.disparity, scene.truth, scene.tiles, scene=scene.name, workers=workers
+            )
+        )
     write_rows(csv_file, TABLE, table(result))
     write_json(json_file, result.figures() | {"provenance": dict(provenance or {})})
     shown = result.all_tiles if result.tiles else result.whole
-    row = table_row("", shown)
+    row = table_row("", shown.total)
     log.info(
-        "%s: mean absolute error %.3f px, %.2f %% over 1 px; y-parallax %.3f px rms; %.1f %% of "
+        "%s: mean absolute error %.3f px, %.3f %% over 1 px; y-parallax %.3f px rms; %.1f %% of "
         "the visible and %.1f %% of the hidden pixels labelled",
         "tiles" if result.tiles else "scene",
         *(
@@ -458,15 +484,16 @@ def evaluate_truth(
 
 
 def geometry_errors(
-    model: EpipolarModel, truth: str | Path, *, step: int = 7
+    model: EpipolarModel, raw_truth: str | Path, *, step: int = 7
 ) -> tuple[ErrorSum, ErrorSum]:
     """How far alignment and epipolar model alone are off: (disparity, y-parallax), px.
 
     The exact ground points of every ``step``-th raw pixel that both views see go through the
     pipeline's sensor models. The first is the error of a label on an exact point, compared with
     the truth of the same pixel; the second the y-parallax of the true correspondences.
+    ``raw_truth``: the truth on the raw left image's grid.
     """
-    group = open_truth(truth)
+    group = require_complete(raw_truth)
     disparity, parallax = ErrorSum(), ErrorSum()
     height, width = group["right_col"].shape
     for top in range(0, height, BLOCK):
