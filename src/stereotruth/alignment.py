@@ -14,7 +14,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .control_points import ControlPoints, read_gcps
+from .epipolar import EpipolarModel
 from .errors import InputError
 from .gcp_checks import (
     View,
@@ -54,6 +55,11 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 POOR_SIGMA = 2.0  # px
+# A careful measurement in px, and for how many degrees of freedom it stands beside the residuals
+# when these are few: 4 GCPs leave two, and may agree by chance.
+CAREFUL_SIGMA = (0.25, 2)
+RPC_SHIFT = 10.0  # px, standard deviation of what an RPC without GCPs is off, and
+RPC_TILT = 3e-4  # of its scale, rotation and shear
 LARGE_SHIFT = 200.0  # px: RPCs err by some 1 to 50 px
 LARGE_TILT = 0.005  # change of scale, rotation or shear; RPCs err by less than 0.001
 UNITS = {
@@ -63,6 +69,7 @@ UNITS = {
     "affine": "(col, row)_image = affine @ (col_rpc, row_rpc, 1); px",
     "covariance": "px^2, of (a_u, a_v, a_1, b_u, b_v, b_1) in col = … + a_u u + a_v v + a_1, "
     "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",
+    "cross_covariance": "px^2, of the left image's parameters (rows) with the right's",
 }
 
 
@@ -95,7 +102,7 @@ class ViewFit:
     ``size`` (cols, rows) of the image; ``sigma0`` px per coordinate, from the redundancy of the
     fit (NaN without any); ``covariance`` float64[6, 6] in px² of the affine's parameters in
     normalised coordinates (u, v) = ((col, row)_rpc − origin) / scale, in the order
-    col: u, v, 1, row: u, v, 1.
+    col: u, v, 1, row: u, v, 1 (few redundant GCPs may agree by chance: see CAREFUL_SIGMA).
     """
 
     view: str
@@ -115,8 +122,13 @@ class ViewFit:
         return tuple(gcp for gcp in self.gcps if not gcp.used)
 
     def rms(self, which: str) -> float:
-        """Root mean square length in px over the used GCPs: before, after or leave_one_out."""
+        """Root mean square length in px over the used GCPs: before, after or leave_one_out.
+
+        NaN without any.
+        """
         pairs = np.array([getattr(gcp, which) for gcp in self.gcps if gcp.used])
+        if not pairs.size:
+            return math.nan
         return float(np.sqrt(np.mean(np.sum(pairs**2, axis=1))))
 
     def covariance_at(self, col: ArrayLike, row: ArrayLike) -> Floats:
@@ -124,13 +136,26 @@ class ViewFit:
 
         That is the part of a projected point's error that stems from the GCPs' measurement.
         """
+        design = self.design(col, row)
+        return design @ self.covariance @ np.swapaxes(design, -1, -2)
+
+    def design(self, col: ArrayLike, row: ArrayLike) -> Floats:
+        """[..., 2, 6]: change of the corrected (col, row) with the parameters of ``covariance``."""
         col, row = np.broadcast_arrays(np.asarray(col, float), np.asarray(row, float))
         image = np.stack([col, row], axis=-1) - self.affine[:, 2]
         rpc = image @ np.linalg.inv(self.affine[:, :2]).T
         u = (rpc - np.array(self.origin)) / self.scale
         basis = np.concatenate([u, np.ones((*u.shape[:-1], 1))], axis=-1)
-        blocks = self.covariance.reshape(2, 3, 2, 3)
-        return np.einsum("...i,aibj,...j->...ab", basis, blocks, basis)
+        design = np.zeros((*basis.shape[:-1], 2, 6))
+        design[..., 0, :3] = design[..., 1, 3:] = basis
+        return design
+
+    def moved(self, parameters: Floats) -> Floats:
+        """The affine float64[2, 3] plus small parameters [6] in the order of ``covariance``."""
+        change = parameters.reshape(2, 3)
+        linear = change[:, :2] / self.scale
+        shift = change[:, 2] - linear @ np.array(self.origin)
+        return self.affine + np.column_stack([linear, shift])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +163,8 @@ class Alignment:
     """Aligned sensor models of a pair, with how they were found.
 
     ``reference_height``: mean of the GCPs that are used in either view, ellipsoidal m.
+    ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
+    ``refinement``: what `refine` observed and changed, empty before.
     """
 
     scene: str
@@ -149,6 +176,41 @@ class Alignment:
     reference_height: float
     warnings: tuple[str, ...]
     provenance: dict[str, Any]
+    cross_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    refinement: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> Floats:
+        """float64[12, 12] px² of the parameters of both fits, left first."""
+        left, right = (fit.covariance for fit in self.fits)
+        return np.block([[left, self.cross_covariance], [self.cross_covariance.T, right]])
+
+    def label_sigma(
+        self, model: EpipolarModel, x: ArrayLike, y: ArrayLike
+    ) -> tuple[Floats, Floats, Floats]:
+        """Standard uncertainty in px that the alignment gives to labels at epipolar (x, y).
+
+        Of the disparity, and of the label's own x and y in the left grid. For points at the
+        reference height; NaN where the model has no ground.
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        height = model.reference_height
+        left = np.stack(model.epipolar_to_left(x, y), axis=-1)
+        ground = model.left.localize(left[..., 0], left[..., 1], height)
+        right = np.stack(model.right.project(*ground, height), axis=-1)
+        effects = [
+            image.slopes(at[..., 0], at[..., 1]) @ fit.design(at[..., 0], at[..., 1])
+            for image, at, fit in zip(
+                (model.left_image, model.right_image), (left, right), self.fits
+            )
+        ]
+        disparity = np.concatenate([effects[0][..., 0, :], -effects[1][..., 0, :]], axis=-1)
+        of_left = self.left_fit.covariance
+        variances = [np.einsum("...i,ij,...j->...", disparity, self.covariance, disparity)]
+        for axis in (0, 1):
+            e = effects[0][..., axis, :]
+            variances.append(np.einsum("...i,ij,...j->...", e, of_left, e))
+        return tuple(np.sqrt(np.maximum(v, 0.0)) for v in variances)
 
     @property
     def fits(self) -> tuple[ViewFit, ViewFit]:
@@ -171,6 +233,8 @@ class Alignment:
             "model": self.model,
             "reference_height": self.reference_height,
             **views,
+            "cross_covariance": self.cross_covariance.tolist(),
+            "refinement": self.refinement,
             "warnings": list(self.warnings),
             "provenance": self.provenance,
         }
@@ -188,6 +252,8 @@ class Alignment:
             reference_height=values["reference_height"],
             warnings=tuple(values["warnings"]),
             provenance=values["provenance"],
+            cross_covariance=np.array(values["cross_covariance"]),
+            refinement=values["refinement"],
         )
 
     def save(self, path: str | Path) -> None:
@@ -238,7 +304,7 @@ def _fit_to_dict(fit: ViewFit) -> dict[str, Any]:
         "gcps": gcps,
         "left_out": [g.id for g in fit.left_out],
         "rms": {name: value if math.isfinite(value) else None for name, value in rms.items()},
-        "sigma0": fit.sigma0,
+        "sigma0": fit.sigma0 if math.isfinite(fit.sigma0) else None,
         "redundancy": fit.redundancy,
         "origin": list(fit.origin),
         "scale": fit.scale,
@@ -260,7 +326,7 @@ def _fit_from_dict(view: str, values: Mapping[str, Any]) -> ViewFit:
         size=tuple(values["size"]),
         affine=np.array(values["affine"]),
         gcps=tuple(gcp(record) for record in values["gcps"]),
-        sigma0=values["sigma0"],
+        sigma0=math.nan if values["sigma0"] is None else values["sigma0"],
         redundancy=values["redundancy"],
         origin=tuple(values["origin"]),
         scale=values["scale"],
@@ -285,6 +351,9 @@ def _view_fit(
     after = system.residuals(parameters)
     one_out = leave_one_out_residuals(system, used)
     cofactors = system.embed @ system.cofactors(used) @ system.embed.T
+    redundancy = 2 * int(used.sum()) - system.design.shape[2]
+    careful, weight = CAREFUL_SIGMA
+    variance = (redundancy * sigma**2 + weight * careful**2) / (redundancy + weight)
     table = []
     for k, i in enumerate(view.index):
         table.append(
@@ -309,10 +378,10 @@ def _view_fit(
         affine=affine,
         gcps=tuple(table),
         sigma0=sigma,
-        redundancy=2 * int(used.sum()) - system.design.shape[2],
+        redundancy=redundancy,
         origin=tuple(system.origin.tolist()),
         scale=system.scale,
-        covariance=sigma**2 * cofactors,
+        covariance=variance * cofactors,
     )
 
 
@@ -469,5 +538,61 @@ def align(
         right_fit=fits[1],
         reference_height=round(float(np.mean([heights[name] for name in sorted(heights)])), 3),
         warnings=tuple(doubts),
+        provenance=dict(provenance),
+    )
+
+
+def from_rpcs(
+    left_image: str | Path,
+    right_image: str | Path,
+    *,
+    model: str = "affine",
+    scene: str = "",
+    provenance: Mapping[str, Any] | None = None,
+) -> Alignment:
+    """The start of a refinement without ground control points: the RPCs as they are.
+
+    Their covariance is that of RPC_SHIFT and RPC_TILT; the reference height is the middle of the
+    RPCs' own heights. Raises InputError for unreadable images.
+    """
+    of = f" (scene {scene})" if scene else ""
+    sensors, fits = [], []
+    for name, image in (("left", Path(left_image)), ("right", Path(right_image))):
+        sensor, size = open_view(name, image, of)
+        scale = max(size) / 2
+        tilt_variance = (RPC_TILT * scale) ** 2
+        fits.append(
+            ViewFit(
+                view=name,
+                image=image.name,
+                size=size,
+                affine=np.array(sensor.affine),
+                gcps=(),
+                sigma0=math.nan,
+                redundancy=0,
+                origin=((size[0] - 1) / 2, (size[1] - 1) / 2),
+                scale=scale,
+                covariance=np.diag([tilt_variance, tilt_variance, RPC_SHIFT**2] * 2),
+            )
+        )
+        sensors.append(sensor)
+    doubt = (
+        f"no ground control points: places on the ground are known to about {RPC_SHIFT:g} px only, "
+        "as the RPCs give them"
+    )
+    log.warning("warning: %s", doubt)
+    if provenance is None:
+        provenance = describe(
+            [left_image, right_image], {"model": model}, source_digest("alignment")
+        )
+    return Alignment(
+        scene=scene,
+        model=model,
+        left=sensors[0],
+        right=sensors[1],
+        left_fit=fits[0],
+        right_fit=fits[1],
+        reference_height=round(float(np.mean([s.rpc.height_off for s in sensors])), 3),
+        warnings=(doubt,),
         provenance=dict(provenance),
     )

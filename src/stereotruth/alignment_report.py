@@ -63,6 +63,9 @@ def _draw(alignment: Alignment, path: Path) -> None:
         side = max(cols, rows)
         for ax, which, word in zip(axes[:, k], ("before", "after"), ("RPC alone", "corrected")):
             used = [g for g in fit.gcps if g.used]
+            if not used:
+                ax.set_title(f"{fit.view}: no ground control points", loc="left", fontsize=10)
+                continue
             at = np.array([g.measured for g in used])
             vector = np.array([getattr(g, which) for g in used])
             longest = max(float(np.hypot(*vector.T).max()), 1e-3)

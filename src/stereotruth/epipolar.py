@@ -278,6 +278,15 @@ class ImageModel:
         map_points(self.packed, inverse, flat[0], flat[1], out)
         return out[0].reshape(pair[0].shape), out[1].reshape(pair[0].shape)
 
+    def slopes(self, col: ArrayLike, row: ArrayLike) -> Floats:
+        """[..., 2, 2]: change of (x, y) with (col, row) at image points; arrays broadcast."""
+        ends = [
+            self.forward(np.add(col, a), np.add(row, b))
+            for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        e = np.stack([np.stack(end, axis=-1) for end in ends])
+        return np.stack([e[0] - e[1], e[2] - e[3]], axis=-1) / 2.0
+
     def shifted(self, x: float, y: float) -> ImageModel:
         """The same model with its origin of (x, y) moved there."""
         affine = np.array(self.affine)

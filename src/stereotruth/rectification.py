@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,9 @@ LATTICE_ERROR = 0.002  # px, accepted error of that
 # Lanczos bends a ramp by 0.015 px, and OpenCV's remap rounds positions to 1/32 px.
 RADIUS = 3  # px, of the interpolation kernel
 ANTIALIAS = 1.2  # source px per epipolar px above which the kernel is widened
+SIGMA_STEP = 512  # px between the nodes of the alignment's uncertainty
 CACHE_MB = 256  # of decoded source; 1024 rows of a scene 34 000 px wide take 70
+LabelSigma = Callable[[EpipolarModel, Any, Any], tuple[Floats, Floats, Floats]]
 KERNEL = "cubic convolution, 6 x 6 taps (Keys 1981, fourth order), widened where downsampling"
 
 
@@ -370,6 +372,21 @@ def rectify_image(
 # --------------------------------------------------------------------------------------- stage
 
 
+def sigma_nodes(model: EpipolarModel, sigma: LabelSigma) -> dict[str, Any]:
+    """Uncertainty of labels by the alignment at nodes of the epipolar grid, JSON-ready.
+
+    ``step_px`` between nodes; ``disparity``, ``x``, ``y`` [row][col] in px, node (0, 0) at the
+    centre of the upper-left pixel, the last ones at or past the grid's end.
+    """
+    rows, cols = (SIGMA_STEP * np.arange(-(-(n - 1) // SIGMA_STEP) + 1) for n in model.shape)
+    values = sigma(model, cols[None, :], rows[:, None])
+    nodes = {}
+    for name, value in zip(("disparity", "x", "y"), values):
+        worst = float(np.nanmax(value)) if np.isfinite(value).any() else 0.0
+        nodes[name] = np.where(np.isfinite(value), value, worst).round(5).tolist()
+    return {"step_px": SIGMA_STEP, **nodes}
+
+
 def rectify(
     left_image: str | Path,
     right_image: str | Path,
@@ -382,13 +399,15 @@ def rectify(
     *,
     workers: int = 1,
     height_range: tuple[float, float] | None = None,
+    label_sigma: LabelSigma | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> EpipolarModel:
     """Fit the epipolar model of an aligned pair and resample both images into Zarr grids.
 
-    Heights are ellipsoidal m; ``height_range`` defaults to the RPCs'. Grids hold ``image`` uint16
-    [y, x], 0 where there is no value; their attributes carry the model and ``provenance``. All
-    three products appear when they are whole, or not at all.
+    Heights are ellipsoidal m; ``height_range`` defaults to the RPCs'. ``label_sigma`` is
+    ``Alignment.label_sigma``, for the attribute ``alignment_sigma`` of the left grid. Grids hold
+    ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model and
+    ``provenance``. All three products appear when they are whole, or not at all.
 
     Raises InputError for images that cannot be read, do not overlap, are one view, or hold nothing
     but nodata.
@@ -419,17 +438,20 @@ def rectify(
                     "nodata": 0,
                 },
             )
+            attrs = {
+                "view": view,
+                "epipolar": model.to_dict(),
+                "provenance": dict(provenance or {}),
+            }
+            if label_sigma is not None and view == "left":
+                attrs["alignment_sigma"] = sigma_nodes(model, label_sigma)
             arrays = create_grid(
                 folder,
                 model.shape,
                 {"image": layer},
                 chunk=CHUNK,
                 shard=SHARD,
-                attrs={
-                    "view": view,
-                    "epipolar": model.to_dict(),
-                    "provenance": dict(provenance or {}),
-                },
+                attrs=attrs,
             )
             facts = rectify_image(
                 source, image, arrays["image"], workers=workers, what=f"{view} epipolar image"

@@ -36,6 +36,12 @@ def read_sheets():
     lidar = {}
     for name, scene in scenes.items():
         sheet = config["scenes"]
+        if not scene.gcps and not config["alignment"]["refine"]:
+            raise InputError(
+                f"scene {name!r} has no GCPs, and alignment.refine is false",
+                file=sheet,
+                remedy="name its file of ground control points, or set alignment.refine to true",
+            )
         if is_synthetic(scene):
             sheets.require_files(scene, sheet, ["gcps"])
             tiles = synthetic_lidar(SYNTHETIC[scene.city], name)
@@ -91,7 +97,8 @@ def right_image(wildcards):
 
 def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
-    return f"results/align/{wildcards.city}/{wildcards.scene}/alignment.json"
+    stage = "refine" if config["alignment"]["refine"] else "align"
+    return f"results/{stage}/{wildcards.city}/{wildcards.scene}/alignment.json"
 
 
 def point_stores(wildcards):

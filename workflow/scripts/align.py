@@ -1,6 +1,6 @@
 """One scene's images to its ground control points."""
 
-from stereotruth.alignment import align
+from stereotruth.alignment import align, from_rpcs
 from stereotruth.alignment_report import write_alignment
 from stereotruth.provenance import describe
 from stereotruth.runlog import job
@@ -9,15 +9,19 @@ if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     model, strict = snakemake.params.model, snakemake.params.strict
     with job(snakemake.log[0], f"align {scene}"):
-        alignment = align(
-            snakemake.input.left[0],
-            snakemake.input.right[0],
-            snakemake.input.gcps,
-            model=model,
-            scene=scene,
-            strict=strict,
-            provenance=describe(snakemake.input, {"model": model}, snakemake.params.code),
-        )
+        images = snakemake.input.left[0], snakemake.input.right[0]
+        provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
+        if snakemake.input.gcps:
+            alignment = align(
+                *images,
+                snakemake.input.gcps,
+                model=model,
+                scene=scene,
+                strict=strict,
+                provenance=provenance,
+            )
+        else:
+            alignment = from_rpcs(*images, model=model, scene=scene, provenance=provenance)
         write_alignment(
             alignment,
             snakemake.output.alignment,

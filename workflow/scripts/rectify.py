@@ -19,5 +19,6 @@ if __name__ == "__main__":
             snakemake.output.left,
             snakemake.output.right,
             workers=snakemake.threads,
+            label_sigma=alignment.label_sigma,
             provenance=describe(snakemake.input, {}, snakemake.params.code),
         )

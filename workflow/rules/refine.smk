@@ -1,0 +1,36 @@
+rule refine:
+    input:
+        left=left_image,
+        right=right_image,
+        alignment=rules.align.output.alignment,
+        points=point_stores,
+    output:
+        alignment="results/refine/{city}/{scene}/alignment.json",
+        observations=report(
+            "results/refine/{city}/{scene}/observations.csv",
+            caption="../report/refinement.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "tie points of the refinement"},
+        ),
+        figure=report(
+            "results/refine/{city}/{scene}/refinement.png",
+            caption="../report/refinement.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "figure of the refinement"},
+        ),
+    log:
+        "logs/refine/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/refine/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=30,
+    params:
+        code=source_digest("refinement_report"),
+    message:
+        "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
+    script:
+        "../scripts/refine.py"
