@@ -12,7 +12,7 @@ import json
 import logging
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +223,7 @@ class Made:
         self.left = Path(f"results/rectify/{place}/left.zarr")
         self.right = Path(f"results/rectify/{place}/right.zarr")
         self.tiles = Path(f"tiles/{scene.city}")
-        self.points = Path(f"results/ingest/{place}")
+        self.points = sorted(Path(f"results/ingest/{place}").glob("*.zarr"))
         self.exact = Path(f"results/accuracy/{place}")
 
     @property
@@ -242,6 +242,19 @@ class Made:
         scene = city.scene(self.scene.scene)
         write_grid_truth(city, scene, folder / "truth.json", folder / "truth.zarr", workers=workers)
         return folder / "truth.zarr"
+
+
+def project_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of project_scene as the workflow would give them."""
+    occlusion, project = config["occlusion"], config["project"]
+    return {
+        "method": occlusion["method"],
+        "window": occlusion["window"],
+        "correlation_threshold": occlusion["correlation_threshold"],
+        "representative": project["representative"],
+        "edge_margin_px": project["edge_margin_px"],
+        "min_points": project["min_points_per_px"],
+    }
 
 
 def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
@@ -272,14 +285,9 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
     project_scene(
         folder / "left.zarr",
         folder / "right.zarr",
-        sorted(made.points.glob("*.zarr")),
+        made.points,
         folder / "disparity.zarr",
-        method=config["occlusion"]["method"],
-        window=config["occlusion"]["window"],
-        correlation_threshold=config["occlusion"]["correlation_threshold"],
-        representative=config["project"]["representative"],
-        edge_margin_px=config["project"]["edge_margin_px"],
-        min_points=config["project"]["min_points_per_px"],
+        **project_settings(config),
         workers=workers,
     )
     return folder / "disparity.zarr"
@@ -301,22 +309,32 @@ def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
     return found
 
 
-def run(arguments: argparse.Namespace) -> dict[str, Any]:
+def read_config(files: Sequence[Path]) -> dict[str, Any]:
+    """The project's configuration with the keys of other files in place of its own."""
     config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
-    for file in arguments.configfile:
+    for file in files:
         overridden(config, yaml.safe_load(file.read_text(encoding="utf-8")) or {})
+    return config
+
+
+def scenes_made(config: Mapping[str, Any], only: Sequence[str] | None) -> list[Made]:
+    """The scenes of the sheet, of these cities or of all, that the workflow has made."""
     cities = sheets.read_cities(config["cities"], SCHEMAS)
     scenes = sheets.read_scenes(config["scenes"], cities, SCHEMAS)
-    wanted: Iterable[Made] = [
-        Made(s) for s in scenes.values() if not arguments.city or s.city in arguments.city
-    ]
-    present = [made for made in wanted if made.disparity.is_dir()]
-    for made in wanted:
-        if made not in present:
+    present = []
+    for made in (Made(s) for s in scenes.values() if not only or s.city in only):
+        if made.disparity.is_dir():
+            present.append(made)
+        else:
             print(f"{made.scene.scene}: not made yet ({made.disparity} is missing)")
+    return present
+
+
+def run(arguments: argparse.Namespace) -> dict[str, Any]:
+    config = read_config(arguments.configfile)
     report: dict[str, Any] = {"truth": [], "exact": [], "geometry": [], "points": [], "warping": []}
     by_city: dict[str, truth.SceneComparison] = {}
-    for made in present:
+    for made in scenes_made(config, arguments.city):
         name = made.scene.scene
         if made.has_truth:
             raw = made.input / "truth.zarr"

@@ -31,6 +31,7 @@ log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
 
 BLOCK = 1024  # px
 # Classes of pixels: the truth's surfaces by number, and what lies beside height edges.
@@ -94,6 +95,21 @@ class Truth:
             *(store[name][rows, cols] for name in flags),
             kind=kind,
         )
+
+    def groups(self) -> dict[str, Bools]:
+        """Masks [h, w] of the pixels of GROUPS, see MEANING; ``visible`` has water, too."""
+        steady = (self.covered == 1) & (self.changed == UNCHANGED)
+        seen, hidden = steady & (self.visible == 1), steady & (self.hidden == 1)
+        shown = (self.covered == 1) & (self.kind > 0)
+        masks = (
+            seen,
+            hidden,
+            shown & (self.changed == IN_LIDAR_ONLY),
+            shown & (self.changed == IN_IMAGES_ONLY),
+            seen & (self.changed_right == 1),
+            hidden & (self.changed_right == 1),
+        )
+        return dict(zip(GROUPS, masks))
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,21 +273,12 @@ def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> z
 def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     """Labels against the truth of the same window; ``statuses``: names by value."""
     labelled = np.isfinite(labels.disparity)
-    steady = (truth.covered == 1) & (truth.changed == UNCHANGED)
-    seen, hidden = steady & (truth.visible == 1), steady & (truth.hidden == 1)
-    shown = (truth.covered == 1) & (truth.kind > 0)
-    groups = (
-        seen,
-        hidden,
-        shown & (truth.changed == IN_LIDAR_ONLY),
-        shown & (truth.changed == IN_IMAGES_ONLY),
-        seen & (truth.changed_right == 1),
-        hidden & (truth.changed_right == 1),
-    )
+    groups = truth.groups()
+    seen = groups["visible"]
     size = len(statuses)
     index = truth.kind.astype(np.intp) * size + labels.status
     counts = np.stack(
-        [np.bincount(index[group], minlength=size * len(CLASSES)) for group in groups]
+        [np.bincount(index[group], minlength=size * len(CLASSES)) for group in groups.values()]
     ).reshape(len(GROUPS), len(CLASSES), size)
     good = seen & labelled
     stated = good & np.isfinite(labels.uncertainty)
@@ -288,7 +295,7 @@ def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     return result
 
 
-def _tile_rows(tiles: Path, scene: str) -> list[dict[str, str]]:
+def labelled_tiles(tiles: Path, scene: str) -> list[dict[str, str]]:
     """Manifest rows of a scene's labelled tiles."""
     manifest = tiles / "manifest.csv"
     try:
@@ -310,11 +317,12 @@ def read_tile_labels(tiles: Path, row: Mapping[str, str], store: zarr.Group) -> 
     return Labels(
         read_tile(tiles / row["disp"]) + float(row["right_offset_px"]),
         np.nan_to_num(read_tile(tiles / row["status"])).astype(np.uint8),
-        store["uncertainty"][_window(row)].astype(np.float64),
+        store["uncertainty"][window_of(row)].astype(np.float64),
     )
 
 
-def _window(row: Mapping[str, str]) -> tuple[slice, slice]:
+def window_of(row: Mapping[str, str]) -> tuple[slice, slice]:
+    """Window [rows, cols] of a tile in its scene's grid; ``row`` is its line of the manifest."""
     r, c, size = int(row["row0"]), int(row["col0"]), int(row["size"])
     return slice(r, r + size), slice(c, c + size)
 
@@ -352,10 +360,10 @@ def compare_scene(
         folder = Path(tiles)
 
         def tile(row: Mapping[str, str]) -> ByClass:
-            here = Truth.read(true, *_window(row))
+            here = Truth.read(true, *window_of(row))
             return compare(read_tile_labels(folder, row, store), here, statuses)
 
-        rows = _tile_rows(folder, scene)
+        rows = labelled_tiles(folder, scene)
         done = _mapped(tile, rows, workers, f"{scene}: tiles compared")
         for row, part in zip(rows, done):
             result.tiles[row["tile"]] = part.total
