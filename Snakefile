@@ -17,6 +17,7 @@ include: "workflow/rules/rectify.smk"
 include: "workflow/rules/project.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/evaluate.smk"
+include: "workflow/rules/report.smk"
 
 
 rule all:

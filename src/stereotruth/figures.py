@@ -103,7 +103,8 @@ def coverage_figure(
     shape, px of the epipolar grid per px of the picture). ``tiles``: (scene, row0, col0, size in
     px of the epipolar grid, split, complete).
     """
-    figure = Figure(figsize=(7.0 * len(scenes), 7.4), layout="constrained")
+    tallest = max(grey.shape[0] / grey.shape[1] for _, grey, _, _ in scenes)
+    figure = Figure(figsize=(7.0 * len(scenes), 6.2 * tallest + 1.4), layout="constrained")
     axes = figure.subplots(1, len(scenes), squeeze=False)[0]
     for axis, (scene, grey, labelled, scale) in zip(axes, scenes):
         picture = np.repeat(grey[..., None], 3, axis=2)

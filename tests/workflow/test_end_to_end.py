@@ -14,70 +14,11 @@ import pytest
 import rasterio
 import rioxarray
 
-from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
-
-from .conftest import Project, copy_project
+from .conftest import SIZE, TINY, Project, copy_project, row_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
-TINY = CitySpec(
-    name="Tiny",
-    lon=114.3,
-    lat=30.6,
-    epsg=32650,
-    base_height_m=20.0,
-    world_seed=7,
-    character=Character(
-        relief_m=8,
-        valley=0.2,
-        wavelength_m=900,
-        max_slope_deg=10,
-        river_m=0,
-        lakes=0,
-        zones={"slabs": 3, "lowrise": 2, "park": 1},
-        towers_m=(30, 40),
-        trees=0.4,
-        zone_m=150.0,
-    ),
-    scenes=(
-        SceneSpec("Tiny-1", (0.0, 0.0), 560, 560, 5, lidar_grid=(2, 1), ragged_m=(20.0, 20.0)),
-    ),
-)
-SIZE = {"tiles": {"size": 128, "min_labelled": 0.5}}
 STAGES = {"align", "rectify", "project", "export"}
-
-
-@pytest.fixture(scope="session")
-def data(tmp_path_factory) -> Path:
-    """The city's files: left.tif, right.tif, lidar/, gcps.csv, truth.zarr."""
-    folder = tmp_path_factory.mktemp("data") / "Tiny-1"
-    make_scene(TINY, TINY.scenes[0], folder, spacing_m=0.4, seed=1)
-    return folder
-
-
-def row_of(folder: Path, **changes: str) -> dict[str, str]:
-    return {
-        "scene": "Tiny-1",
-        "city": "Tiny",
-        "left_image": str(folder / "left.tif"),
-        "right_image": str(folder / "right.tif"),
-        "lidar": str(folder / "lidar"),
-        "gcps": str(folder / "gcps.csv"),
-        **changes,
-    }
-
-
-@pytest.fixture(scope="session")
-def made(data, tmp_path_factory) -> Project:
-    """A project in which tiles/Tiny has been made, by two cores; config in tiny.yaml."""
-    project = copy_project(tmp_path_factory.mktemp("made") / "project")
-    shutil.copytree(data, project.folder / "in")
-    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
-    run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    assert "Look at tiles/Tiny/manifest.csv" in run.text
-    return project
 
 
 def plan(project: Project, *arguments: str) -> dict[str, int]:

@@ -8,7 +8,7 @@ from snakemake.exceptions import WorkflowError
 
 from stereotruth import sheets
 from stereotruth.errors import InputError
-from stereotruth.provenance import source_digest
+from stereotruth.provenance import PACKAGE, file_sha256, source_digest
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
 SCHEMAS = Path(workflow.basedir) / "workflow" / "schemas"
@@ -99,6 +99,17 @@ def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
     stage = "refine" if config["alignment"]["refine"] else "align"
     return f"results/{stage}/{wildcards.city}/{wildcards.scene}/alignment.json"
+
+
+def refinements(wildcards):
+    """The alignments that a city's labels are made with, where they are not those of rule align."""
+    files = [alignment_of(scene) for scene in scenes_of(wildcards.city)]
+    return [file for file in files if not file.startswith("results/align/")]
+
+
+def truth_of_city(city, kind):
+    """The city's figures against the exact truth (json, csv), if it has synthetic scenes."""
+    return [f"results/evaluate/{city}/truth.{kind}"] if synthetic_scenes(city) else []
 
 
 def point_stores(wildcards):

@@ -1,0 +1,42 @@
+rule report_city:
+    input:
+        tiles="tiles/{city}",
+        coverage="results/export/{city}/coverage.png",
+        alignments=lambda w: [
+            f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
+        ],
+        refinements=refinements,
+        truth=lambda w: truth_of_city(w.city, "json"),
+        truth_table=lambda w: truth_of_city(w.city, "csv"),
+    output:
+        report(
+            "results/report/{city}/index.html",
+            caption="../report/page.rst",
+            category="Pages",
+            labels={"city": "{city}"},
+        ),
+    log:
+        "logs/report_city/{city}.log",
+    benchmark:
+        "benchmarks/report_city/{city}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        sliders=config["report"]["sliders"],
+        code=source_digest("report.page"),
+        template=file_sha256(PACKAGE / "report" / "page.html.jinja"),
+    message:
+        "Writing the page of {wildcards.city}"
+    script:
+        "../scripts/report_city.py"
+
+
+rule report:
+    input:
+        expand("results/report/{city}/index.html", city=CITIES),
+    message:
+        "Pages of all cities"

@@ -1,0 +1,28 @@
+"""One city's page."""
+
+from pathlib import Path
+
+from stereotruth.report.page import write_report
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    city, given = snakemake.wildcards.city, snakemake.input
+
+    def by_scene(files):
+        """Files results/<stage>/<city>/<scene>/<file> by scene."""
+        return {Path(file).parent.name: file for file in files}
+
+    with job(snakemake.log[0], f"report {city}"):
+        write_report(
+            city,
+            given.tiles,
+            snakemake.output[0],
+            coverage=given.coverage,
+            alignments=by_scene(given.alignments),
+            refinements=by_scene(given.refinements),
+            truth=given.truth[0] if given.truth else None,
+            truth_table=given.truth_table[0] if given.truth_table else None,
+            sliders=snakemake.params.sliders,
+            workers=snakemake.threads,
+            code=snakemake.params.code,
+        )
