@@ -25,6 +25,12 @@ def test_all_cities_and_the_dataset_are_planned(project):
     assert project.plan("dataset")["dataset"] == 1
 
 
+def test_exact_truth_is_planned_by_scene_and_by_city(project):
+    jobs = project.plan("evaluate")
+    assert jobs["grid_truth"] == jobs["evaluate_truth"] == 7
+    assert jobs["evaluate_truth_city"] == 6
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
