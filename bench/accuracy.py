@@ -39,6 +39,7 @@ GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to
     ("|error| < uncertainty %", "below_1", 63.0, 73.0, 100),
     ("< 2 uncertainties %", "below_2", 92.0, 98.0, 100),
     ("in LiDAR only labelled %", "in_lidar_only", None, 5.0, 100),
+    ("SIFT mean abs px, building", "sift_building", None, 0.32, 1),
 )
 
 
@@ -199,6 +200,15 @@ def calibration_rows(comparisons: Mapping[str, truth.ByClass]) -> list[dict[str,
     return rows
 
 
+def table4(city: str) -> list[dict[str, str]]:
+    """Rows of the city's table 4, as ``snakemake evaluate`` wrote them; none if it did not."""
+    file = Path(f"results/evaluate/{city}/table4.csv")
+    if not file.is_file():
+        return []
+    with file.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
 def geometry_row(scene: str, gcps: str, model: EpipolarModel, store: Path) -> dict[str, str]:
     disparity, parallax = (e.figures() for e in truth.geometry_errors(model, store))
     return {
@@ -334,8 +344,10 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
     config = read_config(arguments.configfile)
     report: dict[str, Any] = {"truth": [], "exact": [], "geometry": [], "points": [], "warping": []}
     by_city: dict[str, truth.SceneComparison] = {}
+    cities = []
     for made in scenes_made(config, arguments.city):
         name = made.scene.scene
+        cities.append(made.scene.city)
         if made.has_truth:
             raw = made.input / "truth.zarr"
             tiles = made.tiles if (made.tiles / "manifest.csv").is_file() else None
@@ -373,6 +385,13 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
     parts = {c: r.all_tiles if r.tiles else r.whole for c, r in by_city.items()}
     report["cities"] = [truth_row(city, part.total) for city, part in parts.items()]
+    report["table4"] = [row for city in dict.fromkeys(cities) for row in table4(city)]
+    absolute = {
+        row["city"]: row["mean_of_mean_absolute_disparity_errors_px"] for row in report["table4"]
+    }
+    for row in report["cities"]:
+        value = absolute.get(f"{row['scope']} (building)")
+        row["sift_building"] = float(value) if value else None
     report["goals"] = goal_rows(report["cities"])
     report["status"] = status_rows(parts)
     report["calibration"] = calibration_rows(parts)
@@ -417,6 +436,7 @@ def show(report: Mapping[str, Any]) -> None:
             }
         )
     print_table("Left and warped right image, labelled pixels", warped)
+    print_table("SIFT matches (table 4; by snakemake evaluate)", report["table4"])
     print_table("What is asked for, tiles by city", report["goals"])
 
 
