@@ -16,6 +16,7 @@ include: "workflow/rules/refine.smk"
 include: "workflow/rules/rectify.smk"
 include: "workflow/rules/project.smk"
 include: "workflow/rules/export.smk"
+include: "workflow/rules/evaluate_images.smk"
 include: "workflow/rules/evaluate.smk"
 include: "workflow/rules/report.smk"
 

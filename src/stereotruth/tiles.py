@@ -11,6 +11,9 @@ Rules for a pair, at its window of the scene's grid:
 - labelled: a share of at least ``min_labelled`` of its pixels has a disparity. Other pairs with
   complete images go under ``unlabelled/``.
 
+Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
+gates of :mod:`gates`, which flag tiles and scenes in the manifest and the summary.
+
 The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
 tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
 """
@@ -18,13 +21,16 @@ tile) is that which gives most labelled pairs, then most pairs, then most labell
 from __future__ import annotations
 
 import csv
+import json
 import logging
 import math
+import os
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +43,12 @@ from rasterio.errors import NotGeoreferencedWarning
 from . import figures
 from .epipolar import EpipolarModel
 from .errors import InputError
-from .grid_store import require_complete
+from .evaluation.classes import tile_class
+from .evaluation.sift import MATCH_COLUMNS, TileMatches, match_rows, match_tile
+from .evaluation.statistics import ErrorSum
+from .evaluation.warping import CorrelationSum, agreement, warp_rows
+from .gates import NO_LIMITS, Limits, flag, missed
+from .grid_store import replacing, require_complete
 from .orientation import orientation, save, sensor_record
 from .provenance import describe, digest, file_sha256
 from .runlog import progress
@@ -78,6 +89,8 @@ class _Source:
     disparity: zarr.Array
     status: zarr.Array
     height: zarr.Array
+    surface_class: zarr.Array | None
+    gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
     flags: Mapping[int, str]
@@ -154,11 +167,20 @@ def _open(item: Scene) -> _Source:
         disparity=disparity["disparity"],
         status=status,
         height=disparity["height"],
+        surface_class=disparity.get("surface_class"),
+        gcp_rms=None if item.alignment is None else _gcp_rms(item.alignment),
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
         flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
         inputs=inputs,
     )
+
+
+def _gcp_rms(alignment: Path) -> float | None:
+    """The larger of both views' residuals of the GCPs, px of the images; None without GCPs."""
+    record = json.loads(Path(alignment).read_text(encoding="utf-8"))
+    found = [record[view]["rms"]["after"] for view in ("left", "right")]
+    return max((value for value in found if value is not None), default=None)
 
 
 def _cell_step(size: int, stride: int) -> int:
@@ -280,6 +302,80 @@ def _choose(
     return windows, (phase[0] * step, phase[1] * step), outcome
 
 
+# ------------------------------------------------------------------------------------ checks
+
+
+@dataclass(frozen=True, eq=False)
+class _Checks:
+    """What its images say about a labelled tile: class, SIFT matches, sums of image warping."""
+
+    kind: str
+    matches: TileMatches
+    warping: CorrelationSum
+
+    def figures(self) -> dict[str, float | int | None]:
+        """By names of the manifest."""
+        return self.matches.figures() | {"warp_correlation": _finite(self.warping.coefficient)}
+
+
+@dataclass
+class _SceneChecks:
+    """The same of all labelled tiles of a scene."""
+
+    gcp_rms: float | None = None
+    errors: ErrorSum = field(default_factory=ErrorSum)
+    parallax: ErrorSum = field(default_factory=ErrorSum)
+    warping: CorrelationSum = field(default_factory=CorrelationSum)
+
+    def add(self, checks: _Checks) -> None:
+        """Add those of a tile."""
+        self.errors.add(checks.matches.row_errors)
+        self.parallax.add(checks.matches.agreeing_parallax)
+        self.warping.merge(checks.warping)
+
+    def figures(self) -> dict[str, float | int | None]:
+        """By names of the manifest, over all matches and all labelled pixels of the tiles."""
+        errors, parallax = self.errors.figures(), self.parallax.figures()
+        return {
+            "gcp_rms_px": self.gcp_rms,
+            "sift_matches": errors["count"],
+            "sift_mean_error_px": errors["bias"],
+            "sift_mean_absolute_error_px": errors["mean_absolute"],
+            "sift_median_error_px": errors["median"],
+            "y_parallax_median_px": parallax["median"],
+            "y_parallax_rms_px": parallax["rms"],
+            "warp_correlation": _finite(self.warping.coefficient),
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+CHECK_COLUMNS = (
+    "sift_matches",
+    "sift_mean_error_px",
+    "sift_mean_absolute_error_px",
+    "sift_median_error_px",
+    "sift_gross_share",
+    "y_parallax_median_px",
+    "y_parallax_rms_px",
+    "warp_correlation",
+)
+
+
+def _check_cells(checks: _Checks | None, limits: Limits) -> dict[str, Any]:
+    """Cells of the manifest; empty for pairs without complete labels."""
+    if checks is None:
+        return dict.fromkeys(("class", *CHECK_COLUMNS, "quality"), "")
+    figures = checks.figures()
+    cells = {
+        name: "" if (v := figures[name]) is None else v if isinstance(v, int) else f"{v:.4f}"
+        for name in CHECK_COLUMNS
+    }
+    return {"class": checks.kind, **cells, "quality": flag(missed(figures, limits))}
+
+
 # ---------------------------------------------------------------------------------- one tile
 
 
@@ -334,9 +430,11 @@ def _write_tile(
     size: int,
     dtype: str,
     nodata: float,
+    building_share: float,
+    limits: Limits,
     provenance: Mapping[str, Any],
-) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """Write one tile's files; its manifest row (without split) and ring on the ground."""
+) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
+    """Write one tile's files; its manifest row (without split), ring on the ground, and checks."""
     rows = slice(window.row0, window.row0 + size)
     here = (rows, slice(window.col0, window.col0 + size))
     start = window.col0 - window.offset
@@ -354,7 +452,9 @@ def _write_tile(
     }
     write_tiff(folder / files["left"], left, nodata=0)
     write_tiff(folder / files["right"], right, nodata=0)
+    checks = None
     if window.labelled:
+        checks = _check(source, here, left, right, height, known, stored, building_share)
         files["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
         files["status"] = f"status/{prefix}_status_{number}.tiff"
         if (stored[known] == nodata).any():
@@ -411,13 +511,38 @@ def _write_tile(
         "disparity_nodata": f"{nodata:g}",
         "lon": f"{lon:.7f}",
         "lat": f"{lat:.7f}",
+        **_check_cells(checks, limits),
     }
     for value, meaning in source.flags.items():
         row[f"count_{meaning}"] = int((status == value).sum())
     for kind in FILES:
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = file_sha256(folder / files[kind]) if kind in files else ""
-    return row, ring
+    return row, ring, checks
+
+
+def _check(
+    source: _Source,
+    here: tuple[slice, slice],
+    left: NDArray[np.uint16],
+    right: NDArray[np.uint16],
+    height: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    stored: NDArray[np.float32],
+    building_share: float,
+) -> _Checks:
+    """Hold the labels of a tile, as stored, against its images."""
+    disparity = np.where(known, stored.astype(np.float64), np.nan)
+    if source.surface_class is None:
+        surface_class = np.zeros(left.shape, np.uint8)
+    else:
+        surface_class = np.asarray(source.surface_class[here])
+    x = np.arange(left.shape[1])[None, :] - disparity
+    return _Checks(
+        kind=tile_class(surface_class, height.astype(np.float64), building_share),
+        matches=match_tile(left, right, disparity, surface_class),
+        warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
+    )
 
 
 def write_manifest(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -462,21 +587,26 @@ def export_city(
     testing: int = 0,
     seed: int = 0,
     strict: bool = False,
+    quality: Limits = NO_LIMITS,
+    building_share: float = 0.02,
     code: str = "",
     workers: int = 1,
     coverage: str | Path | None = None,
     contact_sheet: str | Path | None = None,
+    matches: str | Path | None = None,
 ) -> dict[str, Any]:
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
     alignment.json (for the record). ``stride`` defaults to ``size``, px. ``training``,
     ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there
-    are. ``coverage`` and ``contact_sheet`` are PNG files to write. Returns a summary, see
-    :func:`summary_lines`.
+    are. ``quality``: the limits beyond which tiles and scenes are flagged. ``building_share``:
+    share of building pixels from which on a tile is of that class. ``coverage`` and
+    ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT matches. Returns
+    a summary, see :func:`summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
-    ``strict`` and the splits' counts cannot be met.
+    ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
     """
     out, stride = Path(out_dir), stride or size
     half = disparity_dtype == "float16"
@@ -507,6 +637,8 @@ def export_city(
         "nodata": nodata,
         "split_counts": {"train": training, "val": validation, "test": testing},
         "seed": seed,
+        "quality": asdict(quality),
+        "building_share": building_share,
     }
     inputs = {name: value for source in sources for name, value in source.inputs.items()}
     provenance = describe(inputs, parameters, code)
@@ -520,7 +652,7 @@ def export_city(
         for kind in kinds:
             (scratch / kind).mkdir(parents=True)
 
-        def work(k: int) -> tuple[dict[str, Any], NDArray[np.float64]]:
+        def work(k: int) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
             return _write_tile(
                 scratch,
                 *chosen[k],
@@ -530,16 +662,35 @@ def export_city(
                 size=size,
                 dtype=disparity_dtype,
                 nodata=nodata,
+                building_share=building_share,
+                limits=quality,
                 provenance=provenance,
             )
 
-        with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
+        written, scene_checks = [], {s.scene: _SceneChecks(s.gcp_rms) for s in sources}
+        sink = nullcontext(Path(os.devnull)) if matches is None else replacing(matches)
+        with (
+            warnings.catch_warnings(),
+            sink as matches_file,
+            matches_file.open("w", newline="", encoding="utf-8") as stream,
+            ThreadPoolExecutor(workers) as pool,
+        ):
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            writer = csv.DictWriter(stream, MATCH_COLUMNS, lineterminator="\n")
+            writer.writeheader()
             numbers = range(len(chosen))
-            written = list(progress(pool.map(work, numbers), len(chosen), f"{city}: tiles"))
+            done = progress(pool.map(work, numbers), len(chosen), f"{city}: tiles")
+            for row, ring, checks in done:
+                written.append((row, ring))
+                if checks is not None:
+                    head = {key: row[key] for key in ("city", "scene", "tile", "class")}
+                    writer.writerows(match_rows(head, checks.matches))
+                    scene_checks[row["scene"]].add(checks)
         rows = [row for row, _ in written]
         splits = _split(written, parameters["split_counts"], seed, strict, city)
+        gates = _gates(city, rows, scene_checks, quality, strict)
         summary = _summary(city, rows, splits, phases, outcomes, parameters, half)
+        summary["quality"] = gates
         write_manifest(scratch / "manifest.csv", rows)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
@@ -584,6 +735,43 @@ def _split(
             raise InputError(problem, remedy="a tiles.stride of tiles.size, or strict: false")
         log.warning("%s", problem)
     return {"wanted": wanted, "realised": realised}
+
+
+def _gates(
+    city: str,
+    rows: Sequence[Mapping[str, Any]],
+    scenes: Mapping[str, _SceneChecks],
+    limits: Limits,
+    strict: bool,
+) -> dict[str, Any]:
+    """Figures and missed gates of scenes, flagged tiles; logs each miss, or ends a strict run."""
+    found, problems = {}, []
+    for scene, checks in scenes.items():
+        figures = checks.figures()
+        misses = missed(figures, limits)
+        found[scene] = figures | {"quality": flag(misses)}
+        problems += [f"scene {scene}: {miss}" for miss in misses]
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    for row in labelled:
+        figures = {name: float(row[name]) for name in CHECK_COLUMNS if row[name] != ""}
+        problems += [
+            f"tile {row['tile']} of scene {row['scene']}: {miss}"
+            for miss in missed(figures, limits)
+        ]
+    if problems and strict:
+        more = f"; and {len(problems) - 5} more" if len(problems) > 5 else ""
+        raise InputError(
+            f"{city}: beyond the limits of quality: {'; '.join(problems[:5])}{more}",
+            remedy="better control points, images or LiDAR for what is named, another limit "
+            "(null: none) in quality of the configuration, or strict: false to have it flagged",
+        )
+    for problem in problems:
+        log.warning("%s: %s", city, problem)
+    return {
+        "limits": asdict(limits),
+        "scenes": found,
+        "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
+    }
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -645,8 +833,30 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
         f"{summary['unlabelled_pairs']} pairs without complete labels",
         f"{100 * labelled:.1f} % of their pixels labelled, disparities {low:.1f} … {high:.1f} px, "
         f"rounded by at most {summary['disparity_rounding']['largest_px']:.4f} px",
+        *(_quality_line(scene, found) for scene, found in summary["quality"]["scenes"].items()),
     ]
+    flagged = summary["quality"]["flagged_tiles"]
+    if flagged:
+        some = ", ".join(f"{tile} ({gates})" for tile, gates in list(flagged.items())[:5])
+        more = f" and {len(flagged) - 5} more" if len(flagged) > 5 else ""
+        lines.append(f"Beyond the limits of quality: {some}{more}")
+    else:
+        lines.append("All labelled pairs are within the limits of quality")
     return [*lines, f"Look at {out_dir}/manifest.csv, {out_dir}/left, right, disp, status"]
+
+
+def _quality_line(scene: str, found: Mapping[str, Any]) -> str:
+    def px(name: str, sign: str = "") -> str:
+        return "–" if found[name] is None else f"{found[name]:{sign}.2f} px"
+
+    warp = found["warp_correlation"]
+    return (
+        f"{scene}: {found['sift_matches']} SIFT matches, error {px('sift_mean_error_px', '+')} "
+        f"mean, {px('sift_mean_absolute_error_px')} mean absolute; y-parallax "
+        f"{px('y_parallax_median_px', '+')} median; correlation with the warped right image "
+        f"{'–' if warp is None else f'{warp:.3f}'}"
+        + ("" if found["quality"] == "ok" else f"; beyond the limits: {found['quality']}")
+    )
 
 
 # -------------------------------------------------------------------------------- quick looks

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import struct
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -74,19 +75,30 @@ def surface(sensor: SensorModel, col: np.ndarray, row: np.ndarray) -> tuple[np.n
     return lon, lat, height
 
 
-def make_scene(folder: Path, *, bare_from: int = 10**6, turn: float = 0.02) -> Scene:
-    """Stores of one scene; labels end at epipolar row ``bare_from``."""
+def make_scene(
+    folder: Path,
+    *,
+    bare_from: int = 10**6,
+    turn: float = 0.02,
+    texture: Callable[[np.ndarray, np.ndarray], np.ndarray] = texture,
+    label_offset: float = 0.0,
+    row_shift: float = 0.0,
+) -> Scene:
+    """Stores of one scene; labels end at epipolar row ``bare_from``.
+
+    Planted errors: of the labels (px), and of the right image's rows (px, down).
+    """
     left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
     model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
     y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
     attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
     layers = {"image": Layer("uint16", 0, {"units": "1", "long_name": "grey value"})}
     frames = []
-    for name, to_sensor, sensor in (
-        ("left", model.epipolar_to_left, left),
-        ("right", model.epipolar_to_right, right),
+    for name, to_sensor, sensor, shift in (
+        ("left", model.epipolar_to_left, left, 0.0),
+        ("right", model.epipolar_to_right, right, row_shift),
     ):
-        col, row = to_sensor(x, y)
+        col, row = to_sensor(x, y - shift)
         lon, lat, height = surface(sensor, col, row)
         inside = (abs(col - PIXELS / 2) < PIXELS / 2) & (abs(row - PIXELS / 2) < PIXELS / 2)
         grey = np.where(inside, np.rint(texture(lon, lat)), 0).astype(np.uint16)
@@ -117,7 +129,7 @@ def make_scene(folder: Path, *, bare_from: int = 10**6, turn: float = 0.02) -> S
             shard=128,
             attrs=attrs,
         )
-        arrays["disparity"][:] = np.where(known, disparity, np.nan)
+        arrays["disparity"][:] = np.where(known, disparity + label_offset, np.nan)
         arrays["height"][:] = np.where(known, height, np.nan)
         arrays["status"][:] = np.where(known, 1, np.where(inside & (y < bare_from), 4, 0))
     stores = (folder / f"{name}.zarr" for name in ("scene", "left", "right"))
@@ -176,7 +188,9 @@ def test_folder_is_as_the_contract_says(exported: tuple[Path, dict]) -> None:
         share = float(row["labelled_share"])
         assert (share >= 0.6) == complete
         assert int(row["count_labelled"]) == round(share * SIZE**2)
+        assert (row["quality"] == "ok") == (row["warp_correlation"] != "") == complete
         if complete:
+            assert float(row["warp_correlation"]) > 0.999
             disparity = labels(folder / row["disp"])
             assert np.isfinite(disparity).mean() == pytest.approx(share, abs=1e-6)
             assert float(row["disparity_mean_px"]) == pytest.approx(np.nanmean(disparity), abs=1e-3)

@@ -9,6 +9,7 @@ rule export:
     output:
         tiles=directory("tiles/{city}"),
         summary="results/export/{city}/summary.json",
+        matches="results/export/{city}/matches.csv",
         coverage=report(
             "results/export/{city}/coverage.png",
             caption="../report/coverage.rst",
@@ -37,6 +38,8 @@ rule export:
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         city=lambda w: CITIES[w.city].__dict__,
         tiles=config["tiles"],
+        quality=config["quality"],
+        evaluation=config["evaluation"],
         seed=config["seed"],
         strict=config["strict"],
         code=source_digest("tiles"),

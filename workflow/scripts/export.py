@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from stereotruth.gates import Limits
 from stereotruth.runlog import job
 from stereotruth.tiles import Scene, export_city, summary_lines
 
@@ -25,10 +26,13 @@ if __name__ == "__main__":
             **tiles,
             seed=snakemake.params.seed,
             strict=snakemake.params.strict,
+            quality=Limits(**snakemake.params.quality),
+            **snakemake.params.evaluation,
             code=snakemake.params.code,
             workers=snakemake.threads,
             coverage=snakemake.output.coverage,
             contact_sheet=snakemake.output.contact_sheet,
+            matches=snakemake.output.matches,
         )
         summary["lines"] = summary_lines(summary, snakemake.output.tiles)
         Path(snakemake.output.summary).write_text(json.dumps(summary, indent=2) + "\n")

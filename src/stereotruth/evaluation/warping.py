@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,11 @@ class CorrelationSum:
         self.aa += float((a * a).sum())
         self.bb += float((b * b).sum())
         self.ab += float((a * b).sum())
+
+    def merge(self, other: CorrelationSum) -> None:
+        """Add the sums of other pixels."""
+        for name in ("count", "a", "b", "aa", "bb", "ab"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
     @property
     def coefficient(self) -> float:
@@ -107,10 +112,33 @@ def warp_window(right: Any, disparity: Floats, rows: slice, cols: slice) -> Floa
     return warp_rows(part, x - first)
 
 
-def evaluate_warping(left: str | Path, right: str | Path, disparity: str | Path) -> dict[str, Any]:
-    """Correlation of left and warped right image over the labelled pixels of a scene.
+def agreement(left: Floats, warped: Floats) -> CorrelationSum:
+    """Sums over the pixels that both images show: left (0 is nodata), warped (NaN: none)."""
+    total = CorrelationSum()
+    good = np.isfinite(warped) & (left != 0)
+    total.add(left[good], warped[good])
+    return total
 
-    Takes left.zarr, right.zarr and disparity.zarr. Raises InputError for unfinished stores.
+
+@dataclass
+class SceneWarping:
+    """Sums of left and warped right image, and counts of pixels: labelled, in the left image."""
+
+    sums: CorrelationSum = field(default_factory=CorrelationSum)
+    labelled: int = 0
+    imaged: int = 0
+
+    def merge(self, other: SceneWarping) -> None:
+        """Add those of other pixels."""
+        self.sums.merge(other.sums)
+        self.labelled += other.labelled
+        self.imaged += other.imaged
+
+
+def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> SceneWarping:
+    """Warp a scene, given as left.zarr, right.zarr and disparity.zarr, block by block.
+
+    Raises InputError for unfinished stores.
     """
     left_image, right_image = (require_complete(path)["image"] for path in (left, right))
     labels = require_complete(disparity)["disparity"]
@@ -118,13 +146,24 @@ def evaluate_warping(left: str | Path, right: str | Path, disparity: str | Path)
         raise InputError(
             "images and disparity differ in size", file=disparity, remedy="run project again"
         )
-    total = CorrelationSum()
+    total = SceneWarping()
     for rows, cols in blocks(labels.shape, BLOCK):
         values = labels[rows, cols].astype(np.float64)
         warped = warp_window(right_image, values, rows, cols)
         reference = left_image[rows, cols].astype(np.float64)
-        good = np.isfinite(warped) & (reference != 0)
-        total.add(reference[good], warped[good])
+        labelled = int(np.isfinite(values).sum())
+        total.merge(
+            SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
+        )
+    return total
+
+
+def evaluate_warping(left: str | Path, right: str | Path, disparity: str | Path) -> dict[str, Any]:
+    """Correlation of left and warped right image over the labelled pixels of a scene.
+
+    Takes and raises what :func:`warp_scene` does.
+    """
+    total = warp_scene(left, right, disparity).sums
     return {"pixels": total.count, "correlation": round(total.coefficient, 6)}
 
 
@@ -140,10 +179,7 @@ class WarpedTile:
     @property
     def sums(self) -> CorrelationSum:
         """Of left and warped right image over the labelled pixels."""
-        total = CorrelationSum()
-        good = np.isfinite(self.warped) & (self.left != 0)
-        total.add(self.left[good], self.warped[good])
-        return total
+        return agreement(self.left, self.warped)
 
     @property
     def correlation(self) -> float:

@@ -1,0 +1,21 @@
+"""One city's labels against its images: SIFT matches (table 4) and image warping."""
+
+from stereotruth.evaluation.images import evaluate_city
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    city, given = snakemake.wildcards.city, snakemake.input
+    stores = zip(given.left, given.right, given.disparity)
+    with job(snakemake.log[0], f"evaluate {city}") as log:
+        table = evaluate_city(
+            city,
+            given.tiles,
+            given.matches,
+            dict(zip(snakemake.params.scenes, stores)),
+            **dict(snakemake.output.items()),
+        )
+        for row in table:
+            log.info(
+                "%s: %d pairs, %d matches, mean of mean errors %s px, of mean absolute ones %s px",
+                *list(row.values())[:5],
+            )
