@@ -95,7 +95,7 @@ def test_rows_that_are_off_are_flagged(made):
     wrong = made["rows"]
     rows = labelled(wrong.out)
     assert column(wrong.out, "y_parallax_median_px") == pytest.approx(1.5, abs=0.1)
-    assert {row["quality"] for row in rows} == {"max_y_parallax_px;min_sift_matches"}
+    assert all(row["quality"].startswith("max_y_parallax_px;min_sift_matches") for row in rows)
 
 
 def test_a_strict_run_ends_with_scene_tile_gate_value_and_limit(made, tmp_path):
