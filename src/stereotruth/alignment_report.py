@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 
 import numpy as np
 
 from .alignment import Alignment
+from .figures import round_length
 from .grid_store import replacing
 
 
@@ -39,12 +39,6 @@ def _write_table(alignment: Alignment, path: Path) -> None:
                 )
 
 
-def _nice(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten below a positive value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * 1.0000001) * power
-
-
 def _draw(alignment: Alignment, path: Path) -> None:
     """Vectors of the residuals on both images' frames, before and after the correction."""
     import matplotlib
@@ -69,11 +63,11 @@ def _draw(alignment: Alignment, path: Path) -> None:
             at = np.array([g.measured for g in used])
             vector = np.array([getattr(g, which) for g in used])
             longest = max(float(np.hypot(*vector.T).max()), 1e-3)
-            key = _nice(longest)
+            key = round_length(longest)
             # image px of the frame per px of residual: the longest takes an eighth of the frame
             width = {"angles": "xy", "scale_units": "xy", "scale": longest * 8 / side}
             arrows = ax.quiver(*at.T, *vector.T, color="C0", width=0.005, zorder=3, **width)
-            ax.quiverkey(arrows, 0.80, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
+            ax.quiverkey(arrows, 0.12, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
             ax.plot(*at.T, "o", color="black", markersize=3, zorder=4)
             for g in fit.gcps:
                 ax.annotate(
@@ -87,8 +81,8 @@ def _draw(alignment: Alignment, path: Path) -> None:
                 if not g.used:
                     ax.plot(*g.measured, "x", color="C3", markersize=9, mew=2, zorder=4)
             out = f", {len(fit.left_out)} left out (×)" if fit.left_out else ""
-            ax.set_title(
-                f"{fit.view}, {word}: rms {fit.rms(which):.3f} px{out}", loc="left", fontsize=10
+            ax.set_title(  # above the line of the arrow's key
+                f"{fit.view}, {word}: rms {fit.rms(which):.3f} px{out}\n", loc="left", fontsize=10
             )
             ax.add_patch(
                 matplotlib.patches.Rectangle((-0.5, -0.5), cols, rows, fill=False, color="0.6")

@@ -5,6 +5,7 @@ Disparities are drawn in ``turbo``; pixels without a value are dark grey.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -61,6 +62,12 @@ def shrink(picture: Picture, side: int) -> Picture:
         return picture
     width, height = (max(1, round(n * factor)) for n in picture.shape[1::-1])
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def round_length(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten at or below a positive value, for an arrow's key."""
+    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
+    return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power
 
 
 def panels(rows: Sequence[Sequence[Picture]], gap: int = 4) -> Picture:

@@ -110,6 +110,23 @@ def alignment(path: Path) -> Path:
     return path
 
 
+def refinement(path: Path, applied: bool) -> Path:
+    """The same alignment after a refinement that was applied, or not."""
+    record = json.loads(alignment(path).read_text())
+    for view in (record["left"], record["right"]):
+        view["rms"] = {"before": 7.91, "after": 0.81}
+    record["refinement"] = {
+        "applied": applied,
+        "reason": "" if applied else "the <points> agree",
+        "used": 120,
+        "sites": 17,
+        "before": {"y_parallax": {"median": -0.0511, "rms": 0.11}},
+        "after": {"y_parallax": {"median": -0.0021, "rms": 0.08 if applied else 0.11}},
+    }
+    path.write_text(json.dumps(record))
+    return path
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """A page with everything that may be there, of 5 labelled tiles."""
@@ -151,7 +168,8 @@ def made(tmp_path_factory) -> Path:
         out,
         coverage=coverage,
         alignments={"S-1": alignment(folder / "alignment.json")},
-        refinements={"S-1": folder / "alignment.json"},
+        refinements={"S-1": refinement(folder / "refined.json", applied=True)},
+        refinement_figures={"S-1": coverage, "S-2": folder / "none.png"},
         truth=folder / "truth.json",
         truth_table=folder / "truth.csv",
         table4=folder / "table4.csv",
@@ -273,6 +291,33 @@ def test_headlines_and_tables_say_what_the_files_say(made):
     assert len(rows) == 11
 
 
+@pytest.mark.parametrize("applied", [True, False])
+def test_a_refinement_is_shown_with_before_and_after(tmp_path, applied):
+    write_city(tmp_path / "tiles", 1)
+    page.write_report(
+        "City",
+        tmp_path / "tiles",
+        tmp_path / "index.html",
+        alignments={"S-1": alignment(tmp_path / "a.json")},
+        refinements={"S-1": refinement(tmp_path / "r.json", applied)},
+    )
+    text = (tmp_path / "index.html").read_text()
+    frames = re.findall(r"<figcaption>(.*? image, .*?)</figcaption>", text)
+    after = ["left image, after refinement: 0.81 px rms"] if applied else []
+    assert frames[: len(frames) // 2] == [
+        "left image, RPC alone: 7.91 px rms",
+        "left image, after the fit: 0.79 px rms",
+        *after,
+    ]
+    said = "<b>applied</b>." if applied else "<b>not applied</b>, since the &lt;points&gt; agree."
+    assert f"{said} 120 tie points at 17 sites." in text
+    table = re.search(r"Tie points</caption>.*?</table>", text, re.DOTALL)[0]
+    assert re.findall(r"<td[^>]*>(.*?)</td>", table) == [
+        *("y-parallax before", "−0.051", "0.110"),
+        *("y-parallax after", "−0.002", "0.080" if applied else "0.110"),
+    ]
+
+
 def test_calibrated_deciles_lie_on_the_diagonal():
     deciles = [{"mean_uncertainty": s, "rms_error": e} for s, e in ((0.1, 0.1), (0.2, 0.4))]
     drawn = drawings.calibration(deciles)
@@ -303,7 +348,9 @@ def test_without_a_manifest_it_says_what_to_do(tmp_path):
 def test_arrows_have_the_length_of_their_key(tmp_path):
     record = json.loads(alignment(tmp_path / "a.json").read_text())
     view = record["left"]
-    frame = drawings.arrow_frame("", view["size"], view["gcps"], "before")
+    longest = drawings.longest_residual(view["gcps"], "before")
+    assert longest == 10.0  # not that of the point left out
+    frame = drawings.arrow_frame("", view["size"], view["gcps"], "before", longest)
     assert frame.key_px == 10.0
     per_px = frame.key_length / frame.key_px
     first, second, out = frame.arrows
@@ -391,8 +438,8 @@ def test_the_page_works_in_a_browser_without_a_network(made, tmp_path, width):
     assert found["width"] == width
     assert found["wide"] <= 0  # nothing sticks out sideways
     assert not found["broken"] and found["title"].startswith(CITY)
-    # 4 pictures of 5 tiles, 4 large ones of 2, 2 of the pair without labels, the map
-    assert len(found["images"]) == 20 + 8 + 2 + 1
+    # 4 pictures of 5 tiles, 4 large ones of 2, 2 of the pair without labels, map, tie points
+    assert len(found["images"]) == 20 + 8 + 2 + 2
     assert all(alt and size > 0 for alt, size in found["images"])
     assert [re.search(r"([\d.]+)%", text)[1] for text in found["clip"]] == ["50", "80", "20"]
     assert found["focused"]

@@ -6,6 +6,9 @@ rule report_city:
             f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
         ],
         refinements=refinements,
+        refinement_figures=lambda w: [
+            str(Path(file).with_name("refinement.png")) for file in refinements(w)
+        ],
         truth=lambda w: truth_of_city(w.city, "json"),
         truth_table=lambda w: truth_of_city(w.city, "csv"),
     output:

@@ -20,6 +20,7 @@ if __name__ == "__main__":
             coverage=given.coverage,
             alignments=by_scene(given.alignments),
             refinements=by_scene(given.refinements),
+            refinement_figures=by_scene(given.refinement_figures),
             truth=given.truth[0] if given.truth else None,
             truth_table=given.truth_table[0] if given.truth_table else None,
             sliders=snakemake.params.sliders,

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from ..figures import round_length
+
 SIDE = 300.0  # longer side of a frame of residuals
 SHARE = 1 / 8  # of the frame, taken by the longest arrow
 WIDTH, HEIGHT = 420.0, 150.0  # of a histogram
@@ -40,21 +42,27 @@ class ArrowFrame:
     key_length: float
 
 
-def round_length(value: float) -> float:
-    """The next of 1, 2, 5 times a power of ten at or below a positive value."""
-    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
-    return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power
+def longest_residual(points: Sequence[Mapping[str, Any]], which: str) -> float:
+    """Length in px of the longest residual ``which`` of the GCPs that took part; 0 of none."""
+    used = (p[which] for p in points if p.get("used", True) and None not in p.get(which, [None]))
+    return max((math.hypot(*pair) for pair in used), default=0.0)
 
 
 def arrow_frame(
-    title: str, size: Sequence[float], points: Sequence[Mapping[str, Any]], which: str
+    title: str,
+    size: Sequence[float],
+    points: Sequence[Mapping[str, Any]],
+    which: str,
+    longest: float,
 ) -> ArrowFrame | None:
-    """Residuals ``which`` of GCP records (measured, used, id) on an image of (cols, rows)."""
+    """Residuals ``which`` of GCP records (measured, used, id) on an image of (cols, rows).
+
+    A residual of ``longest`` px takes ``SHARE`` of the frame.
+    """
     shown = [p for p in points if p.get(which) and None not in (*p[which], *p["measured"])]
     if not shown:
         return None
-    lengths = [math.hypot(*p[which]) for p in shown if p.get("used", True)]
-    longest = max(max(lengths, default=0.0), 1e-3)
+    longest = max(longest, 1e-3)
     scale = SIDE / max(size)
     arrow = SHARE * SIDE / longest
     arrows = []

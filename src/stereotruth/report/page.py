@@ -208,12 +208,22 @@ def _residuals(
             fit = record.get(view, {})
             if not fit.get("gcps"):
                 continue
+            longest = {
+                which: max(
+                    drawings.longest_residual(source.get(view, {}).get("gcps", []), which)
+                    for other, _, source in stages
+                    if other == which
+                )
+                for which in ("before", "after")
+            }
             for which, title, source in stages:
                 of = source.get(view, {})
                 rms = of.get("rms", {}).get(which)
                 title = f"{view} image, {title}" + ("" if rms is None else f": {rms:.2f} px rms")
                 points = of.get("gcps", [])
-                frames.append(drawings.arrow_frame(title, fit["size"], points, which))
+                frames.append(
+                    drawings.arrow_frame(title, fit["size"], points, which, longest[which])
+                )
         table_rows = [
             {
                 "image": view,
@@ -476,6 +486,16 @@ def _headlines(
         if refined:
             note += f", {rms(refined, 'after')} px after refinement"
         found.append(Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note))
+
+    ties = [record.get("refinement", {}) for record in refined.values()]
+    if any(tie.get("after") for tie in ties):
+
+        def parallax(when: str) -> str:
+            values = [tie.get(when, {}).get("y_parallax", {}).get("rms") for tie in ties]
+            return spread(values, ".2f")
+
+        note = f"rms; {parallax('before')} px before refinement"
+        found.append(Headline("y-parallax of tie points", f"{parallax('after')} px", note))
 
     def column(name: str) -> list[float]:
         return [v for row in labelled if (v := _number(row.get(name, ""))) is not None]
