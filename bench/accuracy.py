@@ -140,37 +140,38 @@ def status_rows(comparisons: Mapping[str, truth.ByClass]) -> list[dict[str, str]
     rows = []
     for name, parts in comparisons.items():
         figures = parts.figures()
-        pixels_of, found = figures["pixels"], {}
-        for group in ("visible", "in_lidar_only", "in_images_only", "visible_lost"):
-            states = figures["status"][group]
-            found[group] = ", ".join(
-                f"{state} {100 * n / pixels_of[group]:.2f}"
-                for state, n in sorted(states.items(), key=lambda item: -item[1])
+        pixels_of, labelled = figures["pixels"], figures["labelled"]
+
+        def states(group: str, figures: Mapping[str, Any] = figures) -> str:
+            found = figures["status"][group]
+            total = max(sum(found.values()), 1)
+            return ", ".join(
+                f"{state} {100 * n / total:.2f}"
+                for state, n in sorted(found.items(), key=lambda item: -item[1])
                 if state != "labelled"
             )
-        found["hidden"] = ", ".join(
-            f"{kind} {100 * part['labelled']['hidden'] / max(pixels_of['hidden'], 1):.2f}"
-            for kind, part in figures["surfaces"].items()
-            if part["labelled"]["hidden"]
-        )
-        of_hidden = max(pixels_of["hidden"], 1)
-        shares = {g: 100 * pixels_of[g] / max(pixels_of["visible"], 1) for g in ("visible_lost",)}
+
+        def surfaces(group: str, has_label: bool, figures: Mapping[str, Any] = figures) -> str:
+            total = max(figures["pixels"][group], 1)
+            found = {
+                kind: part["labelled"][group] - (0 if has_label else part["pixels"][group])
+                for kind, part in figures["surfaces"].items()
+                if kind != "water"
+            }
+            return ", ".join(f"{kind} {100 * abs(n) / total:.2f}" for kind, n in found.items() if n)
+
+        lost = 100 * pixels_of["visible_lost"] / max(pixels_of["visible"], 1)
+        bared = 100 * labelled["hidden_bared"] / max(pixels_of["hidden"], 1)
         rows += [
             {"city": name, "pixels": what, "%": values}
             for what, values in (
-                ("visible, unlabelled by status", found["visible"]),
-                (
-                    f"of these behind a building in the LiDAR only "
-                    f"({shares['visible_lost']:.2f} %)",
-                    found["visible_lost"],
-                ),
-                ("hidden, labelled by surface", found["hidden"]),
-                (
-                    "of these behind a building in the images only",
-                    f"{100 * figures['labelled']['hidden_bared'] / of_hidden:.2f}",
-                ),
-                ("in LiDAR only, masked by status", found["in_lidar_only"]),
-                ("in images only, masked by status", found["in_images_only"]),
+                ("visible, unlabelled by status", states("visible")),
+                ("visible, unlabelled by surface", surfaces("visible", False)),
+                (f"{lost:.2f} % behind a building in the LiDAR only", states("visible_lost")),
+                ("hidden, labelled by surface", surfaces("hidden", True)),
+                ("behind a building in the images only, labelled", f"{bared:.2f}"),
+                ("in LiDAR only, masked by status", states("in_lidar_only")),
+                ("in images only, masked by status", states("in_images_only")),
             )
         ]
     return rows
