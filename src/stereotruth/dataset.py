@@ -41,6 +41,8 @@ Conventions
   (orientation), are in tiles/<City>/ under the same number; manifest.csv has their checksums there.
 - No ground lies in two splits: tiles of which two overlap are in one split, or in none and then
   not here. Splits are contiguous regions. {shared}
+- quality in manifest.csv: ok, or the limits that the pair's labels exceed when held against its
+  images (SIFT matches, image warping); class: building or vegetation.
 - manifest.csv: a row per pair with scene, window, offset, counts, split and SHA-256 of each file.
 """
 

@@ -19,8 +19,9 @@ The y-parallax, y_right − y_left, is taken without that limit on rows, from th
 is within ``AGREE_PX`` of the median one, so that mismatches do not swamp it.
 
 Key points are those of OpenCV with ``enable_precise_upscale``: without it they lie 0.25 px off.
-Against the exact truth of synthetic cities their disparities have no bias and a normalised median
-absolute deviation of 0.12 px, in x as in y: that much of the figures is not the labels'.
+Against the exact truth of a synthetic city (Kunming, 13164 matches) their disparities have a median
+error of −0.004 px, a normalised median absolute deviation of 0.14 px and a mean absolute error of
+0.18 px, while the labels there are 0.016 px off: so much of the figures is that of SIFT itself.
 """
 
 from __future__ import annotations
