@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.report import drawings, page, pictures
+from stereotruth.report import drawings, page, pictures, tables
 from stereotruth.tiles import write_tiff
 
 from ..browser import look, needs_chromium, screenshot
@@ -135,7 +135,7 @@ def made(tmp_path_factory) -> Path:
     write_city(
         folder / "tiles",
         5,
-        quality=["ok", "y_parallax;sift_error", "ok", "ok", "ok", ""],
+        quality=["ok", "max_y_parallax_px;min_sift_matches", "ok", "ok", "ok", ""],
         sift_mean_absolute_error_px=sift,
         sift_matches=[10, 20, 30, 40, 50, ""],
     )
@@ -157,8 +157,8 @@ def made(tmp_path_factory) -> Path:
         json.dumps({"meaning": {"errors": "label less <truth>"}, "exported_tiles": of_tiles})
     )
     (folder / "table4.csv").write_text(
-        "city,class,pairs,matches,mean_error_px,mean_absolute_error_px\n"
-        "Ville,building,5,150,-0.01,0.30\n"
+        "city,pair_number,matches_number,mean_errors_px,mean_absolute_errors_px,gross_share\n"
+        "Ville (building),5,150,-0.01,0.30,0.001\n"
     )
     out = folder / "page" / "index.html"
     out.parent.mkdir()
@@ -268,8 +268,8 @@ def test_a_missed_gate_is_red_and_named(made):
     text = made.read_text()
     alarm = re.search(r'<div class="alarm" role="note">(.*?)</div>', text, re.DOTALL)[1]
     assert re.findall(r'href="#tile-(\w+)"', alarm) == ["T_1"]
-    assert "y-parallax, sift error" in alarm
-    assert 'class="bad">y_parallax;sift_error</td>' in text
+    assert "y-parallax too high, SIFT matches too low" in alarm
+    assert 'class="bad">max_y_parallax_px;min_sift_matches</td>' in text
     assert "1 of 5 tiles miss one" in text
 
 
@@ -286,8 +286,8 @@ def test_headlines_and_tables_say_what_the_files_say(made):
     assert re.findall(r"<td[^>]*>(.*?)</td>", status) == ["visible", "100", "95.00 %", "5.00 %"]
     table4 = re.search(r'<section id="sift">.*?</section>', text, re.DOTALL)[0]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in table4.split("<tr>")[2:]]
-    assert rows[0] == ["Ville (building)", "5", "150", "−0.010", "0.300"]
-    assert ["Qichun (vegetation)", "736", "99457", "−0.500", "0.790"] in rows
+    assert rows[0] == ["Ville (building)", "5", "150", "−0.010", "0.300", "0.10 %"]
+    assert ["Qichun (vegetation)", "736", "99457", "−0.500", "0.790", ""] in rows
     assert len(rows) == 11
 
 
@@ -318,6 +318,33 @@ def test_a_refinement_is_shown_with_before_and_after(tmp_path, applied):
     ]
 
 
+def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
+    write_city(tmp_path / "tiles", 1, quality=["ok", ""])
+    miss = "max_y_parallax_px"
+    record = {
+        "limits": {"max_y_parallax_px": 0.5, "min_sift_matches": 10, "max_gcp_rms_px": None},
+        "scenes": {
+            "S-1": {
+                "y_parallax_median_px": 0.7,
+                "gcp_rms_px": None,
+                "quality": "max_y_parallax_px",
+            },
+            "S-2": {"y_parallax_median_px": 0.1, "gcp_rms_px": 0.3, "quality": "ok"},
+        },
+    }
+    (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
+    page.write_report("City", tmp_path / "tiles", tmp_path / "index.html")
+    text = (tmp_path / "index.html").read_text()
+    section = re.search(r'<section id="quality">.*?</section>', text, re.DOTALL)[0]
+    assert "Limits: y-parallax ≤ 0.5 px; SIFT matches ≥ 10." in section
+    assert re.findall(r"<td[^>]*>(.*?)</td>", section) == [
+        *("S-1", miss, "0.700", ""),
+        *("S-2", "ok", "0.100", "0.300"),
+    ]
+    assert re.findall(r'class="bad">(.*?)<', section) == [miss]
+    assert "and S-1 as a whole" in text
+
+
 def test_calibrated_deciles_lie_on_the_diagonal():
     deciles = [{"mean_uncertainty": s, "rms_error": e} for s, e in ((0.1, 0.1), (0.2, 0.4))]
     drawn = drawings.calibration(deciles)
@@ -341,7 +368,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
 
 
 def test_without_a_manifest_it_says_what_to_do(tmp_path):
-    with pytest.raises(InputError, match="run the export stage"):
+    with pytest.raises(InputError, match="no manifest"):
         page.write_report("None", tmp_path, tmp_path / "index.html")
 
 
@@ -390,7 +417,7 @@ def test_histograms_share_their_axis_and_keep_every_label():
     ],
 )
 def test_values_are_shown_as_people_read_them(name, text, shown):
-    assert page.show(name, text) == shown
+    assert tables.show(name, text) == shown
 
 
 # ------------------------------------------------------------------------------ in a browser

@@ -9,6 +9,9 @@ rule report_city:
         refinement_figures=lambda w: [
             str(Path(file).with_name("refinement.png")) for file in refinements(w)
         ],
+        table4=rules.evaluate_images.output.table4,
+        sift=rules.evaluate_images.output.sift,
+        sift_figure=rules.evaluate_images.output.sift_figure,
         truth=lambda w: truth_of_city(w.city, "json"),
         truth_table=lambda w: truth_of_city(w.city, "csv"),
     output:

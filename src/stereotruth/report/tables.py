@@ -1,0 +1,135 @@
+"""Values and tables of a page: what stands in CSV and JSON files, as people read it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+ABBREVIATIONS = {"gcp": "GCP", "sift": "SIFT", "lidar": "LiDAR", "nmad": "NMAD"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value of a table: what is shown, what it is sorted by, and whether it misses a limit."""
+
+    text: str
+    key: str
+    bad: bool = False
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's heading, and whether its values are numbers."""
+
+    title: str
+    numeric: bool
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page; ``groups`` are rows that belong together, under a heading or none."""
+
+    columns: tuple[Column, ...]
+    groups: tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]
+
+
+def words(name: str) -> str:
+    """A column's name in words: underscores go, a unit at the end stands apart."""
+    text = name.removeprefix("count_").replace("y_parallax", "y-parallax")
+    unit = ""
+    if "share" in text:  # shown in percent
+        text = text.removeprefix("share_").removeprefix("of_")
+    elif text.endswith("_px"):
+        text, unit = text.removesuffix("_px"), ", px"
+    return " ".join(ABBREVIATIONS.get(word, word) for word in text.split("_")) + unit
+
+
+def gate(name: str) -> str:
+    """What a missed gate of the configuration says: ``max_…`` too high, ``min_…`` too low."""
+    text = words(name.removeprefix("max_").removeprefix("min_")).removesuffix(", px")
+    ending = {"max": " too high", "min": " too low"}.get(name[:3], "")
+    return text + ending
+
+
+def limit(name: str, value: float) -> str:
+    """A limit of the configuration in words."""
+    text, _, unit = words(name.removeprefix("max_").removeprefix("min_")).partition(", ")
+    return f"{text} {'≥' if name.startswith('min_') else '≤'} {value:g} {unit}".strip()
+
+
+def number(text: str) -> float | None:
+    """The finite number that a text says, else None."""
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        return None
+    return value if np.isfinite(value) else None
+
+
+def minus(text: str) -> str:
+    """A number's text with the true minus sign."""
+    return text.replace("-", "−")
+
+
+def show(name: str, text: str) -> str:
+    """A value of the column ``name`` as people read it: shares in percent, else 3 decimals."""
+    value = number(text)
+    if value is None:
+        return text
+    if "share" in name:
+        return minus(f"{100 * value:.2f} %")
+    if value == int(value) and "." not in text:
+        whole = f"{int(value)}"
+        return minus(f"{int(value):,}".replace(",", " ") if len(whole) > 5 else whole)
+    if name in ("lon", "lat"):
+        return minus(f"{value:.5f}")
+    return minus(f"{value:.3f}")
+
+
+def cell(name: str, text: str, bad: bool = False) -> Cell:
+    """A table's cell of a value as it stands in a CSV file."""
+    value = number(text)
+    return Cell(show(name, text), text if value is None else f"{value:.9g}", bad)
+
+
+def table(rows: Sequence[Mapping[str, str]], columns: Sequence[str] | None = None) -> Table | None:
+    """A table of CSV rows, with the given columns or all; None of no rows."""
+    if not rows:
+        return None
+    names = list(rows[0]) if columns is None else [c for c in columns if c in rows[0]]
+    return Table(columns_of(names, rows), (("", tuple(cells_of(names, row) for row in rows)),))
+
+
+def columns_of(names: Iterable[str], rows: Sequence[Mapping[str, str]]) -> tuple[Column, ...]:
+    """Headings of named columns; numeric are those that hold nothing but numbers."""
+
+    def numeric(name: str) -> bool:
+        values = [row[name] for row in rows if row.get(name)]
+        return bool(values) and all(number(value) is not None for value in values)
+
+    return tuple(Column(words(name), numeric(name)) for name in names)
+
+
+def cells_of(names: Iterable[str], row: Mapping[str, str]) -> tuple[Cell, ...]:
+    """Cells of named columns; a missed gate in the column ``quality`` is bad."""
+    return tuple(
+        cell(name, row.get(name) or "", name == "quality" and bool(missed(row))) for name in names
+    )
+
+
+def missed(row: Mapping[str, Any]) -> list[str]:
+    """Names of the quality gates that a tile of the manifest misses."""
+    text = row.get("quality") or "ok"
+    return [] if text == "ok" else [name.strip() for name in text.split(";") if name.strip()]
+
+
+def spread(values: Iterable[float | None], form: str) -> str:
+    """One value, or the least and the largest of several; a dash of none."""
+    known = sorted(v for v in values if v is not None)
+    if not known:
+        return "–"
+    low, high = (minus(format(v, form)) for v in (known[0], known[-1]))
+    return low if low == high else f"{low}{' … ' if '−' in low + high else '–'}{high}"
