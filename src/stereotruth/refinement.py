@@ -46,7 +46,8 @@ log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SYSTEMATIC = 0.02  # px that all tie points may have in common, along and across the rows
+MATCHING = 0.01  # px, what even the best match may be off
+SYSTEMATIC = 0.01  # px that all tie points may have in common, along and across the rows
 FINE = 6  # px: radius of the first search around every place
 FINEST = 2  # px: of the last
 COARSEST = 48  # px: of a search for the shift that all places have in common
@@ -78,13 +79,17 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on."""
+    """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on.
+
+    ``ratio``, ``site_ratio`` [2]: standard deviation of a match along and across the rows, and the
+    part that a site shares, in units of the match's own.
+    """
 
     parameters: Floats
     covariance: Floats
     weights: Floats
-    sigma: Floats
-    site_sigma: Floats
+    ratio: Floats
+    site_ratio: Floats
     statistic: float
     freedom: int
 
@@ -130,43 +135,47 @@ def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s:
 
 
 def estimate(
-    design: Floats, observed: Floats, sites: NDArray[np.int64], prior: Floats
+    design: Floats, observed: Floats, own: Floats, sites: NDArray[np.int64], prior: Floats
 ) -> _Estimate:
     """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
 
-    ``prior`` [12, 12] is the covariance about zero. Observations of one site, int[n], share errors.
+    ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
+    poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
+    is the covariance about zero. Observations of one site, int[n], share errors.
     """
     root = _root(prior)
     sites = np.unique(sites, return_inverse=True)[1]
     counts = np.bincount(sites)[sites]
+    expected = np.hypot(own, MATCHING)[:, None]
     inner = design @ root
     rank = root.shape[1]
     used = np.ones(len(observed), bool)
-    # The start: the median shift, and half of the observations that lie nearest to it.
     residuals = observed - np.median(observed, axis=0)
     z = np.zeros(rank)
     sigma, site_sigma = np.ones(2), np.zeros(2)
     weights = np.ones(len(observed))
     for step in range(40):
-        sigma = np.array([_scale(residuals[:, k], used) for k in (0, 1)])
-        length = np.hypot(*(residuals / sigma).T)
+        relative = residuals / expected
+        sigma = np.array([_scale(relative[:, k], used) for k in (0, 1)])
+        length = np.hypot(*(relative / sigma).T)
         if step < 8:  # first a convex one: Huber's, which any start leads to its minimum
             weights = np.minimum(1.0, 2.0 / np.maximum(length, 1e-12))
         else:
             weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
             used = weights > 0.0
-            sigma = np.array([_scale(residuals[:, k], used) for k in (0, 1)])
+            sigma = np.array([_scale(relative[:, k], used) for k in (0, 1)])
             site_sigma = np.array(
-                [_site_sigma(residuals[:, k], weights, sites, sigma[k]) for k in (0, 1)]
+                [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
             )
-        information = weights[:, None] / (sigma**2 + counts[:, None] * site_sigma**2)
+        variance = expected**2 * (sigma**2 + counts[:, None] * site_sigma**2)
+        information = weights[:, None] / variance
         weighted = inner * information[:, :, None]
         normal = np.einsum("nap,naq->pq", weighted, inner)
         right = np.einsum("nap,na->p", weighted, observed)
         shared = weighted.sum(axis=0).T  # [r, 2], with what all observations have in common
-        own = information.sum(axis=0) + SYSTEMATIC**-2.0
-        normal -= (shared / own) @ shared.T
-        right -= (shared / own) @ np.einsum("na,na->a", information, observed)[:, None][:, 0]
+        total = information.sum(axis=0) + SYSTEMATIC**-2.0
+        normal -= (shared / total) @ shared.T
+        right -= (shared / total) @ np.sum(information * observed, axis=0)
         last = z
         z = np.linalg.solve(np.eye(rank) + normal, right)
         residuals = observed - inner @ z
@@ -282,8 +291,8 @@ def _record(
         "chi_square": round(found.statistic, 2),
         "degrees_of_freedom": found.freedom,
         "probability_by_chance": _chance(found),
-        "sigma_of_a_match_px": found.sigma.round(4).tolist(),
-        "sigma_shared_in_a_site_px": found.site_sigma.round(4).tolist(),
+        "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
+        "shared_in_a_site": found.site_ratio.round(3).tolist(),
         "sigma_shared_by_all_px": SYSTEMATIC,
         **spreads,
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
@@ -345,7 +354,7 @@ def _search(
             return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
         design, slopes = _linearised(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
-        found = estimate(design, observed + design @ parameters, ties.site, prior)
+        found = estimate(design, observed + design @ parameters, ties.sigma, ties.site, prior)
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
         last, parameters = parameters, found.parameters

@@ -18,7 +18,7 @@ from .conftest import SIZE, TINY, Project, copy_project, row_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
-STAGES = {"align", "rectify", "project", "export"}
+STAGES = {"align", "refine", "rectify", "project", "export"}
 
 
 def plan(project: Project, *arguments: str) -> dict[str, int]:
@@ -112,9 +112,9 @@ def test_another_tile_size_runs_export_only(made):
     [
         ("tiles", {"export"}),
         ("disparity", {"project", "export"}),
-        ("rectification", {"rectify", "project", "export"}),
+        ("rectification", {"refine", "rectify", "project", "export"}),
         ("alignment", STAGES),
-        ("points", {"ingest", "project", "export"}),
+        ("points", STAGES - {"align"} | {"ingest"}),
         ("sheets", set()),
         ("simulate/render", set()),
     ],

@@ -15,7 +15,7 @@ from .conftest import ROOT
 def test_a_city_is_planned_from_nothing(project):
     jobs = project.plan("tiles/Qichun")
     assert jobs["export"] == 1
-    assert jobs["align"] == jobs["rectify"] == jobs["project"] == 2
+    assert jobs["align"] == jobs["refine"] == jobs["rectify"] == jobs["project"] == 2
     assert jobs["simulate_image"] == 4
     assert jobs["ingest"] == jobs["simulate_lidar"] >= 4
 
@@ -60,6 +60,26 @@ def test_a_missing_file_is_named(project, column):
     assert run.status != 0
     for word in ("Mine-1", f"{column}.laz", "mine_scenes.tsv", "Remedy"):
         assert word in run.text
+
+
+def test_a_scene_without_gcps_is_refused_unless_it_is_refined(project):
+    row = {"scene": "Mine-1", "city": "Mine"}
+    for name in ("left_image", "right_image", "lidar"):
+        (project.folder / f"{name}.laz").touch()
+        row[name] = f"{name}.laz"
+    mine = project.add_scene("mine", [row], alignment={"refine": False})
+    run = project.snakemake("--dry-run", "tiles/Mine", "--configfile", mine)
+    assert run.status != 0
+    for word in ("Mine-1", "no GCPs", "alignment.refine", "Remedy"):
+        assert word in run.text
+    jobs = project.plan("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
+    assert jobs["refine"] == 1
+
+
+def test_refinement_can_be_switched_off(project):
+    (project.folder / "off.yaml").write_text("alignment:\n  refine: false\n")
+    jobs = project.plan("tiles/Kunming", "--configfile", "off.yaml")
+    assert "refine" not in jobs and jobs["align"] == 1
 
 
 def test_lint_passes():

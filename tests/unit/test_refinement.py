@@ -1,0 +1,294 @@
+"""Refinement on a textured hilly surface seen by known cameras: what is planted is found."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from stereotruth.alignment import Alignment, ViewFit
+from stereotruth.epipolar import fit_epipolar
+from stereotruth.errors import InputError
+from stereotruth.refinement import estimate, refine
+from stereotruth.refinement_report import write_refinement
+from stereotruth.rpc import SensorModel
+
+from .test_disparity import write_points
+from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
+from .test_rpc import write_image
+
+SIZE = (760, 700)  # cols, rows of both images
+TRUE = (camera(BACKWARD, size=SIZE), camera(FORWARD, angle=2.0, gsd=0.8, size=SIZE))
+SHIFT = np.array([0.0, 0.0, 1.0])
+
+
+def surface(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+    return HEIGHT + 9.0 * np.sin(east / 80.0) + 7.0 * np.cos(north / 60.0)
+
+
+def texture(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+    """Smooth noise on the ground: unlike a few waves, it is itself only where it is."""
+    noise = gaussian_filter(np.random.default_rng(4).normal(0, 1, (800, 800)), 1.8, mode="wrap")
+    at = np.stack([north, east]) / 0.8 + 400.0  # lattice of 0.8 m
+    return 1000.0 + 1500.0 * map_coordinates(noise, at, order=3, mode="grid-wrap")
+
+
+def render(sensor: SensorModel) -> np.ndarray:
+    col, row = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    height = np.full(col.shape, HEIGHT)
+    for _ in range(12):
+        lon, lat = sensor.localize(col, row, height)
+        east, north = (lon - LON) * METRES[0], (lat - LAT) * METRES[1]
+        height = surface(east, north)
+    rng = np.random.default_rng(int(sensor.rpc.samp_num_coeff[3] * 1e6) % 1000)
+    return np.round(texture(east, north) + rng.normal(0, 5.0, col.shape)).astype(np.uint16)
+
+
+def lidar(spacing: float = 0.6) -> np.ndarray:
+    """lon, lat, height [n, 3] of points on the surface, 0.03 m of noise."""
+    rng = np.random.default_rng(0)
+    east, north = np.mgrid[-300:300:spacing, -300:300:spacing].reshape(2, -1)
+    east, north = np.stack([east, north]) + rng.uniform(-0.3, 0.3, (2, east.size)) * spacing
+    height = surface(east, north) + rng.normal(0, 0.03, east.size)
+    return np.column_stack([LON + east / METRES[0], LAT + north / METRES[1], height])
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("images")
+    return [write_image(folder / f"{n}.tif", None, render(s)) for n, s in zip("lr", TRUE)]
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory) -> Path:
+    return write_points(tmp_path_factory.mktemp("points"), lidar())
+
+
+def start(left: np.ndarray, right: np.ndarray, sigma: float, model: str = "affine") -> Alignment:
+    """The true pair with affine errors [2, 3] for ((u, v, 1) of the frame's half), in px.
+
+    ``sigma`` px: standard deviation of every one of its parameters.
+    """
+    fits, sensors = [], []
+    scale = max(SIZE) / 2
+    for name, true, error in zip(("left", "right"), TRUE, (left, right)):
+        fit = ViewFit(
+            view=name,
+            image=f"{name}.tif",
+            size=SIZE,
+            affine=np.array(true.affine),
+            gcps=(),
+            sigma0=float("nan"),
+            redundancy=0,
+            origin=((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2),
+            scale=scale,
+            covariance=np.eye(6) * sigma**2,
+        )
+        fits.append(replace(fit, affine=fit.moved(np.asarray(error).ravel())))
+        sensors.append(SensorModel(true.rpc, fits[-1].affine))
+    return Alignment("S-1", model, *sensors, *fits, HEIGHT, (), {"inputs": {}})
+
+
+def relative_error(alignment: Alignment) -> tuple[float, float]:
+    """Largest error of the disparity and largest y-parallax over the scene, px.
+
+    Of exact points of the surface, against where the true cameras see them.
+    """
+    east, north = (c.ravel() for c in np.meshgrid(np.linspace(-180, 180, 9), [-150, 0, 150]))
+    ground = LON + east / METRES[0], LAT + north / METRES[1], surface(east, north)
+    model = fit_epipolar(alignment.left, alignment.right, SIZE, SIZE, HEIGHT)
+    x_left, y_left = model.left_to_epipolar(*TRUE[0].project(*ground))
+    x_right, y_right = model.right_to_epipolar(*TRUE[1].project(*ground))
+    label = model.ground_to_epipolar(*ground)
+    disparity = label[0] - label[2] - (x_left - x_right)
+    return float(np.abs(disparity).max()), float(np.abs(y_right - y_left).max())
+
+
+NONE = np.zeros((2, 3))
+PLANTED = np.array([[0.2, -0.1, 0.7], [0.1, 0.15, -0.5]])
+
+
+def test_a_planted_shift_and_tilt_is_taken_out(images, points):
+    planted = start(NONE, PLANTED, 0.5)
+    assert max(relative_error(planted)) > 0.5
+    refined, observations = refine(planted, *images, [points])
+    assert refined.refinement["applied"]
+    assert max(relative_error(refined)) < 0.02
+    record = refined.refinement
+    assert record["used"] > 100
+    for name in ("disparity", "y_parallax"):
+        assert record["before"][name]["trend_rms"] > 0.3
+        assert record["after"][name]["trend_rms"] < 0.02
+    assert np.abs(np.median(observations.after[observations.used], axis=0)).max() < 0.02
+
+
+def test_rpcs_alone_are_brought_together(images, points):
+    left = np.array([[0.05, 0.0, 9.0], [0.0, -0.05, -6.0]])
+    right = np.array([[0.0, 0.1, -8.0], [-0.05, 0.0, 11.0]])
+    planted = start(left, right, 10.0)
+    refined, _ = refine(planted, *images, [points])
+    assert max(relative_error(planted)) > 10.0
+    assert max(relative_error(refined)) < 0.03
+    model = fit_epipolar(refined.left, refined.right, SIZE, SIZE, HEIGHT)
+    disparity, x, y = refined.label_sigma(model, model.shape[1] / 2, model.shape[0] / 2)
+    assert disparity < 0.03
+    # The common part is seen on slopes only: the uncertainty of the labels' places says so.
+    miss = np.subtract(refined.left.project(LON, LAT, HEIGHT), TRUE[0].project(LON, LAT, HEIGHT))
+    assert np.abs(miss).max() < 4 * max(x, y)
+
+
+def test_a_good_alignment_is_left_as_it_is(images, points):
+    good = start(NONE, NONE, 0.01)
+    refined, _ = refine(good, *images, [points])
+    assert not refined.refinement["applied"]
+    assert "do not contradict" in refined.refinement["reason"]
+    assert refined.refinement["before"] == refined.refinement["after"]
+    for before, after in ((good.left, refined.left), (good.right, refined.right)):
+        assert (before.affine == after.affine).all()
+
+
+def test_changed_ground_does_not_draw_the_result(images, points, tmp_path):
+    """An eighth of the right image has moved, a tenth of the LiDAR is 1.5 m too high."""
+    col, row = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    changed = render(TRUE[1])
+    moved = np.roll(changed, 3, axis=1)
+    part = (col > SIZE[0] / 2) & (row < SIZE[1] / 4)
+    changed[part] = moved[part]
+    right = write_image(tmp_path / "changed.tif", None, changed)
+    cloud = lidar()
+    north = (cloud[:, 1] - LAT) * METRES[1]
+    cloud[north < -170.0, 2] += 1.5
+    store = write_points(tmp_path, cloud)
+    refined, observations = refine(start(NONE, PLANTED, 0.5), images[0], right, [store])
+    assert max(relative_error(refined)) < 0.03
+    assert (~observations.used).mean() > 0.1
+
+
+def test_what_both_images_share_stays_as_the_gcps_say(images, points):
+    """GCPs that are sure of the left image: all of the relative error goes to the right one."""
+    planted = start(NONE, PLANTED, 0.5)
+    sure = replace(planted, left_fit=replace(planted.left_fit, covariance=np.eye(6) * 1e-8))
+    refined, _ = refine(sure, *images, [points])
+    assert np.abs(refined.left.affine - TRUE[0].affine)[:, 2].max() < 1e-3
+    assert max(relative_error(refined)) < 0.02
+
+
+@pytest.mark.parametrize("model", ["shift", "similarity"])
+def test_simpler_models_are_refined_too(images, points, model):
+    shift_only = PLANTED * SHIFT
+    planted = start(NONE, shift_only, 0.5, model)
+    fixed = np.diag([0.0, 0.0, 0.25] * 2)
+    fits = [replace(fit, covariance=fixed) for fit in planted.fits]
+    refined, _ = refine(replace(planted, left_fit=fits[0], right_fit=fits[1]), *images, [points])
+    assert max(relative_error(refined)) < 0.03
+
+
+def test_too_little_to_see_is_said(images, tmp_path):
+    cloud = lidar()
+    corner = cloud[(cloud[:, 0] > LON + 190 / METRES[0])]
+    store = write_points(tmp_path, corner)
+    planted = start(NONE, PLANTED, 0.5)
+    with pytest.raises(InputError, match="without ground control points"):
+        refine(planted, *images, [store])
+
+
+def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
+    cloud = lidar(1.0)
+    half = cloud[:, 0] < LON
+    a, b = (write_points(tmp_path / n, cloud[h], n) for n, h in (("a", half), ("b", ~half)))
+    planted = start(NONE, PLANTED, 0.5)
+    one, other = (refine(planted, *images, stores)[0] for stores in ([a, b], [b, a]))
+    assert one.to_dict() == other.to_dict()
+
+
+def test_json_keeps_the_refinement(images, points, tmp_path):
+    refined, observations = refine(start(NONE, PLANTED, 0.5), *images, [points])
+    files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]
+    write_refinement(refined, observations, *files)
+    again = Alignment.load(files[0])
+    assert again.to_dict() == refined.to_dict()
+    assert (again.covariance == refined.covariance).all()
+    with files[1].open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == refined.refinement["tie_points"]
+    assert sum(row["used"] == "yes" for row in rows) == refined.refinement["used"]
+    assert files[2].stat().st_size > 10_000
+    write_refinement(replace(refined, refinement={"applied": False, "reason": "x"}), None, *files)
+    assert len(files[1].read_text().splitlines()) == 1
+
+
+# ------------------------------------------------------------------------------- the estimate
+
+
+def system(rng: np.random.Generator, n: int = 600):
+    """Design [n, 2, 12] of places on a plane, and the sites that they belong to."""
+    u, v = rng.uniform(-1, 1, (2, n))
+    basis = np.column_stack([u, v, np.ones(n)])
+    design = np.zeros((n, 2, 12))
+    design[:, 0, :3] = design[:, 1, 3:6] = -basis
+    design[:, 0, 6:9] = design[:, 1, 9:] = basis
+    sites = (np.floor(u * 4) * 100 + np.floor(v * 4)).astype(int)
+    return design, sites
+
+
+def test_uncertainty_of_the_estimate_is_honest():
+    """True parameters drawn from the prior, errors shared in sites, a fifth blunders."""
+    rng = np.random.default_rng(3)
+    ratios, chances = [], []
+    prior = np.eye(12) * 0.2**2
+    for _ in range(60):
+        design, sites = system(rng)
+        truth = rng.normal(0, 0.2, 12)
+        own = rng.uniform(0.02, 0.08, len(design))
+        index = np.unique(sites, return_inverse=True)[1]
+        shared = rng.normal(0, 0.03, (index.max() + 1, 2))[index]
+        errors = rng.normal(0, 1, (len(design), 2)) * own[:, None] + shared
+        errors += rng.normal(0, 0.01, 2)
+        bad = rng.random(len(design)) < 0.2
+        errors[bad] += rng.uniform(-3, 3, (bad.sum(), 2))
+        found = estimate(design, design @ truth + errors, own, sites, prior)
+        at = design[rng.integers(0, len(design))]
+        sigma = np.sqrt(np.diag(at @ found.covariance @ at.T))
+        ratios += list(at @ (found.parameters - truth) / sigma)
+        nothing = estimate(design, errors, own, sites, prior)
+        chances.append(nothing.statistic / nothing.freedom)
+    ratios = np.abs(ratios)
+    assert 0.55 < (ratios < 1).mean() < 0.85
+    assert (ratios < 2).mean() > 0.9
+    assert np.median(chances) < 2.0
+
+
+def test_label_sigma_is_the_spread_of_labels():
+    """Against labels of alignments whose parameters are drawn from the covariance."""
+    planted = start(NONE, NONE, 0.1)
+    rng = np.random.default_rng(0)
+    root = rng.normal(0, 0.05, (12, 12))
+    covariance = root @ root.T
+    fits = [
+        replace(fit, covariance=covariance[k : k + 6, k : k + 6])
+        for fit, k in zip(planted.fits, (0, 6))
+    ]
+    alignment = replace(
+        planted, left_fit=fits[0], right_fit=fits[1], cross_covariance=covariance[:6, 6:]
+    )
+    model = fit_epipolar(alignment.left, alignment.right, SIZE, SIZE, HEIGHT)
+    x, y = np.array([100.0, 350.0, 600.0]), np.array([120.0, 500.0, 300.0])
+    ground = *model.epipolar_to_ground(x, y, HEIGHT), HEIGHT
+    labels = []
+    for _ in range(3000):
+        p = root @ rng.normal(0, 1, 12)
+        left, right = (
+            SensorModel(s.rpc, fit.moved(part))
+            for s, fit, part in zip(
+                (alignment.left, alignment.right), alignment.fits, (p[:6], p[6:])
+            )
+        )
+        x_left, y_left = model.left_to_epipolar(*left.project(*ground))
+        x_right, _ = model.right_to_epipolar(*right.project(*ground))
+        labels.append([x_left - x_right, x_left, y_left])
+    for sigma, spread in zip(alignment.label_sigma(model, x, y), np.std(labels, axis=0)):
+        assert sigma == pytest.approx(spread, rel=0.06)
