@@ -408,6 +408,8 @@ def test_histograms_share_their_axis_and_keep_every_label():
     [
         ("labelled_share", "0.123456", "12.35 %"),
         ("mean_px", "-0.1", "−0.100"),
+        ("mean_px", "-0.0001", "0.000"),
+        ("labelled_share", "-0.00001", "0.00 %"),
         ("row0", "1024", "1024"),
         ("labels", "5061336", "5 061 336"),
         ("class", "building", "building"),

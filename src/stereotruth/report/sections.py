@@ -27,6 +27,7 @@ from .tables import (
 )
 
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
+FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
 
 # Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
 # errors in px.
@@ -408,7 +409,7 @@ def provenance(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]
 
 
 def manifest_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Columns that differ between tiles, without files and checksums; quality first."""
+    """Columns that differ between tiles, without files and checksums; ``FIRST`` first."""
     names = [
         name
         for name in rows[0]
@@ -417,4 +418,4 @@ def manifest_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
         and (name in ("tile", "scene", "split", "quality") or len({r[name] for r in rows}) > 1)
         and name != "number"
     ]
-    return sorted(names, key=lambda name: (name != "tile", name != "quality"))
+    return sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))

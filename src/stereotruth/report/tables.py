@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -70,8 +71,8 @@ def number(text: str) -> float | None:
 
 
 def minus(text: str) -> str:
-    """A number's text with the true minus sign."""
-    return text.replace("-", "−")
+    """A number's text with the true minus sign, and none before a zero."""
+    return re.sub(r"-(?=0\.?0*(?![\d.]))", "", text).replace("-", "−")
 
 
 def show(name: str, text: str) -> str:
