@@ -56,6 +56,10 @@ ROUNDS = 5
 SETTLED = 0.01  # px, change of a round after which no other follows
 MOVED = 3.0  # px in the left image after which places are looked for anew
 MIN_PLACES, MIN_SITES = 30, 8
+LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
+MIN_USED = 0.5
+DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
+FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
 TUKEY = 4.685  # deviations at which an observation has lost all weight
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
 
@@ -82,7 +86,8 @@ class _Estimate:
     """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on.
 
     ``ratio``, ``site_ratio`` [2]: standard deviation of a match along and across the rows, and the
-    part that a site shares, in units of the match's own.
+    part that a site shares, in units of the match's own. ``statistic``: chi-square of the
+    observations against no change, ``pull``: that of the change against the prior.
     """
 
     parameters: Floats
@@ -92,6 +97,8 @@ class _Estimate:
     site_ratio: Floats
     statistic: float
     freedom: int
+    pull: float
+    pull_freedom: int
 
 
 # ------------------------------------------------------------------------------------ estimation
@@ -177,15 +184,28 @@ def estimate(
         normal -= (shared / total) @ shared.T
         right -= (shared / total) @ np.sum(information * observed, axis=0)
         last = z
-        z = np.linalg.solve(np.eye(rank) + normal, right)
+        # Weights and scatter are those about what the tie points say by themselves: an alignment
+        # that is far off and sure of itself shall not make them look bad.
+        z = np.linalg.solve(FREE * np.eye(rank) + normal, right)
         residuals = observed - inner @ z
         if step > 12 and np.abs(inner @ (z - last)).max() < 1e-5:
             break
+    z = np.linalg.solve(np.eye(rank) + normal, right)
     values, vectors = np.linalg.eigh(normal)
     seen = values > 1e-9 * values.max()
     statistic = float(np.sum((vectors[:, seen].T @ right) ** 2 / values[seen]))
     covariance = root @ np.linalg.inv(np.eye(rank) + normal) @ root.T
-    return _Estimate(root @ z, covariance, weights, sigma, site_sigma, statistic, int(seen.sum()))
+    return _Estimate(
+        root @ z,
+        covariance,
+        weights,
+        sigma,
+        site_sigma,
+        statistic,
+        int(seen.sum()),
+        float(z @ z),
+        rank,
+    )
 
 
 # ----------------------------------------------------------------------------------- observations
@@ -369,6 +389,13 @@ def _search(
         observed + design @ (last - parameters),
         found.weights > 0.0,
     )
+    scatter = max(_scale(observations.after[:, k], found.weights > 0.0) for k in (0, 1))
+    used = float(np.mean(found.weights > 0.0))
+    if scatter > LOOSE or used < MIN_USED:
+        return (
+            f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
+            "blunders): LiDAR and images do not show the same ground, or not at the same height"
+        )
     return observations, found, current
 
 
@@ -378,6 +405,20 @@ def _pull(design: Floats, observed: Floats, prior: Floats) -> Floats:
     inner = (design @ root).reshape(-1, root.shape[1])
     normal = np.eye(root.shape[1]) + inner.T @ inner / len(design)
     return root @ np.linalg.solve(normal, inner.T @ observed.ravel() / len(design))
+
+
+def _doubts(alignment: Alignment, record: Mapping[str, Any], found: _Estimate) -> list[str]:
+    """What is odd about a refinement that is applied all the same."""
+    if chi2.sf(found.pull, found.pull_freedom) > DOUBTFUL:
+        return []
+    ratio = abs(_epipolar(alignment).report["disparity_px_per_m"]["mean"])
+    offset = record["before"]["disparity"]["median"]
+    return [
+        "LiDAR and images differ by more than the ground control points' own scatter explains: "
+        f"{offset:+.2f} px of disparity ({offset / ratio:+.2f} m of height), "
+        f"{record['before']['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
+        "vertical datum and the points' heights"
+    ]
 
 
 def _moved_left(alignment: Alignment, parameters: Floats) -> float:
@@ -431,8 +472,12 @@ def refine(
         refined = alignment
         observations = replace(observations, after=observations.before)
         record["after"] = record["before"]
+    doubts = [] if insignificant else _doubts(alignment, record, found)
+    for text in doubts:
+        log.warning("warning: %s", text)
     refined = replace(
         refined,
+        warnings=(*alignment.warnings, *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],

@@ -218,12 +218,15 @@ def _covered(
     right: SensorModel,
     right_size: tuple[int, int],
     stores: Sequence[PointStore],
+    heights: tuple[float, float],
     col: float,
     row: float,
 ) -> tuple[float, float] | None:
-    """Range of heights (m) at a left position that LiDAR and right image cover, else None."""
-    low = min(store.bounds[4] for store in stores)
-    high = max(store.bounds[5] for store in stores)
+    """Range of heights (m) at a left position that LiDAR and right image cover, else None.
+
+    ``heights``: that of all points.
+    """
+    low, high = heights
     for _ in range(3):
         lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
         if not np.isfinite(lon):
@@ -250,12 +253,13 @@ def choose_sites(
     cols, rows = sizes[0]
     if min(cols, rows) < SITE:
         return []
+    every = min(s.bounds[4] for s in stores), max(s.bounds[5] for s in stores)
 
     def grid(spacing: float) -> list[Site]:
         found = []
         for row in np.arange(spacing / 2, rows, spacing):
             for col in np.arange(spacing / 2, cols, spacing):
-                heights = _covered(left, right, sizes[1], stores, col, row)
+                heights = _covered(left, right, sizes[1], stores, every, col, row)
                 if heights is not None:
                     corner = (
                         min(max(int(at) - SITE // 2, 0), n - SITE)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.alignment import Alignment, ViewFit
+from stereotruth.alignment import Alignment, GcpResidual, ViewFit
 from stereotruth.epipolar import fit_epipolar
 from stereotruth.errors import InputError
 from stereotruth.refinement import estimate, refine
@@ -194,6 +194,38 @@ def test_too_little_to_see_is_said(images, tmp_path):
     planted = start(NONE, PLANTED, 0.5)
     with pytest.raises(InputError, match="without ground control points"):
         refine(planted, *images, [store])
+
+
+def gcp() -> GcpResidual:
+    nothing = (0.0, 0.0)
+    return GcpResidual("G1", LON, LAT, HEIGHT, *[nothing] * 5, True)
+
+
+def with_gcp(alignment: Alignment) -> Alignment:
+    """What was fitted to ground control points, so that it can stand without a refinement."""
+    fits = [replace(fit, gcps=(gcp(),)) for fit in alignment.fits]
+    return replace(alignment, left_fit=fits[0], right_fit=fits[1])
+
+
+def test_lidar_of_another_datum_changes_nothing(images, tmp_path):
+    cloud = lidar()
+    cloud[:, 2] += 25.0
+    store = write_points(tmp_path, cloud)
+    planted = with_gcp(start(NONE, NONE, 0.05))
+    refined, _ = refine(planted, *images, [store])
+    assert not refined.refinement["applied"]
+    assert refined.refinement["reason"]
+    assert (refined.right.affine == planted.right.affine).all()
+
+
+def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
+    cloud = lidar()
+    cloud[:, 2] += 1.0
+    store = write_points(tmp_path, cloud)
+    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
+    assert refined.refinement["applied"]
+    assert len(refined.warnings) == 1 and "vertical datum" in refined.warnings[0]
+    assert "+1.0" in refined.warnings[0] or "+0.9" in refined.warnings[0]
 
 
 def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
