@@ -454,7 +454,7 @@ def _write_tile(
     write_tiff(folder / files["right"], right, nodata=0)
     checks = None
     if window.labelled:
-        checks = _check(source, here, left, right, height, known, stored, building_share)
+        checks = _check(source, here, left, right, known, stored, building_share)
         files["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
         files["status"] = f"status/{prefix}_status_{number}.tiff"
         if (stored[known] == nodata).any():
@@ -526,7 +526,6 @@ def _check(
     here: tuple[slice, slice],
     left: NDArray[np.uint16],
     right: NDArray[np.uint16],
-    height: NDArray[np.float32],
     known: NDArray[np.bool_],
     stored: NDArray[np.float32],
     building_share: float,
@@ -539,7 +538,7 @@ def _check(
         surface_class = np.asarray(source.surface_class[here])
     x = np.arange(left.shape[1])[None, :] - disparity
     return _Checks(
-        kind=tile_class(surface_class, height.astype(np.float64), building_share),
+        kind=tile_class(surface_class, source.height, here, building_share),
         matches=match_tile(left, right, disparity, surface_class),
         warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
     )

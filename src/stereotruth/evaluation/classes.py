@@ -11,6 +11,8 @@ small houses in forests on slopes; of tiles without houses, 0.4 % pass for build
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +65,23 @@ def buildings_by_shape(height: Floats) -> NDArray[np.bool_]:
     return raised & (cv2.dilate(flat.astype(np.uint8), square) > 0)
 
 
-def tile_class(surface_class: NDArray[np.uint8], height: Floats, building_share: float) -> str:
-    """Class of a tile [h, w] from the LiDAR's classes (0: unknown) or its heights (m)."""
+def tile_class(
+    surface_class: NDArray[np.uint8],
+    height: Any,
+    here: tuple[slice, slice],
+    building_share: float,
+) -> str:
+    """Class of a tile from the LiDAR's classes in it (0: unknown), or from heights.
+
+    ``height``: of the whole scene, m, NaN where there is none (may be a Zarr array); ``here``: the
+    tile's rows and columns in it. Heights are read with ``GROUND_PX`` of their surroundings.
+    """
     if np.isin(surface_class, CLASSED_CODES).any():
         found, of = surface_class == BUILDING_CODE, surface_class != 0
     else:
-        found, of = buildings_by_shape(height), np.isfinite(height)
+        wide = tuple(slice(max(s.start - GROUND_PX, 0), s.stop + GROUND_PX) for s in here)
+        tile = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(here, wide))
+        values = np.asarray(height[wide], dtype=np.float64)
+        found, of = buildings_by_shape(values)[tile], np.isfinite(values[tile])
     share = found.sum() / max(of.sum(), 1)
     return BUILDING if share >= building_share else VEGETATION
