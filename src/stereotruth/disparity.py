@@ -1,21 +1,22 @@
 """Points to disparity: the stage `project` (paper, section III-C).
 
-Every point is projected into both rectified images; hidden points are removed
-(:mod:`stereotruth.correlation`, :mod:`stereotruth.occlusion`); what is left of a pixel of the left
-epipolar grid is condensed to one ground point, whose own projections give
-d = x_left - x_right (px). A point belongs to the pixel (floor(x_left + 0.5), floor(y_left + 0.5)).
+Every point is projected into both rectified images; hidden points are removed; what is left of a
+pixel of the left epipolar grid is condensed to one label, d = x_left - x_right (px), see
+:mod:`stereotruth.representative`. A point belongs to the pixel (floor(x_left + 0.5),
+floor(y_left + 0.5)).
 
-A pixel's representative is condensed from the points that passed, by exact integer sums:
+What is tested, in this order; a pixel has the status of the first test that leaves it nothing, that
+of its point that got furthest:
 
-- ``top``: mean longitude, latitude and height of the points on the top surface at the pixel's
-  centre (:func:`stereotruth.occlusion.seen_surface`). No bias by the largest of several noisy
-  heights, and no mixture where a roof's edge and the ground share a pixel. Points of other surfaces
-  count as hidden from the left, with every method. Where an edge passes within ``edge_margin_px``
-  of the centre, noise of the alignment decides which surface it meets: no label.
-- ``paper``: mean longitude and latitude of all points, height of the highest.
-
-Each pixel has one status, that of its point that got furthest through the tests in the order
-frame, left view, right view, correlation, edge, number of points; see :class:`Status`.
+1. of each point: does it lie in both frames; is it on the surface that its pixel's centre sees
+   (:func:`stereotruth.occlusion.seen_surface`; with the representative ``top`` or geometric
+   visibility); do the image windows around it correlate (method ``correlation``: the paper's
+   filter, :mod:`stereotruth.correlation`);
+2. of each pixel: do both cameras see it past the other surfaces
+   (:func:`stereotruth.occlusion.hidden_pixels`; ``geometric``, ``both``); is an edge of its surface
+   within ``edge_margin_px`` of its centre; do its neighbours carry its surface
+   (:func:`stereotruth.agreement.supported`); do the images agree with what the LiDAR has there, and
+   is it no water (:func:`stereotruth.agreement.outvoted`; ``both``); are there ``min_points``.
 
 The grid is worked on in blocks of one shard, each independent of the others; a block is cut into
 windows of a bounded number of points. The result has the same bytes for any number of workers, size
@@ -25,7 +26,7 @@ of windows, and order of blocks, stores and points.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from functools import cached_property
@@ -38,7 +39,8 @@ import zarr
 from numba import njit
 from numpy.typing import NDArray
 
-from .correlation import correlate, in_frame, read_patch
+from .agreement import VOTE_PX, outvoted, supported, surface_correlation, warp_to_left
+from .correlation import Patch, correlate, in_frame, read_patch
 from .epipolar import EpipolarModel
 from .errors import InputError
 from .grid_store import Layer, blocks, building, create_grid, require_complete
@@ -47,14 +49,14 @@ from .occlusion import (
     FILL_RADII,
     METHODS,
     Rays,
-    box_sum,
     build_surface,
     exact_sums,
     hidden_pixels,
     seen_surface,
 )
-from .points import LATTICE_DEG, LATTICE_M, Points, PointStore, query_points
+from .points import LATTICE_DEG, Points, PointStore, query_points
 from .provenance import describe, digest
+from .representative import REPRESENTATIVES, Labels, Pixels, at_centres, at_points, condense
 from .runlog import BlockProgress
 
 log = logging.getLogger("stereotruth")
@@ -64,12 +66,8 @@ Box = tuple[float, float, float, float]
 
 CHUNK = 256
 SHARD = 1024
-MARGIN = EDGE + 1  # px around a window; one for the uncertainty's 3 x 3 pixels
-REPRESENTATIVES = ("top", "paper")
 MAX_POINTS = 2_500_000  # expected in a window; some 120 bytes each at the peak
-HEIGHT_NOISE_M = 0.05  # what airborne LiDAR has at least; floor of the spread in a pixel
-_PER_PX = 1 << 16  # disparity spreads and correlations are summed as integers of 2^-16
-_PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
+WATER_CLASS = 9  # ASPRS
 
 
 class Status(IntEnum):
@@ -86,15 +84,13 @@ class Status(IntEnum):
     EDGE_IN_PIXEL = 8
 
 
-# The tests in their order; a point's stage is the test that it failed. Higher got further.
+# The tests of points in their order; a point's stage is the test that it failed.
 _ORDER = (
     Status.NO_POINTS,
     Status.OUT_OF_FRAME,
     Status.HIDDEN_IN_LEFT,
-    Status.HIDDEN_IN_RIGHT,
     Status.LOW_CORRELATION,
-    Status.EDGE_IN_PIXEL,
-    Status.BELOW_MINIMUM_COUNT,
+    Status.LABELLED,
 )
 _STAGE = {status: np.uint8(stage) for stage, status in enumerate(_ORDER)}
 _STATUS_OF_STAGE = np.array(_ORDER, dtype=np.uint8)
@@ -108,7 +104,7 @@ class Settings:
     window: int = 9
     correlation_threshold: float = 0.5
     representative: str = "top"
-    edge_margin_px: float = 0.25
+    edge_margin_px: float = 0.05
     min_points: int = 1
 
     def __post_init__(self) -> None:
@@ -123,11 +119,6 @@ class Settings:
             )
 
     @property
-    def uses_correlation(self) -> bool:
-        """Whether windows of the images are compared."""
-        return self.method in ("correlation", "both")
-
-    @property
     def uses_seen_surface(self) -> bool:
         """Whether points off the surface that the centre sees count as hidden from the left."""
         return self.uses_geometry or self.representative == "top"
@@ -137,20 +128,35 @@ class Settings:
         """Whether rays are tested against the surface of the points."""
         return self.method in ("geometric", "both")
 
+    @property
+    def images_window(self) -> int:
+        """Side in px of the window that the method compares in both images; 1 for none."""
+        return self.window if self.method in ("correlation", "both") else 1
 
-def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
+    @property
+    def margin(self) -> int:
+        """Pixels around a window whose points have a say in it."""
+        # one for each ring of neighbours: planes, their pooled noise, support
+        reach = EDGE + 3
+        return reach + VOTE_PX + self.window // 2 if self.method == "both" else reach
+
+
+def layers(settings: Settings) -> dict[str, Layer]:
     """The arrays of a disparity store."""
-    condensed, meant = (
+    condensed, used = (
         (
-            "mean longitude, latitude and height",
-            "points on the surface that the pixel's centre sees and that were not found hidden",
+            "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
+            "of its neighbours on the same surface",
+            "points on the surface that the pixel's centre sees",
         )
         if settings.representative == "top"
-        else (
-            "mean longitude and latitude, greatest height",
-            "points that were not found hidden",
-        )
+        else ("disparity of the point at mean longitude and latitude, greatest height", "points")
     )
+    compared = {
+        "correlation": "mean correlation coefficient of the image windows at the points used",
+        "both": "correlation coefficient of left and warped right image over the pixels of the "
+        f"same surface in {settings.window} x {settings.window} px",
+    }
     return {
         "disparity": Layer(
             "float32",
@@ -159,7 +165,7 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
                 "units": "px",
                 "long_name": "ground-truth disparity x_left - x_right of the left view",
                 "nodata": "NaN",
-                "representative": f"{settings.representative}: {condensed} of the {meant}",
+                "representative": f"{settings.representative}: {condensed}",
             },
         ),
         "status": Layer(
@@ -171,8 +177,11 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
                 "flag_values": [int(status) for status in Status],
                 "flag_meanings": " ".join(status.name.lower() for status in Status),
                 "hidden_in_left": "no point of the pixel lies on the surface that its centre sees",
-                "precedence": "of the point that got furthest through the tests: frame, left "
-                "view, right view, correlation, edge, number of points",
+                "changed": "LiDAR and images show different surfaces there, or water",
+                "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other "
+                "surfaces",
+                "precedence": "frame, left view, correlation of points; right view, edge, change, "
+                "number of points of pixels",
             },
         ),
         "height": Layer(
@@ -189,7 +198,7 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
             0,
             {
                 "units": "1",
-                "long_name": f"number of points used: {meant}",
+                "long_name": f"number of points used: {used}",
                 "comment": "counts above 65535 are stored as 65535",
             },
         ),
@@ -198,9 +207,8 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
             np.nan,
             {
                 "units": "1",
-                "long_name": "mean correlation coefficient of the image windows at the points used",
+                "long_name": compared.get(settings.method, "none: no windows are compared"),
                 "nodata": "NaN",
-                "comment": "also NaN where the method compares no windows",
             },
         ),
         "uncertainty": Layer(
@@ -208,18 +216,24 @@ def layers(settings: Settings, alignment_sigma_px: float) -> dict[str, Layer]:
             np.nan,
             {
                 "units": "px",
-                "long_name": "standard uncertainty of the disparity (coarse)",
+                "long_name": "standard uncertainty of the disparity",
                 "nodata": "NaN",
-                "formula": "sqrt(max(s, f)^2 / n + a^2): s standard deviation of the disparities "
-                "of the points used about their pixel's mean, pooled over 3 x 3 pixels; f that of "
-                f"{HEIGHT_NOISE_M:g} m of height; n point_count; a alignment, "
-                f"{alignment_sigma_px:g} px",
+                "formula": "sqrt(v / n + p + a^2 + (gx ax)^2 + (gy ay)^2): v variance of the "
+                "points' disparities about their surface, pooled over 3 x 3 pixels; n point_count; "
+                "p variance of the plane to the centre; g slope of the disparity; a standard "
+                "uncertainty of disparity and of place (ax, ay) by the alignment",
+            },
+        ),
+        "surface_class": Layer(
+            "uint8",
+            0,
+            {
+                "units": "1",
+                "long_name": "LAS class (ASPRS) of the highest point used",
+                "comment": "0: never classified, or no label",
             },
         ),
     }
-
-
-# ------------------------------------------------------------------------------------ condensing
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -228,94 +242,42 @@ def _furthest(pixel: NDArray[np.int64], stage: NDArray[np.uint8], out: NDArray[n
         out[pixel[k]] = max(out[pixel[k]], stage[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _collect(
-    pixel: NDArray[np.int64],
-    use: NDArray[np.bool_],
-    h_q: NDArray[np.int64],
-    fall: NDArray[np.int64],
-    correlation: NDArray[np.int64],
-    out: NDArray[np.int64],
-) -> None:
-    """Per pixel: greatest height, sums of ``fall``, of its square, and of ``correlation``."""
-    for k in range(pixel.size):
-        if use[k]:
-            i = pixel[k]
-            out[i, 0] = max(out[i, 0], h_q[k])
-            out[i, 1] += fall[k]
-            out[i, 2] += fall[k] * fall[k]
-            out[i, 3] += correlation[k]
-
-
-def condense(
-    model: EpipolarModel,
-    points: Points,
-    disparity: Floats,
-    pixel: NDArray[np.int64],
-    use: NDArray[np.bool_],
-    correlation: NDArray[np.float32] | None,
-    shape: tuple[int, int],
-    settings: Settings,
-    px_per_m: float,
-    alignment_sigma_px: float,
-) -> dict[str, NDArray]:
-    """Layers of a window from its points in ``use``; arrays of ``shape``, without status.
-
-    ``disparity`` (px), ``pixel`` (row-major index into ``shape``) and ``correlation`` are those of
-    the points. Pixels of fewer points than ``settings.min_points`` hold their count only. The
-    uncertainty of the outermost ring of pixels lacks neighbours.
-    """
-    size = shape[0] * shape[1]
-    sums = exact_sums(points, pixel, use, size)
-    # Disparities relative to the pixel's height, as integers: exact sums in any order.
-    fall = np.zeros(len(points), dtype=np.int64)
-    reference = np.full(size, np.nan)
-    n = sums[:, 0]
-    found = np.flatnonzero(n)
-    lon, lat = sums[found, 1] / n[found] / _PER_DEG, sums[found, 2] / n[found] / _PER_DEG
-    more = np.zeros((size, 4), dtype=np.int64)
-    more[:, 0] = np.iinfo(np.int64).min
-    quantised = np.zeros(len(points), dtype=np.int64)
-    if correlation is not None:
-        quantised[use] = np.rint(correlation[use].astype(np.float64) * _PER_PX)
-    mean_height = sums[found, 3] / n[found] / _PER_M
-    xy = model.ground_to_epipolar(lon, lat, mean_height)
-    reference[found] = xy[0] - xy[2]
-    fall[use] = np.rint((disparity[use] - reference[pixel[use]]) * _PER_PX)
-    _collect(pixel, use, points.h_q, fall, quantised, more)
-    highest = more[found, 0] / _PER_M
-    if settings.representative == "paper":
-        xy = model.ground_to_epipolar(lon, lat, highest)
-
-    squares = np.zeros(size)
-    fallen = more[found, 1] / n[found]
-    squares[found] = (more[found, 2] - fallen * fallen * n[found]) / _PER_PX**2
-    freedom = np.zeros(size)
-    freedom[found] = n[found] - 1
-    squares, freedom = box_sum(squares.reshape(shape)), box_sum(freedom.reshape(shape))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.where(freedom > 0, squares / freedom, 0.0).reshape(-1)[found]
-    variance = np.maximum(variance, (HEIGHT_NOISE_M * px_per_m) ** 2)
-
-    kept = n[found] >= settings.min_points
-    out = {
-        "disparity": (xy[0] - xy[2]),
-        "height": highest,
-        "uncertainty": np.sqrt(variance / n[found] + alignment_sigma_px**2),
-    }
-    if correlation is not None:
-        out["correlation"] = more[found, 3] / n[found] / _PER_PX
-    result = {}
-    for name in ("disparity", "height", "uncertainty", "correlation"):
-        layer = np.full(size, np.nan, dtype=np.float32)
-        if name in out:
-            layer[found[kept]] = out[name][kept]
-        result[name] = layer.reshape(shape)
-    result["point_count"] = np.minimum(n, 65535).astype(np.uint16).reshape(shape)
-    return result
-
-
 # --------------------------------------------------------------------------------------- windows
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentSigma:
+    """Standard uncertainty (px) that the alignment gives to labels, on nodes over the left grid.
+
+    ``nodes`` [3, rows, cols]: of the disparity, and of the label's place along x and y; ``step`` px
+    between nodes, the first at pixel (0, 0).
+    """
+
+    nodes: Floats
+    step: float
+
+    @classmethod
+    def of(cls, attrs: Mapping[str, Any]) -> AlignmentSigma:
+        """From the attributes of the rectified left image; zero where they do not tell."""
+        known = attrs.get("alignment_sigma")
+        if known is None:
+            return cls(np.zeros((3, 1, 1)), 1.0)
+        nodes = np.array([known[name] for name in ("disparity", "x", "y")], dtype=np.float64)
+        return cls(np.nan_to_num(nodes, nan=float(np.nanmax(nodes, initial=0.0))), known["step_px"])
+
+    def at(self, x: Floats, y: Floats) -> Floats:
+        """[3, …] at pixels, bilinear between the nodes."""
+        rows, cols = self.nodes.shape[1:]
+        v, u = np.clip(y / self.step, 0, rows - 1), np.clip(x / self.step, 0, cols - 1)
+        j, i = (
+            np.minimum(v.astype(int), max(rows - 2, 0)),
+            np.minimum(u.astype(int), max(cols - 2, 0)),
+        )
+        below, beside = np.minimum(j + 1, rows - 1), np.minimum(i + 1, cols - 1)
+        v, u = v - j, u - i
+        n = self.nodes
+        upper = (1 - u) * n[:, j, i] + u * n[:, j, beside]
+        return (1 - v) * upper + v * ((1 - u) * n[:, below, i] + u * n[:, below, beside])
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +288,6 @@ class _Scene:
     right_store: Path
     point_stores: tuple[Path, ...]
     settings: Settings
-    alignment_sigma_px: float
     max_points: int
 
     def __getstate__(self) -> dict[str, Any]:
@@ -348,12 +309,17 @@ class _Scene:
     def rays(self) -> Rays:
         return Rays.of(self.model)
 
+    @cached_property
+    def alignment_sigma(self) -> AlignmentSigma:
+        return AlignmentSigma.of(require_complete(self.left_store).attrs)
+
     # -- where the points of a window are
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
-        x = np.linspace(cols.start - MARGIN - 1.0, cols.stop + MARGIN, 5)
-        y = np.linspace(rows.start - MARGIN - 1.0, rows.stop + MARGIN, 5)
+        margin = self.settings.margin
+        x = np.linspace(cols.start - margin - 1.0, cols.stop + margin, 5)
+        y = np.linspace(rows.start - margin - 1.0, rows.stop + margin, 5)
         edge_x = np.concatenate([x, x, np.full(5, x[0]), np.full(5, x[-1])])
         edge_y = np.concatenate([np.full(5, y[0]), np.full(5, y[-1]), y, y])
         ground = np.hstack(
@@ -421,14 +387,14 @@ class _Scene:
         boxes = self.boxes(rows, cols)
         if boxes is None:
             return None
-        settings = self.settings
+        settings, margin = self.settings, self.settings.margin
         points = query_points(self.stores, *boxes[settings.uses_geometry])
         if len(points) == 0:
             return None
         surface = build_surface(points, self.rays) if settings.uses_geometry else None
         wide = (
-            slice(rows.start - MARGIN, rows.stop + MARGIN),
-            slice(cols.start - MARGIN, cols.stop + MARGIN),
+            slice(rows.start - margin, rows.stop + margin),
+            slice(cols.start - margin, cols.stop + margin),
         )
         shape = wide[0].stop - wide[0].start, wide[1].stop - wide[1].start
         xy = self.model.ground_to_epipolar(points.lon, points.lat, points.height)
@@ -446,71 +412,141 @@ class _Scene:
         points = Points(*(getattr(points, f.name)[inside] for f in fields(Points)))
         pixel = (np.floor(xy[1] + 0.5).astype(np.int64) - wide[0].start) * shape[1]
         pixel += np.floor(xy[0] + 0.5).astype(np.int64) - wide[1].start
-        stage, use, correlation = self.judge(points, xy, pixel, wide, surface)
-        result = condense(
-            self.model,
-            points,
-            xy[0] - xy[2],
-            pixel,
-            use,
-            correlation,
-            shape,
-            settings,
-            self.rays.px_per_m,
-            self.alignment_sigma_px,
+        low, high = int(np.floor(xy[2].min())) - 1, int(np.floor(xy[2].max())) + 3
+        left = read_patch(self.images[0], *wide, settings.images_window)
+        right = read_patch(self.images[1], wide[0], slice(low, high), settings.images_window)
+
+        stage, use, edge, correlation = self.test_points(xy, pixel, wide, left, right)
+        pixels = condense(
+            self.model, points, xy, pixel, use, correlation, shape, settings.representative
         )
         furthest = np.zeros(shape[0] * shape[1], dtype=np.uint8)
         _furthest(pixel, stage, furthest)
         status = _STATUS_OF_STAGE[furthest].reshape(shape)
-        status[np.isfinite(result["disparity"])] = Status.LABELLED
-        result["status"] = status
-        own = np.zeros(shape, dtype=np.bool_)
-        inner = slice(MARGIN, -MARGIN)
-        own[inner, inner] = True
-        own = own.reshape(-1)[pixel]
-        counts = np.array(
-            [own.sum(), (own & (stage > _STAGE[Status.OUT_OF_FRAME])).sum(), (own & use).sum()]
+        if surface is not None:
+            sums = exact_sums(points, pixel, use, status.size)
+            hidden = hidden_pixels(surface, self.rays, sums, *wide).reshape(shape)
+            status[hidden == 1] = Status.HIDDEN_IN_LEFT
+            status[hidden == 2] = Status.HIDDEN_IN_RIGHT
+        if edge is not None:
+            on_edge = np.zeros(status.size, dtype=np.bool_)
+            on_edge[pixel[edge]] = True
+            status[(status == Status.LABELLED) & on_edge.reshape(shape)] = Status.EDGE_IN_PIXEL
+        labels = self.labels(pixels, status == Status.LABELLED, wide)
+        agreement = pixels.correlation
+        if settings.method == "both":
+            agreement = self.test_agreement(labels, pixels, status, left, right, wide)
+        if settings.uses_geometry:
+            known = np.where(status == Status.LABELLED, labels.disparity, np.nan)
+            alone = np.isfinite(known) & ~supported(known, status != Status.NO_POINTS)
+            status[alone] = Status.EDGE_IN_PIXEL
+        few = (status == Status.LABELLED) & (pixels.count < settings.min_points)
+        status[few] = Status.BELOW_MINIMUM_COUNT
+        return self.collected(pixels, labels, agreement, status, wide), self.counted(
+            pixel, stage, status
         )
-        return {name: layer[inner, inner] for name, layer in result.items()}, counts
 
-    def judge(
+    def test_points(
         self,
-        points: Points,
         xy: Floats,
         pixel: NDArray[np.int64],
         wide: tuple[slice, slice],
-        surface: Any,
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32] | None]:
-        """Stage of every point (see _ORDER), which may be used, and their correlation."""
+        left: Patch,
+        right: Patch,
+    ) -> tuple[
+        NDArray[np.uint8],
+        NDArray[np.bool_],
+        NDArray[np.bool_] | None,
+        NDArray[np.float32] | None,
+    ]:
+        """Per point: stage (see _ORDER), which are used, which see an edge, correlation."""
         settings = self.settings
-        window = settings.window if settings.uses_correlation else 1
-        low, high = int(np.floor(xy[2].min())), int(np.floor(xy[2].max())) + 2
-        left = read_patch(self.images[0], *wide, window)
-        right = read_patch(self.images[1], wide[0], slice(low, high), window)
         use = in_frame(left, right, xy)
-        stage = np.where(use, _STAGE[Status.BELOW_MINIMUM_COUNT], _STAGE[Status.OUT_OF_FRAME])
-        size = (wide[0].stop - wide[0].start) * (wide[1].stop - wide[1].start)
+        stage = np.where(use, _STAGE[Status.LABELLED], _STAGE[Status.OUT_OF_FRAME])
+        edge = correlation = None
         if settings.uses_seen_surface:
             framed = use
             use, edge = seen_surface(xy, pixel, framed, *wide, settings.edge_margin_px)
             stage[framed & ~use] = _STAGE[Status.HIDDEN_IN_LEFT]
-        if settings.uses_geometry:
-            sums = exact_sums(points, pixel, use, size)
-            hidden = hidden_pixels(surface, self.rays, sums, *wide)[pixel]
-            stage[use & (hidden == 1)] = _STAGE[Status.HIDDEN_IN_LEFT]
-            stage[use & (hidden == 2)] = _STAGE[Status.HIDDEN_IN_RIGHT]
-            use &= hidden == 0
-        correlation = None
-        if settings.uses_correlation:
-            correlation = np.full(len(points), np.nan, dtype=np.float32)
+        if settings.method == "correlation":
+            correlation = np.full(use.size, np.nan, dtype=np.float32)
             correlation[use] = correlate(left, right, xy[:, use], settings.window)
             fail = use & ~(correlation >= settings.correlation_threshold)
             stage[fail] = _STAGE[Status.LOW_CORRELATION]
             use &= ~fail
-        if settings.representative == "top":
-            stage[use & edge] = _STAGE[Status.EDGE_IN_PIXEL]
-            use &= ~edge
-        return stage, use, correlation
+        return stage, use, edge if settings.representative == "top" else None, correlation
+
+    def labels(self, pixels: Pixels, valid: NDArray[np.bool_], wide: tuple[slice, slice]) -> Labels:
+        """Labels of the valid pixels by the settings' representative."""
+        if self.settings.representative == "paper":
+            return at_points(pixels, valid, self.rays.px_per_m)
+        first = wide[0].start, wide[1].start
+        return at_centres(pixels, valid, first, self.rays.px_per_m)
+
+    def test_agreement(
+        self,
+        labels: Labels,
+        pixels: Pixels,
+        status: NDArray[np.uint8],
+        left: Patch,
+        right: Patch,
+        wide: tuple[slice, slice],
+    ) -> Floats:
+        """Correlation of the images over each pixel's surface; sets what has changed in status."""
+        warped = warp_to_left(right, *wide, labels.disparity)
+        top, side = wide[0].start - left.row, wide[1].start - left.col
+        shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
+        found = surface_correlation(
+            shown.astype(np.float64), warped, labels.disparity, self.settings.window
+        )
+        changed = outvoted(found, labels.disparity, self.settings.correlation_threshold)
+        changed |= (status == Status.LABELLED) & (pixels.surface_class == WATER_CLASS)
+        status[changed] = Status.CHANGED
+        return found
+
+    def collected(
+        self,
+        pixels: Pixels,
+        labels: Labels,
+        correlation: Floats,
+        status: NDArray[np.uint8],
+        wide: tuple[slice, slice],
+    ) -> dict[str, NDArray]:
+        """The layers of a window, without its margin."""
+        margin = self.settings.margin
+        inner = slice(margin, -margin), slice(margin, -margin)
+        y, x = np.mgrid[wide][:, *inner].astype(np.float64)
+        sigma, sigma_x, sigma_y = self.alignment_sigma.at(x, y)
+        slope = labels.slope[:, *inner]
+        variance = labels.variance[inner] + sigma**2
+        variance = variance + (slope[0] * sigma_x) ** 2 + (slope[1] * sigma_y) ** 2
+        values = {
+            "disparity": labels.disparity[inner],
+            "height": pixels.highest[inner],
+            "correlation": correlation[inner],
+            "uncertainty": np.sqrt(variance),
+        }
+        known = status[inner] == Status.LABELLED
+        result = {name: np.where(known, v, np.nan).astype(np.float32) for name, v in values.items()}
+        kept = known | (status[inner] == Status.BELOW_MINIMUM_COUNT)
+        count = np.where(kept, np.minimum(pixels.count[inner], 65535), 0)
+        result["point_count"] = count.astype(np.uint16)
+        result["surface_class"] = np.where(known, pixels.surface_class[inner], 0).astype(np.uint8)
+        result["status"] = status[inner]
+        return result
+
+    def counted(
+        self, pixel: NDArray[np.int64], stage: NDArray[np.uint8], status: NDArray[np.uint8]
+    ) -> NDArray[np.int64]:
+        """Points of a window without its margin: all, in both frames, used."""
+        own = np.zeros(status.shape, dtype=np.bool_)
+        inner = slice(self.settings.margin, -self.settings.margin)
+        own[inner, inner] = True
+        own = own.reshape(-1)[pixel]
+        labelled = np.isin(status, (Status.LABELLED, Status.BELOW_MINIMUM_COUNT)).reshape(-1)[pixel]
+        used = own & (stage == _STAGE[Status.LABELLED]) & labelled
+        framed = own & (stage > _STAGE[Status.OUT_OF_FRAME])
+        return np.array([own.sum(), framed.sum(), used.sum()])
 
     # -- one block
 
@@ -609,23 +645,21 @@ def project_scene(
     window: int = 9,
     correlation_threshold: float = 0.5,
     representative: str = "top",
-    edge_margin_px: float = 0.25,
+    edge_margin_px: float = 0.05,
     min_points: int = 1,
     workers: int = 1,
     scheduler: Any = "threads",
     code: str = "",
     scene: str = "",
-    alignment_sigma_px: float = 0.0,
     max_points: int = MAX_POINTS,
 ) -> dict[str, Any]:
     """Project the points of a scene and write its disparity grid; returns the summary.
 
     ``left_store``, ``right_store``: rectified images made by `rectify`; ``point_stores``: made by
     `ingest`, in any order. ``method`` is one of METHODS: ``correlation`` (the paper's filter),
-    ``geometric`` (visibility in both views from the points), ``both`` (geometric, then the
-    filter on what is left), ``none``. ``scheduler`` is what Dask's compute takes;
+    ``geometric`` (visibility in both views from the points), ``both`` (geometric, and what the
+    images contradict is ``changed``), ``none``. ``scheduler`` is what Dask's compute takes;
     ``workers`` the number of its threads. ``code``: digest of the source, for the provenance.
-    ``alignment_sigma_px``: standard uncertainty of the disparity from the alignment, if known.
 
     The store [y, x] on the left epipolar grid: see :func:`layers`; attributes ``epipolar`` (the
     model), ``summary``, ``points_bounds``, ``provenance``. Summary: ``pixels`` by status,
@@ -640,9 +674,7 @@ def project_scene(
     paths = sorted(Path(path) for path in point_stores)
     if not paths:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
-    job = _Scene(
-        Path(left_store), Path(right_store), tuple(paths), settings, alignment_sigma_px, max_points
-    )
+    job = _Scene(Path(left_store), Path(right_store), tuple(paths), settings, max_points)
     model, stores = job.model, job.stores
     corners = np.array([store.bounds for store in stores])
     bounds = [*corners[:, :2].min(0), *corners[:, 2:4].max(0)]
@@ -664,7 +696,7 @@ def project_scene(
             *((f"points/{store.path.name}", store.path) for store in stores),
         )
     }
-    parameters = asdict(settings) | {"alignment_sigma_px": alignment_sigma_px}
+    parameters = asdict(settings)
     attrs = {
         "kind": "disparity",
         "scene": scene,
@@ -679,7 +711,7 @@ def project_scene(
         create_grid(
             unfinished,
             model.shape,
-            layers(settings, alignment_sigma_px),
+            layers(settings),
             chunk=CHUNK,
             shard=SHARD,
             attrs=attrs,
@@ -712,9 +744,9 @@ def project_scene(
         100.0 * summary["labelled_share"],
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )
-    if settings.uses_correlation and summary["labelled_share"] < 0.4:
+    if settings.images_window > 1 and summary["labelled_share"] < 0.4:
         log.warning(
-            "only %.0f %% of the pixels with points pass the correlation filter: check the "
+            "only %.0f %% of the pixels with points are seen alike in both images: check the "
             "vertical datum of the LiDAR (geoid in scenes.tsv), its CRS and the GCP residuals",
             100.0 * summary["labelled_share"],
         )

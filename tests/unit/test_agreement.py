@@ -1,0 +1,87 @@
+"""Agreement of images and labels on small fields whose answers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.agreement import outvoted, supported, surface_correlation, warp_to_left
+from stereotruth.correlation import read_patch
+
+
+def texture(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(200, 1200, shape)
+
+
+def test_warp_samples_at_x_less_disparity() -> None:
+    """A cubic along x is reproduced to its last digit; outside the image there is nothing."""
+    x = np.arange(200.0)
+    image = np.broadcast_to(np.round(500 + 2 * x + 0.01 * x * x), (40, 200)).astype(np.uint16)
+    rows, cols = slice(5, 25), slice(60, 120)
+    patch = read_patch(image, rows, slice(0, 200), 9)
+    disparity = np.full((20, 60), 10.25)
+    warped = warp_to_left(patch, rows, cols, disparity)
+    at = np.arange(60, 120) - 10.25
+    assert np.abs(warped - (500 + 2 * at + 0.01 * at * at)).max() < 0.6  # of the rounding
+    disparity[:, :5] = np.nan
+    disparity[:, 5:9] = 300.0
+    warped = warp_to_left(patch, rows, cols, disparity)
+    assert np.isnan(warped[:, :9]).all()
+    assert np.isfinite(warped[:, 9:]).all()
+
+
+def test_surface_correlation_stays_on_the_surface() -> None:
+    """Beside a step, what the other surface shows does not count."""
+    left = texture((60, 60))
+    warped = 0.7 * left + 40
+    warped[:, 30:] = texture((60, 30), seed=1)  # the upper surface shows something else
+    disparity = np.zeros((60, 60))
+    disparity[:, 30:] = 20.0
+    found = surface_correlation(left, warped, disparity, 9)
+    assert found[:, :30] == pytest.approx(1.0, abs=1e-9)
+    assert np.abs(found[:, 30:]).mean() < 0.25
+    # With one surface, the same pixels would be mixed.
+    mixed = surface_correlation(left, warped, np.zeros((60, 60)), 9)
+    assert mixed[:, 28:30].max() < 0.99
+
+
+def test_correlation_is_that_of_numpy() -> None:
+    left, warped = texture((21, 21)), texture((21, 21), seed=1)
+    warped[3, 4] = np.nan
+    found = surface_correlation(left, warped, np.zeros((21, 21)), 7)
+    window = np.s_[2:9, 3:10]
+    known = np.isfinite(warped[window])
+    expected = np.corrcoef(left[window][known], warped[window][known])[0, 1]
+    assert found[5, 6] == pytest.approx(expected, abs=1e-12)
+    assert np.isnan(found[3, 4])
+    assert (surface_correlation(left, np.full((21, 21), 5.0), np.zeros((21, 21)), 7) == 0).all()
+
+
+def test_single_failures_are_not_change_but_a_region_is() -> None:
+    correlation = np.full((80, 80), 0.9)
+    rng = np.random.default_rng(2)
+    correlation[rng.random((80, 80)) < 0.2] = 0.1
+    disparity = np.zeros((80, 80))
+    assert not outvoted(correlation, disparity, 0.5).any()
+    disparity[30:50, 30:50] = 15.0
+    correlation[30:50, 30:50] = np.where(rng.random((20, 20)) < 0.2, 0.9, 0.1)
+    changed = outvoted(correlation, disparity, 0.5)
+    assert changed[30:50, 30:50].all()
+    assert changed.sum() == 400
+    disparity[40, 40] = np.nan
+    assert not outvoted(correlation, disparity, 0.5)[40, 40]
+
+
+def test_support_counts_neighbours_with_points() -> None:
+    disparity = np.zeros((20, 20))
+    disparity[:, 10:] = 8.0
+    points = np.ones((20, 20), dtype=bool)
+    assert supported(disparity, points).all()  # a straight edge: five of eight
+    disparity[5, 5] = 8.0
+    disparity[12, 10] = 0.0
+    found = supported(disparity, points)
+    assert not found[5, 5] and not found[12, 10]
+    # Sparse points: neighbours without any have no say.
+    lonely = np.full((20, 20), np.nan)
+    lonely[::3, ::3] = 1.0
+    assert supported(lonely, np.isfinite(lonely))[::3, ::3].all()
