@@ -161,14 +161,16 @@ def main() -> int:
         "--blocks", type=int, default=0, help="only so many blocks of each scene, the fullest"
     )
     parser.add_argument("--figure", type=Path, help="file for the figure (PNG)")
-    parser.add_argument("--json", type=Path, help="file for all figures")
+    parser.add_argument("--json", type=Path, help="file for all figures; keeps other cities' there")
     parser.add_argument("--redraw", action="store_true", help="draw what --json holds, run nothing")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.ERROR, format="%(message)s")
     rows: Rows = []
-    if arguments.redraw:
-        rows = json.loads(arguments.json.read_text(encoding="utf-8"))
+    if arguments.json and arguments.json.is_file():
+        known = json.loads(arguments.json.read_text(encoding="utf-8"))
+        again = [] if arguments.redraw else arguments.city or {row["city"] for row in known}
+        rows = [row for row in known if row["city"] not in again]
     try:
         config = read_config(arguments.configfile)
         made = [] if arguments.redraw else scenes_made(config, arguments.city)
