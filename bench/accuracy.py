@@ -19,8 +19,8 @@ from typing import Any
 import yaml
 
 from stereotruth import sheets
-from stereotruth.alignment import align
-from stereotruth.epipolar import EpipolarModel
+from stereotruth.alignment import Alignment, align
+from stereotruth.epipolar import EpipolarModel, fit_epipolar
 from stereotruth.errors import InputError
 from stereotruth.evaluation import checkpoints, truth, warping
 from stereotruth.evaluation.grid_truth import write_grid_truth
@@ -210,11 +210,11 @@ def table4(city: str) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def geometry_row(scene: str, gcps: str, model: EpipolarModel, store: Path) -> dict[str, str]:
+def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
     disparity, parallax = (e.figures() for e in truth.geometry_errors(model, store))
     return {
         "scene": scene,
-        "GCPs": gcps,
+        "alignment": alignment,
         "disparity bias px": pixels(disparity["bias"], sign=True),
         "mean abs": pixels(disparity["mean_absolute"]),
         "max": pixels(disparity["max"]),
@@ -235,11 +235,19 @@ class Made:
         self.right = Path(f"results/rectify/{place}/right.zarr")
         self.tiles = Path(f"tiles/{scene.city}")
         self.points = sorted(Path(f"results/ingest/{place}").glob("*.zarr"))
+        self.aligned = Path(f"results/align/{place}/alignment.json")
+        self.refined = Path(f"results/refine/{place}/alignment.json")
         self.exact = Path(f"results/accuracy/{place}")
 
     @property
     def has_truth(self) -> bool:
         return self.scene.city in CITIES and (self.input / "truth.zarr").is_dir()
+
+    def before(self, model: EpipolarModel) -> EpipolarModel:
+        """The epipolar model by the ground control points alone; ``model``: the one in use."""
+        aligned = Alignment.load(self.aligned)
+        sizes = model.left_size, model.right_size
+        return fit_epipolar(aligned.left, aligned.right, *sizes, aligned.reference_height)
 
     def truth(self, folder: Path, disparity: Path, workers: int) -> Path:
         """The truth on the grid of a disparity store: the workflow's, or made in ``folder``."""
@@ -292,6 +300,7 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         folder / "left.zarr",
         folder / "right.zarr",
         workers=workers,
+        label_sigma=aligned.label_sigma,
     )
     project_scene(
         folder / "left.zarr",
@@ -367,7 +376,9 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
                 result
             )
             model = EpipolarModel.from_dict(require_complete(made.disparity).attrs["epipolar"])
-            report["geometry"].append(geometry_row(name, "measured", model, raw))
+            if made.refined.is_file() and config["alignment"]["refine"]:
+                report["geometry"].append(geometry_row(name, "GCPs", made.before(model), raw))
+            report["geometry"].append(geometry_row(name, "as used", model, raw))
         if made.has_truth and arguments.exact:
             folder = made.exact / "noise-free"
             exact = with_exact_gcps(made, folder, config, arguments.workers)
@@ -375,7 +386,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             result = truth.compare_scene(exact, true, None, scene=name, workers=arguments.workers)
             report["exact"].append(truth_row(f"{name} scene", result.whole.total))
             model = EpipolarModel.from_dict(require_complete(exact).attrs["epipolar"])
-            report["geometry"].append(geometry_row(name, "noise-free", model, raw))
+            report["geometry"].append(geometry_row(name, "noise-free GCPs", model, raw))
         if (made.input / "checkpoints.csv").is_file():
             figures = checkpoints.evaluate_checkpoints(
                 made.disparity, made.input / "checkpoints.csv", scene=name

@@ -125,7 +125,7 @@ def draw(rows: Rows, path: Path) -> None:
     figure = Figure(figsize=(4.2 * columns, 3.6 * lines), layout="constrained")
     axes = np.ravel(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False))
     for ax, city in zip(axes, cities):
-        ax.fill_between([0.02, 1], 98.5, 100, color="#2ca02c", alpha=0.2, lw=0)
+        ax.fill_between([0.1, 1], 98.5, 100, color="#2ca02c", alpha=0.2, lw=0, label="aim")
         for way, style, colour in zip(WAYS, STYLES, COLOURS):
             here = [row for row in rows if row["city"] == city and row["way"] == way]
             x, y = (100 * np.array([row[key] for row in here]) for key in ("hidden", "visible"))
@@ -140,7 +140,7 @@ def draw(rows: Rows, path: Path) -> None:
         ax.set_title(city, fontsize=10)
         ax.set_xscale("log")
         ax.set_xlim(0.1, 100)
-        ax.set_ylim(60, 100)
+        ax.set_ylim(45, 100)
         ax.grid(alpha=0.3)
     for ax in axes[len(cities) :]:
         ax.set_axis_off()
