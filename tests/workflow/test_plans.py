@@ -31,6 +31,17 @@ def test_exact_truth_is_planned_by_scene_and_by_city(project):
     assert jobs["evaluate_truth_city"] == 6
 
 
+def test_real_scenes_are_evaluated_by_their_images(project):
+    for name in ("left.tif", "right.tif", "points.laz", "gcps.csv"):
+        (project.folder / name).touch()
+    row = {"scene": "R-1", "city": "Real", "left_image": "left.tif", "right_image": "right.tif"}
+    config = project.add_scene("real", [row | {"lidar": "points.laz", "gcps": "gcps.csv"}])
+    jobs = project.plan("evaluate", "--configfile", config)
+    assert jobs["export"] == jobs["evaluate_images"] == 1
+    assert "grid_truth" not in jobs
+    assert project.plan("evaluate")["evaluate_images"] == 6  # synthetic cities
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
