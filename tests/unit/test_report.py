@@ -146,8 +146,7 @@ def made(tmp_path_factory) -> Path:
         "scene,1000,0.25,0.5\ntiles,900,0.125,\ntile T_0,90,0.0625,0.001\n"
     )
     deciles = [
-        {"mean_uncertainty": 0.1, "rms_error": 0.2},
-        {"mean_uncertainty": 0.4, "rms_error": 0.4},
+        {"mean_uncertainty": s, "share_below_1": 0.7, "share_below_2": 1.0} for s in (0.1, 0.4)
     ]
     of_tiles = {
         "status": {"visible": {"labelled": 95, "low_correlation": 5}, "hidden": {}},
@@ -345,12 +344,16 @@ def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
     assert "and S-1 as a whole" in text
 
 
-def test_calibrated_deciles_lie_on_the_diagonal():
-    deciles = [{"mean_uncertainty": s, "rms_error": e} for s, e in ((0.1, 0.1), (0.2, 0.4))]
+def test_calibrated_groups_lie_on_the_lines():
+    deciles = [
+        {"mean_uncertainty": sigma, "share_below_1": once, "share_below_2": twice}
+        for sigma, once, twice in ((0.1, 0.683, 0.954), (0.3, 0.25, 1.0))
+    ]
     drawn = drawings.calibration(deciles)
-    (x, y, _), (u, v, _) = drawn.points
-    assert x == pytest.approx(drawings.SIDE - y)
-    assert drawings.SIDE - v == pytest.approx(2 * u, abs=0.2)
+    right, wrong = drawn.groups
+    assert [y for y, _ in drawn.right] == pytest.approx([right[1], right[2]], abs=0.11)
+    assert wrong[:3] == (0.75 * drawings.WIDTH, 0.75 * drawings.HEIGHT, 0.0)
+    assert (right[3], wrong[3]) == ("0.100", "0.300")
     assert drawings.calibration([]) is None
 
 

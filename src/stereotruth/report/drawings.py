@@ -144,22 +144,29 @@ def histograms(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Points of errors (rms) against stated uncertainties; ticks (place, text) of both axes."""
+    """Shares of errors below once and twice their uncertainty, by groups of rising uncertainty.
 
-    points: tuple[tuple[float, float, str], ...]
-    ticks: tuple[tuple[float, str], ...]
+    ``groups``: (x, y of the one, y of the other, mean uncertainty, what to say); ``right``: (y,
+    share in percent) of both where the uncertainty is right.
+    """
+
+    groups: tuple[tuple[float, float, float, str, str], ...]
+    right: tuple[tuple[float, str], ...]
 
 
 def calibration(deciles: Sequence[Mapping[str, float]]) -> Calibration | None:
-    """Deciles of the uncertainty in a square of ``SIDE``; the diagonal is where they are right."""
-    pairs = [(d["mean_uncertainty"], d["rms_error"]) for d in deciles]
-    if not pairs:
+    """Groups of labels (deciles of their uncertainty) in a frame of ``WIDTH`` by ``HEIGHT``."""
+    if not deciles:
         return None
-    ticks = MaxNLocator(4).tick_values(0.0, max(map(max, pairs)))
-    scale = SIDE / ticks[-1]
-    points = [
-        (round(x * scale, 1), round(SIDE - y * scale, 1), f"stated {x:.3f} px, found {y:.3f} px")
-        for x, y in pairs
-    ]
-    marks = [(round(t * scale, 1), f"{t:g}") for t in ticks if t >= 0]
-    return Calibration(tuple(points), tuple(marks))
+
+    def y(share: float) -> float:
+        return round(HEIGHT * (1 - share), 1)
+
+    step = WIDTH / len(deciles)
+    groups = []
+    for k, group in enumerate(deciles):
+        once, twice = group["share_below_1"], group["share_below_2"]
+        sigma = f"{group['mean_uncertainty']:.3f}"
+        text = f"uncertainty {sigma} px: {100 * once:.1f} % below once, {100 * twice:.1f} % twice"
+        groups.append((round((k + 0.5) * step, 1), y(once), y(twice), sigma, text))
+    return Calibration(tuple(groups), tuple((y(p / 100), f"{p} %") for p in (68.3, 95.4)))
