@@ -59,6 +59,7 @@ def _draw(alignment: Alignment, path: Path) -> None:
             used = [g for g in fit.gcps if g.used]
             if not used:
                 ax.set_title(f"{fit.view}: no ground control points", loc="left", fontsize=10)
+                ax.set_axis_off()
                 continue
             at = np.array([g.measured for g in used])
             vector = np.array([getattr(g, which) for g in used])
