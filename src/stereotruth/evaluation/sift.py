@@ -53,7 +53,7 @@ SIZE_RATIO = 1.3
 AGREE_PX = 1.0
 GROSS_PX = 3.0
 MIN_PARALLAX = 5  # matches; fewer give no y-parallax
-PAIRS = 1 << 16  # descriptors that are compared at a time
+PAIRS = 1 << 17  # of key points that are compared at a time
 
 
 class KeyPoints(NamedTuple):
@@ -90,33 +90,36 @@ def match(
     """Matches as indices into left and right, see the module; disparities in px."""
     low = np.searchsorted(right.y, left.y - ROW_SEARCH_PX, "left")
     count = np.searchsorted(right.y, left.y + ROW_SEARCH_PX, "right") - low
-    i = np.repeat(np.arange(left.x.size), count)
-    j = np.arange(count.sum()) + np.repeat(low - np.cumsum(count) + count, count)
-    d = left.x[i] - right.x[j]
-    near = (d >= disparity_range[0]) & (d <= disparity_range[1])
-    i, j = i[near], j[near]
-    distance = np.empty(i.size, np.float32)
-    for k in range(0, i.size, PAIRS):
-        part = slice(k, k + PAIRS)
-        difference = left.descriptors[i[part]] - right.descriptors[j[part]]
-        distance[part] = np.sqrt(np.einsum("nk,nk->n", difference, difference))
-    order = np.lexsort((j, distance, i))
-    i, j, distance = i[order], j[order], distance[order]
-    a, first = np.unique(i, return_index=True)
-    b, shortest = j[first], distance[first]
-    rival = np.full(left.x.size, np.nan, np.float32)  # nearest at another place
-    best = np.zeros(left.x.size, np.intp)
-    best[a] = b
-    apart = np.hypot(right.x[j] - right.x[best[i]], right.y[j] - right.y[best[i]]) > APART_PX
-    place, at = np.unique(i[apart], return_index=True)
-    rival[place] = distance[apart][at]
+    nearest = np.zeros(left.x.size, np.intp)
+    shortest = np.full(left.x.size, np.inf, np.float32)
+    rival = np.full(left.x.size, np.nan, np.float32)  # distance of the nearest at another place
     back = np.full(right.x.size, np.inf, np.float32)
-    np.minimum.at(back, j, distance)
-    turn = np.abs((left.angle[a] - right.angle[b] + 180.0) % 360.0 - 180.0)
-    scale = np.abs(np.log(left.size[a] / right.size[b]))
-    good = (shortest < RATIO * rival[a]) & (shortest <= back[b])
+    total = np.cumsum(count)
+    ends = np.searchsorted(total, np.arange(PAIRS, total[-1] + PAIRS, PAIRS), "right")
+    for first, last in zip([0, *ends], [*ends, left.x.size]):
+        n = count[first:last]
+        i = np.repeat(np.arange(first, last), n)
+        j = np.arange(n.sum()) + np.repeat(low[first:last] - np.cumsum(n) + n, n)
+        d = left.x[i] - right.x[j]
+        near = (d >= disparity_range[0]) & (d <= disparity_range[1])
+        i, j = i[near], j[near]
+        difference = left.descriptors[i] - right.descriptors[j]
+        distance = np.sqrt(np.einsum("nk,nk->n", difference, difference))
+        np.minimum.at(back, j, distance)
+        order = np.lexsort((j, distance, i))
+        i, j, distance = i[order], j[order], distance[order]
+        a, at = np.unique(i, return_index=True)
+        nearest[a], shortest[a] = j[at], distance[at]
+        beside = nearest[i]
+        apart = np.hypot(right.x[j] - right.x[beside], right.y[j] - right.y[beside]) > APART_PX
+        a, at = np.unique(i[apart], return_index=True)
+        rival[a] = distance[apart][at]
+    turn = np.abs((left.angle - right.angle[nearest] + 180.0) % 360.0 - 180.0)
+    scale = np.abs(np.log(left.size / right.size[nearest]))
+    good = (shortest < RATIO * rival) & (shortest <= back[nearest])
     good &= (turn <= ANGLE_DEG) & (scale <= np.log(SIZE_RATIO))
-    return a[good], b[good]
+    found = np.flatnonzero(good)
+    return found, nearest[found]
 
 
 def constant_labels(disparity: Floats) -> Bools:
