@@ -197,8 +197,8 @@ def estimate(
     statistic = float(np.sum((vectors[:, seen].T @ right) ** 2 / values[seen]))
     covariance = root @ np.linalg.inv(np.eye(rank) + normal) @ root.T
     return _Estimate(
-        root @ z,
-        covariance,
+        np.round(root @ z, 8),  # so that the count of threads leaves no trace
+        np.round(covariance, 14),
         weights,
         sigma,
         site_sigma,
@@ -422,6 +422,17 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: _Estimate) -
     ]
 
 
+def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
+    for text in doubts:
+        log.warning("warning: %s", text)
+    if strict and doubts:
+        raise InputError(
+            f"{doubts[0]}{of}",
+            file=image,
+            remedy="check LiDAR and GCPs, or set strict or alignment.refine to false",
+        )
+
+
 def _moved_left(alignment: Alignment, parameters: Floats) -> float:
     fit = alignment.left_fit
     return _changes(fit, fit.moved(parameters[:6]))["largest"]
@@ -433,13 +444,15 @@ def refine(
     right_image: str | Path,
     point_stores: Sequence[str | Path],
     *,
+    strict: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> tuple[Alignment, Observations | None]:
     """Refine an alignment by tie points between LiDAR and both images.
 
     Returns the alignment, with the record of what was done in ``refinement``, and the
     observations. It is the one that came, affines and all, if the tie points do not contradict
-    it or are too few. Reads a fixed number of places, whatever the scene's size.
+    it or are too few. Reads a fixed number of places, whatever the scene's size. ``strict`` makes
+    warnings errors.
 
     Raises InputError if there are neither GCPs nor usable tie points.
     """
@@ -460,7 +473,7 @@ def refine(
                 file=left_image,
                 remedy="measure GCPs, and check that LiDAR and images show the same ground",
             )
-        log.warning("warning: not refined: %s", result)
+        _warn([f"not refined: {result}"], strict, left_image, of)
         record = {"applied": False, "reason": result}
         return replace(alignment, refinement=record, provenance=record_of), None
     observations, found, refined = result
@@ -474,8 +487,7 @@ def refine(
         observations = replace(observations, after=observations.before)
         record["after"] = record["before"]
     doubts = [] if insignificant else _doubts(alignment, record, found)
-    for text in doubts:
-        log.warning("warning: %s", text)
+    _warn(doubts, strict, left_image, of)
     refined = replace(
         refined,
         warnings=(*alignment.warnings, *doubts),

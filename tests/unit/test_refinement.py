@@ -48,7 +48,7 @@ def render(sensor: SensorModel) -> np.ndarray:
     return np.round(texture(east, north) + rng.normal(0, 5.0, col.shape)).astype(np.uint16)
 
 
-def lidar(spacing: float = 0.6) -> np.ndarray:
+def lidar(spacing: float = 1.0) -> np.ndarray:
     """lon, lat, height [n, 3] of points on the surface, 0.03 m of noise."""
     rng = np.random.default_rng(0)
     east, north = np.mgrid[-300:300:spacing, -300:300:spacing].reshape(2, -1)
@@ -227,11 +227,13 @@ def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
     refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
     assert refined.refinement["applied"]
     assert len(refined.warnings) == 1 and "vertical datum" in refined.warnings[0]
+    with pytest.raises(InputError, match="vertical datum"):
+        refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store], strict=True)
     assert "+1.0" in refined.warnings[0] or "+0.9" in refined.warnings[0]
 
 
 def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
-    cloud = lidar(1.0)
+    cloud = lidar()
     half = cloud[:, 0] < LON
     a, b = (write_points(tmp_path / n, cloud[h], n) for n, h in (("a", half), ("b", ~half)))
     planted = start(NONE, PLANTED, 0.5)

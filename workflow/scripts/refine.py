@@ -21,6 +21,7 @@ if __name__ == "__main__":
             snakemake.input.left[0],
             snakemake.input.right[0],
             snakemake.input.points,
+            strict=snakemake.params.strict,
             provenance=describe(inputs, {}, snakemake.params.code),
         )
         write_refinement(
