@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereotruth.alignment import Alignment, align
+from stereotruth.alignment import RPC_SHIFT, Alignment, align, from_rpcs
 from stereotruth.alignment_report import write_alignment
 from stereotruth.control_points import COLUMNS, read_gcps
 from stereotruth.errors import InputError
@@ -398,6 +398,19 @@ def test_too_few_after_blunders_names_them(images, tmp_path):
     rows[0]["left_col"] = rows[0]["left_row"] = ""
     with pytest.raises(InputError, match="neither"):
         run(images, tmp_path, rows)
+
+
+def test_without_gcps_the_rpcs_stand_with_their_uncertainty(images, tmp_path):
+    alignment = from_rpcs(images["left"], images["right"], scene="S-1")
+    assert (alignment.left.affine == np.eye(2, 3)).all()
+    middle = alignment.left_fit.covariance_at(SIZES["left"][0] / 2, SIZES["left"][1] / 2)
+    assert np.sqrt(np.diag(middle)) == pytest.approx([RPC_SHIFT] * 2, rel=1e-3)
+    assert "no ground control points" in alignment.warnings[0]
+    files = [tmp_path / name for name in ("a.json", "r.csv", "f.png")]
+    write_alignment(alignment, *files)
+    again = Alignment.load(files[0])
+    assert again.to_dict() == alignment.to_dict()
+    assert np.isnan(again.left_fit.sigma0) and np.isnan(again.left_fit.rms("after"))
 
 
 def test_swapped_images_are_recognised(images, tmp_path):

@@ -53,7 +53,7 @@ def test_a_sheet_is_read_with_crlf_bom_comments_and_short_rows(tmp_path, cities)
         (scenes_text(with_cell("city", "Quichun")), ["'Quichun'", "did you mean 'Qichun'"]),
         (scenes_text(with_cell("scene", "Qichun_1")), ["line 2", "Qichun_1", "unique id"]),
         (scenes_text(ROW, ROW), ["'Qichun-1'", "more than one row"]),
-        (scenes_text(with_cell("gcps", "")), ["line 2", "gcps"]),
+        (scenes_text(with_cell("lidar", "")), ["line 2", "lidar"]),
         (scenes_text(with_cell("right_image", "l.tif")), ["one image twice"]),
         (scenes_text(ROW, columns=(*COLUMNS[:-1], "gcp")), ["'gcps' is missing", "'gcp' is unkn"]),
         (scenes_text(ROW).replace("\t", ","), ["separated by tabs"]),
