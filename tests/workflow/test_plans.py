@@ -23,6 +23,7 @@ def test_a_city_is_planned_from_nothing(project):
 def test_all_cities_and_the_dataset_are_planned(project):
     assert project.plan()["export"] == 6
     assert project.plan("dataset")["dataset"] == 1
+    assert project.plan("report")["report_city"] == 6
 
 
 def test_exact_truth_is_planned_by_scene_and_by_city(project):

@@ -21,7 +21,7 @@ from ..evaluation.warping import read_tile, warp_tile
 
 Picture = figures.Picture
 
-QUALITIES = (82, 70, 55, 40, 25)  # of WebP; below, the picture is made smaller instead
+QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
 GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
@@ -59,19 +59,25 @@ class TilePictures:
 def encode(picture: Picture, limit: int) -> str:
     """A data URI of a grey or RGB picture as WebP of at most ``limit`` bytes.
 
-    The best quality that fits; where none does, the picture is halved (one pixel always fits).
+    Scaled down where even the lowest quality does not fit, then the best quality that fits (one
+    pixel always does).
     """
     colour = picture[..., ::-1] if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
-    while True:
-        for quality in QUALITIES:
-            done, data = cv2.imencode(".webp", colour, [cv2.IMWRITE_WEBP_QUALITY, quality])
-            if not done:
-                raise RuntimeError("OpenCV without WebP")
-            if data.size <= limit or max(colour.shape[:2]) == 1:
-                return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
-        height, width = colour.shape[:2]
-        half = (max(1, width // 2), max(1, height // 2))
-        colour = cv2.resize(colour, half, interpolation=cv2.INTER_AREA)
+    data = _webp(colour, QUALITIES[-1])
+    while data.size > limit and (side := max(colour.shape[:2])) > 1:
+        factor = min(0.9, np.sqrt(limit / data.size))
+        colour = figures.shrink(colour, max(1, int(side * factor)))
+        data = _webp(colour, QUALITIES[-1])
+    better = (_webp(colour, quality) for quality in QUALITIES[:-1])
+    data = next((found for found in better if found.size <= limit), data)
+    return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _webp(colour: Picture, quality: int) -> NDArray[np.uint8]:
+    done, data = cv2.imencode(".webp", colour, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise RuntimeError("OpenCV without WebP")
+    return data
 
 
 def encode_file(path: Path, limit: int, side: int) -> str:
