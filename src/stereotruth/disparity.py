@@ -40,7 +40,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .agreement import VOTE_PX, outvoted, supported, surface_correlation, warp_to_left
-from .correlation import Patch, correlate, in_frame, read_patch
+from .correlation import Array2D, Patch, correlate, in_frame, read_patch
 from .epipolar import EpipolarModel
 from .errors import InputError
 from .grid_store import Layer, blocks, building, create_grid, require_complete
@@ -57,6 +57,7 @@ from .occlusion import (
 from .points import LATTICE_DEG, Points, PointStore, query_points
 from .provenance import describe, digest
 from .representative import REPRESENTATIVES, Labels, Pixels, at_centres, at_points, condense
+from .right_view import MirroredImage, MirroredModel, mirrored
 from .runlog import BlockProgress
 
 log = logging.getLogger("stereotruth")
@@ -141,8 +142,10 @@ class Settings:
         return reach + VOTE_PX + self.window // 2 if self.method == "both" else reach
 
 
-def layers(settings: Settings) -> dict[str, Layer]:
-    """The arrays of a disparity store."""
+def layers(settings: Settings, view: str) -> dict[str, Layer]:
+    """The arrays of a disparity store of the ``view``, left or right."""
+    other = {"left": "right", "right": "left"}[view]
+    match = {"left": "x - disparity", "right": "x + disparity"}[view]
     condensed, used = (
         (
             "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
@@ -154,8 +157,8 @@ def layers(settings: Settings) -> dict[str, Layer]:
     )
     compared = {
         "correlation": "mean correlation coefficient of the image windows at the points used",
-        "both": "correlation coefficient of left and warped right image over the pixels of the "
-        f"same surface in {settings.window} x {settings.window} px",
+        "both": f"correlation coefficient of {view} and warped {other} image over the pixels of "
+        f"the same surface in {settings.window} x {settings.window} px",
     }
     return {
         "disparity": Layer(
@@ -163,8 +166,10 @@ def layers(settings: Settings) -> dict[str, Layer]:
             np.nan,
             {
                 "units": "px",
-                "long_name": "ground-truth disparity x_left - x_right of the left view",
+                "long_name": f"ground-truth disparity x_left - x_right of the {view} view",
                 "nodata": "NaN",
+                "match": f"what the {view} image shows at (x, y), the {other} one shows at "
+                f"({match}, y)",
                 "representative": f"{settings.representative}: {condensed}",
             },
         ),
@@ -176,12 +181,13 @@ def layers(settings: Settings) -> dict[str, Layer]:
                 "long_name": "why a pixel has a label or none",
                 "flag_values": [int(status) for status in Status],
                 "flag_meanings": " ".join(status.name.lower() for status in Status),
-                "hidden_in_left": "no point of the pixel lies on the surface that its centre sees",
+                f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre "
+                "sees",
                 "changed": "LiDAR and images show different surfaces there, or water",
                 "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other "
                 "surfaces",
-                "precedence": "frame, left view, correlation of points; right view, edge, change, "
-                "number of points of pixels",
+                "precedence": f"frame, {view} view, correlation of points; {other} view, edge, "
+                "change, number of points of pixels",
             },
         ),
         "height": Layer(
@@ -289,17 +295,26 @@ class _Scene:
     point_stores: tuple[Path, ...]
     settings: Settings
     max_points: int
+    view: str = "left"
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
 
-    @cached_property
-    def images(self) -> tuple[zarr.Array, zarr.Array]:
-        return tuple(require_complete(p)["image"] for p in (self.left_store, self.right_store))
+    # The view that gets labels is "left" from here on, see right_view.
 
     @cached_property
-    def model(self) -> EpipolarModel:
-        return EpipolarModel.from_dict(require_complete(self.left_store).attrs["epipolar"])
+    def images(self) -> tuple[Array2D, Array2D]:
+        left, right = (
+            require_complete(path)["image"] for path in (self.left_store, self.right_store)
+        )
+        if self.view == "right":
+            return MirroredImage(right), MirroredImage(left)
+        return left, right
+
+    @cached_property
+    def model(self) -> EpipolarModel | MirroredModel:
+        model = EpipolarModel.from_dict(require_complete(self.left_store).attrs["epipolar"])
+        return MirroredModel(model) if self.view == "right" else model
 
     @cached_property
     def stores(self) -> tuple[PointStore, ...]:
@@ -516,6 +531,8 @@ class _Scene:
         margin = self.settings.margin
         inner = slice(margin, -margin), slice(margin, -margin)
         y, x = np.mgrid[wide][:, *inner].astype(np.float64)
+        if self.view == "right":
+            x = self.model.shape[1] - 1 - x
         sigma, sigma_x, sigma_y = self.alignment_sigma.at(x, y)
         slope = labels.slope[:, *inner]
         variance = labels.variance[inner] + sigma**2
@@ -570,6 +587,9 @@ class _Scene:
     def block(self, out: Path, rows: slice, cols: slice) -> NDArray[np.int64]:
         """Label one block and write it; returns pixels by status, and the counts of points."""
         group = zarr.open_group(out, mode="r+")
+        where = rows, cols
+        if self.view == "right":
+            cols = mirrored(cols, self.model.shape[1])
         shape = rows.stop - rows.start, cols.stop - cols.start
         arrays: dict[str, NDArray] = {}
         points = np.zeros(3, dtype=np.int64)
@@ -577,18 +597,22 @@ class _Scene:
             found = self.label(r, c)
             if found is None:
                 continue
-            where = (
+            part = (
                 slice(r.start - rows.start, r.stop - rows.start),
                 slice(c.start - cols.start, c.stop - cols.start),
             )
             for name, layer in found[0].items():
                 if name not in arrays:
                     arrays[name] = np.full(shape, group[name].fill_value, dtype=layer.dtype)
-                arrays[name][where] = layer
+                arrays[name][part] = layer
             points += found[1]
-        for name, array in arrays.items():
-            group[name][rows, cols] = array
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
+        if self.view == "right":
+            left, right = (status == s for s in (Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT))
+            status[left], status[right] = Status.HIDDEN_IN_RIGHT, Status.HIDDEN_IN_LEFT
+            arrays = {name: array[:, ::-1] for name, array in arrays.items()}
+        for name, array in arrays.items():
+            group[name][where] = array
         return np.concatenate([np.bincount(status.reshape(-1), minlength=len(Status)), points])
 
 
@@ -641,6 +665,7 @@ def project_scene(
     point_stores: Sequence[str | Path],
     out: str | Path,
     *,
+    view: str = "left",
     method: str = "correlation",
     window: int = 9,
     correlation_threshold: float = 0.5,
@@ -656,15 +681,16 @@ def project_scene(
     """Project the points of a scene and write its disparity grid; returns the summary.
 
     ``left_store``, ``right_store``: rectified images made by `rectify`; ``point_stores``: made by
-    `ingest`, in any order. ``method`` is one of METHODS: ``correlation`` (the paper's filter),
+    `ingest`, in any order. ``view``: left, or right for the labels of the right image, on its own
+    grid of the same shape. ``method`` is one of METHODS: ``correlation`` (the paper's filter),
     ``geometric`` (visibility in both views from the points), ``both`` (geometric, and what the
     images contradict is ``changed``), ``none``. ``scheduler`` is what Dask's compute takes;
     ``workers`` the number of its threads. ``code``: digest of the source, for the provenance.
 
-    The store [y, x] on the left epipolar grid: see :func:`layers`; attributes ``epipolar`` (the
-    model), ``summary``, ``points_bounds``, ``provenance``. Summary: ``pixels`` by status,
-    ``points`` (in the grid, in both frames, used), ``labelled_share`` of the pixels that have
-    points, settings.
+    The store [y, x] on the epipolar grid of the view: see :func:`layers`; attributes ``epipolar``
+    (the model), ``view``, ``summary``, ``points_bounds``, ``provenance``. Summary: ``pixels`` by
+    status, ``points`` (in the grid, in both frames, used), ``labelled_share`` of the pixels that
+    have points, settings.
 
     Raises InputError if no point falls into both images.
     """
@@ -696,11 +722,12 @@ def project_scene(
             *((f"points/{store.path.name}", store.path) for store in stores),
         )
     }
-    parameters = asdict(settings)
+    parameters = {"view": view} | asdict(settings)
     attrs = {
         "kind": "disparity",
         "scene": scene,
-        "epipolar": model.to_dict(),
+        "view": view,
+        "epipolar": dict(require_complete(left_store).attrs["epipolar"]),
         "points_bounds": points_bounds,
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
@@ -711,7 +738,7 @@ def project_scene(
         create_grid(
             unfinished,
             model.shape,
-            layers(settings),
+            layers(settings, view),
             chunk=CHUNK,
             shard=SHARD,
             attrs=attrs,

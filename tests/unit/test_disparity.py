@@ -323,6 +323,35 @@ def test_building_in_one_world_only_is_masked_as_changed(plane, box, only_in, tm
     assert not (without["status"].values == Status.CHANGED).any()
 
 
+def test_right_view_has_its_own_labels(box) -> None:
+    """Against the rays of the right camera; and both views name each other's pixels."""
+    east, north, height = seen(box.model, "right", box=True)
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = box.model.ground_to_epipolar(lon, lat, height)
+    truth = (xy[0] - xy[2]).reshape(box.model.shape)
+    right = box.project("of_right.zarr", method="both", view="right")
+    left = box.project("of_left.zarr", method="both")
+    disparity, status = right["disparity"].values, right["status"].values
+    labelled = np.isfinite(disparity)
+    surface = np.isin(height, (HEIGHT, ROOF))
+    assert (np.abs(disparity - truth) < 1e-3)[labelled & surface].mean() > 0.999
+    inner = surface.copy()
+    edge = 10 + int(np.ceil(np.abs(box.truth).max()))
+    inner[:edge] = inner[-edge:] = inner[:, :edge] = inner[:, -edge:] = False
+    assert labelled[inner].mean() > 0.9
+    assert right["disparity"].attrs["match"].endswith("(x + disparity, y)")
+    # What only the right camera sees is hidden in the left one.
+    assert (status == Status.HIDDEN_IN_LEFT).sum() > 300
+    assert 3 * (status == Status.HIDDEN_IN_RIGHT).sum() < (status == Status.HIDDEN_IN_LEFT).sum()
+    rows, cols = np.nonzero(labelled)
+    there = np.rint(cols + disparity[rows, cols]).astype(int)
+    ok = (there >= 0) & (there < left.sizes["x"])
+    back = left["disparity"].values[rows[ok], there[ok]]
+    both = np.isfinite(back)
+    assert both.mean() > 0.9
+    assert (np.abs(back - disparity[rows[ok], cols[ok]])[both] < 0.05).mean() > 0.99
+
+
 def test_water_is_masked_as_changed(plane, tmp_path) -> None:
     to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
     points = plane.points
