@@ -60,6 +60,7 @@ MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image
 OVERVIEW_PX = 1400  # longer side of the pictures in the coverage figure
 CONTACT_TILES = 16  # most tiles on the contact sheet
 FILES = ("left", "right", "disp", "status", "orientation")
+RIGHT_FILES = ("disp_right", "status_right")  # labels of the right view, where a scene has them
 NONE_KIND, IMAGES, LABELLED = 0, 1, 2
 REASONS = (
     "left image incomplete",
@@ -70,13 +71,17 @@ REASONS = (
 
 
 class Scene(NamedTuple):
-    """What export reads of one scene: its id and stores, and where it came from the alignment."""
+    """What export reads of one scene: its id and stores, and where it came from the alignment.
+
+    ``disparity_of_right``: the store of the right view's labels, if they are wanted.
+    """
 
     scene: str
     disparity: Path
     left: Path
     right: Path
     alignment: Path | None = None
+    disparity_of_right: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,7 @@ class _Source:
     disparity: zarr.Array
     status: zarr.Array
     height: zarr.Array
+    of_right: zarr.Group | None
     surface_class: zarr.Array | None
     gcp_rms: float | None
     model: EpipolarModel
@@ -158,6 +164,11 @@ def _open(item: Scene) -> _Source:
         f"{item.scene}/{name}": digest(dict(group.attrs.get("provenance", {})))
         for name, group in (("left", left), ("right", right), ("disparity", disparity))
     }
+    of_right = None
+    if item.disparity_of_right is not None:
+        of_right = require_complete(item.disparity_of_right)
+        found = digest(dict(of_right.attrs.get("provenance", {})))
+        inputs[f"{item.scene}/disparity_of_right"] = found
     if item.alignment is not None:
         inputs[f"{item.scene}/alignment"] = file_sha256(item.alignment)
     return _Source(
@@ -167,6 +178,7 @@ def _open(item: Scene) -> _Source:
         disparity=disparity["disparity"],
         status=status,
         height=disparity["height"],
+        of_right=of_right,
         surface_class=disparity.get("surface_class"),
         gcp_rms=None if item.alignment is None else _gcp_rms(item.alignment),
         model=model,
@@ -457,20 +469,21 @@ def _write_tile(
         checks = _check(source, here, left, right, known, stored, building_share)
         files["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
         files["status"] = f"status/{prefix}_status_{number}.tiff"
-        if (stored[known] == nodata).any():
-            raise InputError(
-                f"tile {name} has a true disparity of {nodata:g} px, the value for nodata",
-                remedy="set tiles.nodata to a value that no disparity takes",
-            )
-        write_tiff(
-            folder / files["disp"],
-            np.where(known, stored, np.float32(nodata)),
-            nodata=nodata,
-            half=dtype == "float16",
-            description="disparity in px, x_left - x_right of this pair",
-        )
         meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
+        options = {"nodata": nodata, "half": dtype == "float16", "tile": name}
+        _write_labels(folder / files["disp"], np.where(known, stored, np.nan), **options)
         write_tiff(folder / files["status"], status, description=meanings)
+        if source.of_right is not None:
+            there = (rows, slice(start, start + size))
+            of_right = source.of_right["disparity"][there].astype(np.float64) - window.offset
+            files["disp_right"] = f"disp_right/{prefix}_disparity_right_{number}.tiff"
+            files["status_right"] = f"status_right/{prefix}_status_right_{number}.tiff"
+            _write_labels(folder / files["disp_right"], round_disparity(of_right, dtype), **options)
+            write_tiff(
+                folder / files["status_right"],
+                source.of_right["status"][there],
+                description=meanings,
+            )
     record = orientation(
         source.model,
         source.sensors,
@@ -515,10 +528,29 @@ def _write_tile(
     }
     for value, meaning in source.flags.items():
         row[f"count_{meaning}"] = int((status == value).sum())
-    for kind in FILES:
+    for kind in (*FILES, *(RIGHT_FILES if source.of_right is not None else ())):
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = file_sha256(folder / files[kind]) if kind in files else ""
     return row, ring, checks
+
+
+def _write_labels(
+    path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool, tile: str
+) -> None:
+    """Disparities (px, NaN where there is none) as a TIFF."""
+    known = np.isfinite(disparity)
+    if (disparity[known] == nodata).any():
+        raise InputError(
+            f"tile {tile} has a true disparity of {nodata:g} px, the value for nodata",
+            remedy="set tiles.nodata to a value that no disparity takes",
+        )
+    write_tiff(
+        path,
+        np.where(known, disparity, np.float32(nodata)),
+        nodata=nodata,
+        half=half,
+        description="disparity in px, x_left - x_right of this pair",
+    )
 
 
 def _check(
@@ -597,8 +629,8 @@ def export_city(
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
-    alignment.json (for the record). ``stride`` defaults to ``size``, px. ``training``,
-    ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there
+    alignment.json (for the record) and the store of the right view's labels. ``stride`` defaults to
+    ``size``, px. ``training``, ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there
     are. ``quality``: the limits beyond which tiles and scenes are flagged. ``building_share``:
     share of building pixels from which on a tile is of that class. ``coverage`` and
     ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT matches. Returns
@@ -646,6 +678,8 @@ def export_city(
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         kinds = {"left", "right", "disp", "status", "orientation"}
+        if any(source.of_right is not None for source in sources):
+            kinds |= set(RIGHT_FILES)
         if not all(window.labelled for _, window in chosen):
             kinds |= {"unlabelled/left", "unlabelled/right"}
         for kind in kinds:

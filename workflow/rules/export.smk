@@ -6,6 +6,11 @@ rule export:
             f"results/rectify/{w.city}/{s.scene}/right.zarr" for s in scenes_of(w.city)
         ],
         disparity=lambda w: [f"results/project/{w.city}/{s.scene}.zarr" for s in scenes_of(w.city)],
+        disparity_of_right=lambda w: [
+            f"results/project/{w.city}/{s.scene}_right.zarr"
+            for s in scenes_of(w.city)
+            if config["project"]["right_view"]
+        ],
     output:
         tiles=directory("tiles/{city}"),
         summary="results/export/{city}/summary.json",

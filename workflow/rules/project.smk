@@ -16,10 +16,27 @@ rule project:
         mem_mb=4000,
         runtime=240,
     params:
+        view="left",
         occlusion=config["occlusion"],
-        project=config["project"],
+        project={key: v for key, v in config["project"].items() if key != "right_view"},
         code=source_digest("disparity"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
     script:
         "../scripts/project.py"
+
+
+use rule project as project_right with:
+    output:
+        disparity=directory("results/project/{city}/{scene}_right.zarr"),
+    log:
+        "logs/project_right/{city}/{scene}.log",
+    benchmark:
+        "benchmarks/project_right/{city}/{scene}.tsv"
+    params:
+        view="right",
+        occlusion=config["occlusion"],
+        project={key: v for key, v in config["project"].items() if key != "right_view"},
+        code=source_digest("disparity"),
+    message:
+        "Projecting the point cloud of scene {wildcards.scene} into the right view"

@@ -9,6 +9,7 @@ from stereotruth.tiles import Scene, export_city, summary_lines
 
 if __name__ == "__main__":
     given, city, tiles = snakemake.input, snakemake.params.city, snakemake.params.tiles
+    of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
     with job(snakemake.log[0], f"export {city['city']}") as log:
         summary = export_city(
             scenes=list(
@@ -19,6 +20,7 @@ if __name__ == "__main__":
                     given.left,
                     given.right,
                     given.alignment,
+                    of_right,
                 )
             ),
             out_dir=snakemake.output.tiles,

@@ -12,6 +12,7 @@ if __name__ == "__main__":
             snakemake.input.right,
             snakemake.input.points,
             snakemake.output.disparity,
+            view=snakemake.params.view,
             method=occlusion["method"],
             window=occlusion["window"],
             correlation_threshold=occlusion["correlation_threshold"],
