@@ -631,10 +631,10 @@ def export_city(
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
     alignment.json (for the record) and the store of the right view's labels. ``stride`` defaults to
     ``size``, px. ``training``, ``validation``, ``testing`` are the counts of table 3, which are
-    scaled to the tiles there are. ``quality``: the limits beyond which tiles and scenes are flagged.
-    ``building_share``: share of building pixels from which on a tile is of that class. ``coverage`` and
-    ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT matches. Returns
-    a summary, see :func:`summary_lines`.
+    scaled to the tiles there are. ``quality``: the limits beyond which tiles and scenes are
+    flagged. ``building_share``: share of building pixels from which on a tile is of that class.
+    ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
+    matches. Returns a summary, see :func:`summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
