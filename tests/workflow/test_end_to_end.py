@@ -152,6 +152,33 @@ def test_one_core_gives_the_same_bytes(made, tmp_path):
         assert hashes(made.folder / product) == hashes(other.folder / product)
 
 
+def test_the_right_view_is_a_second_product(made, tmp_path):
+    """Asked for later, it adds files and leaves the others; both views name each other's pixels."""
+    other = Project(tmp_path / "other")
+    shutil.copytree(made.folder, other.folder)
+    config = other.folder / "tiny.yaml"
+    config.write_text(config.read_text() + "project: {right_view: true}\n")
+    assert plan(other) == {"project_right": 1, "export": 1}
+    run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
+    assert run.status == 0, run.text[-4000:]
+    row = next(row for row in manifest(other) if row["complete"] == "yes")
+    folder = other.folder / "tiles/Tiny"
+    left, right = (
+        rioxarray.open_rasterio(folder / row[kind], masked=True)[0].values
+        for kind in ("disp", "disp_right")
+    )
+    before = hashes(made.folder / "tiles/Tiny/disp")
+    assert before == hashes(folder / "disp")
+    rows, cols = np.nonzero(np.isfinite(right))
+    there = np.rint(cols + right[rows, cols]).astype(int)
+    inside = (there >= 0) & (there < left.shape[1])
+    back = left[rows[inside], there[inside]]
+    miss = np.abs(back - right[rows[inside], cols[inside]])[np.isfinite(back)]
+    assert miss.size > 0.3 * left.size
+    assert np.median(miss) < 0.1
+    assert other.snakemake("verify", "--configfile", "tiny.yaml").status == 0
+
+
 def test_verify_finds_an_edited_tile(made, tmp_path):
     assert made.snakemake("verify", "--configfile", "tiny.yaml").status == 0
     tile = next((made.folder / "tiles/Tiny/left").iterdir())
