@@ -132,7 +132,8 @@ def draw(rows: Rows, path: Path) -> None:
             size = 11 if style == "*" else 4
             ax.plot(x, y, style, color=colour, ms=size, lw=1.3, label=way)
             for row, at_x, at_y in zip(here, x, y):
-                if "-" in style and row["threshold"] is not None:
+                # the points of "both" lie close together: its last one only
+                if style == "o-" and (colour == COLOURS[0] or row["threshold"] == THRESHOLDS[-1]):
                     ax.annotate(
                         f"{row['threshold']:g}", (at_x, at_y), (3, -8),
                         textcoords="offset points", fontsize=6, color=colour, annotation_clip=True,
