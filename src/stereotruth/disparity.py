@@ -105,7 +105,7 @@ class Settings:
     window: int = 9
     correlation_threshold: float = 0.5
     representative: str = "top"
-    edge_margin_px: float = 0.05
+    edge_margin_px: float = 0.0
     min_points: int = 1
 
     def __post_init__(self) -> None:
@@ -670,7 +670,7 @@ def project_scene(
     window: int = 9,
     correlation_threshold: float = 0.5,
     representative: str = "top",
-    edge_margin_px: float = 0.05,
+    edge_margin_px: float = 0.0,
     min_points: int = 1,
     workers: int = 1,
     scheduler: Any = "threads",

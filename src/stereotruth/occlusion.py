@@ -42,6 +42,7 @@ SURFACE_PX = 1.0
 COVER_PX = 1.0
 MAX_COVER_PX = 2.5
 EMPTY_OCTANTS = 3
+MANY = 12  # points in 3 x 3 pixels from which on a gap of four octants is no chance
 # Cells are finer than pixels, so that walls stand where they are: 0.7 % more of the visible pixels
 # were kept than with cells of a pixel, at equal shares of hidden ones.
 CELL_PX = 0.5
@@ -137,6 +138,14 @@ def _count(pixel: Ints, use: NDArray[np.bool_], out: Ints) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _octant(du: float, dv: float) -> int:
+    """0 … 7 in the order of the angle: quadrant, then its first or second half."""
+    mixed = (du < 0.0) != (dv < 0.0)
+    quadrant = (4 if dv < 0.0 else 0) + (2 if mixed else 0)
+    return quadrant + (1 if (abs(dv) > abs(du)) != mixed else 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _uncovered(
     xy: Floats,
     pixel: Ints,
@@ -169,10 +178,7 @@ def _uncovered(
             for a in range(max(i - n, 0), min(i + n + 1, tops.shape[1])):
                 du = a + 0.5 - u
                 if tops[b, a] > limit and du * du + dv * dv <= far * far:
-                    # Octants in the order of the angle: quadrant, then its first or second half.
-                    mixed = (du < 0.0) != (dv < 0.0)
-                    octant = (4 if dv < 0.0 else 0) + (2 if mixed else 0)
-                    octants |= 1 << (octant + (1 if (abs(dv) > abs(du)) != mixed else 0))
+                    octants |= 1 << _octant(du, dv)
         out[k] = not surrounded[octants]
 
 
@@ -201,16 +207,22 @@ def _nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _nearest_other(
+def _around(
     xy: Floats,
     use: NDArray[np.bool_],
     first: tuple[int, int],
     disparity: Floats,
     tolerance: float,
-    distance: Floats,
+    other: Floats,
+    octants: Ints,
+    count: Ints,
 ) -> None:
-    """Per pixel: squared distance of its centre to the nearest point of another surface."""
-    rows, cols = distance.shape
+    """Per pixel, of the points in it and in those beside it.
+
+    ``other``: squared distance of the centre to the nearest one of another surface; ``octants``:
+    bits of those in which its own surface has points; ``count``: how many there are.
+    """
+    rows, cols = disparity.shape
     for k in range(xy.shape[1]):
         if not use[k]:
             continue
@@ -219,9 +231,12 @@ def _nearest_other(
         d = xy[0, k] - xy[2, k]
         for b in range(max(j - 1, 0), min(j + 2, rows)):
             for a in range(max(i - 1, 0), min(i + 2, cols)):
-                if abs(d - disparity[b, a]) > tolerance:
+                count[b, a] += 1
+                if abs(d - disparity[b, a]) <= tolerance:
+                    octants[b, a] |= 1 << _octant(x - a, y - b)
+                else:
                     q = (x - a) ** 2 + (y - b) ** 2
-                    distance[b, a] = min(distance[b, a], q)
+                    other[b, a] = min(other[b, a], q)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -260,9 +275,11 @@ def seen_surface(
     beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
     within SURFACE_PX. There are none if the pixel only holds points of another surface.
 
-    The second result tells which of them lie in a pixel on an edge: half-way between the nearest
-    points of its surface and of another one, the edge passes within ``edge_margin_px`` of the
-    centre, so that it may as well see the other one.
+    The second result tells which of them lie in a pixel on an edge. Either the points of its
+    surface do not surround the centre: they leave a gap of more than EMPTY_OCTANTS, as beside a
+    wall that no point tells of (not where points are so sparse that gaps come by chance). Or,
+    half-way between the nearest points of its surface and of another one, the edge passes within
+    ``edge_margin_px`` of the centre, so that it may as well see the other one.
 
     ``pixel`` is the row-major index into ``rows`` x ``cols``; ``xy`` [4, n] as in
     :func:`stereotruth.correlation.correlate`. The outermost EDGE rings of pixels lack neighbours.
@@ -293,8 +310,10 @@ def seen_surface(
     distance, disparity = np.full(shape, np.inf), np.full(shape, np.nan)
     _nearest(xy, uncovered, first, distance, disparity)
     other = np.full(shape, np.inf)
-    _nearest_other(xy, uncovered, first, disparity, SURFACE_PX, other)
-    edge = np.sqrt(other) < np.sqrt(distance) + 2.0 * edge_margin_px
+    octants, around = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+    _around(xy, uncovered, first, disparity, SURFACE_PX, other, octants, around)
+    edge = ~_surrounded(EMPTY_OCTANTS)[octants] & (around >= MANY)
+    edge |= np.sqrt(other) < np.sqrt(distance) + 2.0 * edge_margin_px
     out = np.empty(use.size, dtype=np.bool_)
     _near_surface(xy, pixel, uncovered, disparity.reshape(-1), SURFACE_PX, out)
     return out, out & edge.reshape(-1)[pixel]
