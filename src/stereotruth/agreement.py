@@ -29,9 +29,9 @@ from .occlusion import SURFACE_PX
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# Pixels belong to one surface if their disparities differ by no more than SURFACE_PX, and SLOPE
-# px for each pixel between them: terrain may fall by that much, a storey is 3 px at once.
-SLOPE = 0.3
+# Pixels belong to one surface if a disparity is off the plane through the other by no more than
+# SURFACE_PX, and BEND px for each pixel between them.
+BEND = 0.1
 VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
 SUPPORT = 0.6  # share of the neighbours with points that must carry the surface
@@ -87,25 +87,27 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _same(disparity, b, a, here, distance):
-    return abs(disparity[b, a] - here) <= SURFACE_PX + SLOPE * distance
+def _same(disparity, slope, y, x, b, a):
+    plane = disparity[y, x] + slope[0, y, x] * (a - x) + slope[1, y, x] * (b - y)
+    return abs(disparity[b, a] - plane) <= SURFACE_PX + BEND * max(abs(b - y), abs(a - x))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _correlation(left: Floats, warped: Floats, disparity: Floats, half: int, out: Floats) -> None:
+def _correlation(
+    left: Floats, warped: Floats, disparity: Floats, slope: Floats, half: int, out: Floats
+) -> None:
     rows, cols = left.shape
     for y in range(rows):
         for x in range(cols):
             out[y, x] = np.nan
             if not np.isfinite(warped[y, x]):
                 continue
-            here, u0, v0 = disparity[y, x], left[y, x], warped[y, x]
+            u0, v0 = left[y, x], warped[y, x]
             n = 0
             su = sv = suu = svv = suv = 0.0
             for b in range(max(y - half, 0), min(y + half + 1, rows)):
                 for a in range(max(x - half, 0), min(x + half + 1, cols)):
-                    far = max(abs(b - y), abs(a - x))
-                    if np.isfinite(warped[b, a]) and _same(disparity, b, a, here, far):
+                    if np.isfinite(warped[b, a]) and _same(disparity, slope, y, x, b, a):
                         u, v = left[b, a] - u0, warped[b, a] - v0
                         n += 1
                         su += u
@@ -120,25 +122,29 @@ def _correlation(left: Floats, warped: Floats, disparity: Floats, half: int, out
             out[y, x] = (suv - su * sv / n) / np.sqrt(uu * vv) if uu > 0.0 and vv > 0.0 else 0.0
 
 
-def surface_correlation(left: Floats, warped: Floats, disparity: Floats, window: int) -> Floats:
+def surface_correlation(
+    left: Floats, warped: Floats, disparity: Floats, slope: Floats, window: int
+) -> Floats:
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
 
-    ``warped`` is NaN and ``disparity`` (px) anything where there is no label. NaN where there is no
+    ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
+    where there is no label. NaN where there is no
     label or fewer pixels than the ``window`` (odd, px) is wide; 0 where either image is constant.
     """
     out = np.empty(left.shape)
-    _correlation(left, warped, disparity, window // 2, out)
+    _correlation(left, warped, disparity, slope, window // 2, out)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _outvoted(correlation: Floats, disparity: Floats, threshold: float, out: Bools) -> None:
+def _outvoted(
+    correlation: Floats, disparity: Floats, slope: Floats, threshold: float, out: Bools
+) -> None:
     rows, cols = correlation.shape
     for y in range(rows):
         for x in range(cols):
             out[y, x] = False
-            here = disparity[y, x]
-            if not np.isfinite(here):
+            if not np.isfinite(disparity[y, x]):
                 continue
             votes = 0
             against = 0
@@ -147,16 +153,19 @@ def _outvoted(correlation: Floats, disparity: Floats, threshold: float, out: Boo
                     b, a = y + down, x + across
                     if not (0 <= b < rows and 0 <= a < cols and np.isfinite(correlation[b, a])):
                         continue
-                    if _same(disparity, b, a, here, max(abs(down), abs(across))):
+                    if _same(disparity, slope, y, x, b, a):
                         votes += 1
                         against += correlation[b, a] < threshold
             out[y, x] = 2 * against > votes
 
 
-def outvoted(correlation: Floats, disparity: Floats, threshold: float) -> Bools:
-    """Pixels [h, w] around which most of their surface correlates by less than ``threshold``."""
+def outvoted(correlation: Floats, disparity: Floats, slope: Floats, threshold: float) -> Bools:
+    """Pixels [h, w] around which most of their surface correlates by less than ``threshold``.
+
+    ``disparity`` (px) and its ``slope`` [2, h, w] tell what belongs to a surface.
+    """
     out = np.empty(correlation.shape, dtype=np.bool_)
-    _outvoted(correlation, disparity, threshold, out)
+    _outvoted(correlation, disparity, slope, threshold, out)
     return out
 
 

@@ -511,10 +511,11 @@ class _Scene:
         warped = warp_to_left(right, *wide, labels.disparity)
         top, side = wide[0].start - left.row, wide[1].start - left.col
         shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
+        surface = labels.disparity, labels.slope
         found = surface_correlation(
-            shown.astype(np.float64), warped, labels.disparity, self.settings.window
+            shown.astype(np.float64), warped, *surface, self.settings.window
         )
-        changed = outvoted(found, labels.disparity, self.settings.correlation_threshold)
+        changed = outvoted(found, *surface, self.settings.correlation_threshold)
         changed |= (status == Status.LABELLED) & (pixels.surface_class == WATER_CLASS)
         status[changed] = Status.CHANGED
         return found
@@ -700,7 +701,7 @@ def project_scene(
     paths = sorted(Path(path) for path in point_stores)
     if not paths:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
-    job = _Scene(Path(left_store), Path(right_store), tuple(paths), settings, max_points)
+    job = _Scene(Path(left_store), Path(right_store), tuple(paths), settings, max_points, view)
     model, stores = job.model, job.stores
     corners = np.array([store.bounds for store in stores])
     bounds = [*corners[:, :2].min(0), *corners[:, 2:4].max(0)]

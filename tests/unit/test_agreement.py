@@ -8,6 +8,8 @@ import pytest
 from stereotruth.agreement import outvoted, supported, surface_correlation, warp_to_left
 from stereotruth.correlation import read_patch
 
+LEVEL = np.zeros((2, 80, 80))
+
 
 def texture(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(200, 1200, shape)
@@ -37,24 +39,27 @@ def test_surface_correlation_stays_on_the_surface() -> None:
     warped[:, 30:] = texture((60, 30), seed=1)  # the upper surface shows something else
     disparity = np.zeros((60, 60))
     disparity[:, 30:] = 20.0
-    found = surface_correlation(left, warped, disparity, 9)
+    found = surface_correlation(left, warped, disparity, LEVEL[:, :60, :60], 9)
     assert found[:, :30] == pytest.approx(1.0, abs=1e-9)
     assert np.abs(found[:, 30:]).mean() < 0.25
     # With one surface, the same pixels would be mixed.
-    mixed = surface_correlation(left, warped, np.zeros((60, 60)), 9)
+    mixed = surface_correlation(left, warped, np.zeros((60, 60)), LEVEL[:, :60, :60], 9)
     assert mixed[:, 28:30].max() < 0.99
 
 
 def test_correlation_is_that_of_numpy() -> None:
     left, warped = texture((21, 21)), texture((21, 21), seed=1)
     warped[3, 4] = np.nan
-    found = surface_correlation(left, warped, np.zeros((21, 21)), 7)
+    found = surface_correlation(left, warped, np.zeros((21, 21)), LEVEL[:, :21, :21], 7)
     window = np.s_[2:9, 3:10]
     known = np.isfinite(warped[window])
     expected = np.corrcoef(left[window][known], warped[window][known])[0, 1]
     assert found[5, 6] == pytest.approx(expected, abs=1e-12)
     assert np.isnan(found[3, 4])
-    assert (surface_correlation(left, np.full((21, 21), 5.0), np.zeros((21, 21)), 7) == 0).all()
+    assert (
+        surface_correlation(left, np.full((21, 21), 5.0), np.zeros((21, 21)), LEVEL[:, :21, :21], 7)
+        == 0
+    ).all()
 
 
 def test_single_failures_are_not_change_but_a_region_is() -> None:
@@ -62,14 +67,14 @@ def test_single_failures_are_not_change_but_a_region_is() -> None:
     rng = np.random.default_rng(2)
     correlation[rng.random((80, 80)) < 0.2] = 0.1
     disparity = np.zeros((80, 80))
-    assert not outvoted(correlation, disparity, 0.5).any()
+    assert not outvoted(correlation, disparity, LEVEL, 0.5).any()
     disparity[30:50, 30:50] = 15.0
     correlation[30:50, 30:50] = np.where(rng.random((20, 20)) < 0.2, 0.9, 0.1)
-    changed = outvoted(correlation, disparity, 0.5)
+    changed = outvoted(correlation, disparity, LEVEL, 0.5)
     assert changed[30:50, 30:50].all()
     assert changed.sum() == 400
     disparity[40, 40] = np.nan
-    assert not outvoted(correlation, disparity, 0.5)[40, 40]
+    assert not outvoted(correlation, disparity, LEVEL, 0.5)[40, 40]
 
 
 def test_support_counts_neighbours_with_points() -> None:
@@ -85,3 +90,19 @@ def test_support_counts_neighbours_with_points() -> None:
     lonely = np.full((20, 20), np.nan)
     lonely[::3, ::3] = 1.0
     assert supported(lonely, np.isfinite(lonely))[::3, ::3].all()
+
+
+def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
+    """A hillside of 0.8 px per px votes as one; ground does not vote for a roof of 3.5 px."""
+    x = np.broadcast_to(np.arange(60.0), (60, 60))
+    slope = np.zeros((2, 60, 60))
+    slope[0] = 0.8
+    correlation = np.full((60, 60), 0.9)
+    correlation[30, 30] = 0.1
+    assert not outvoted(correlation, 0.8 * x, slope, 0.5).any()
+    roof = np.s_[22:38, 22:38]
+    disparity, correlation = np.zeros((60, 60)), np.full((60, 60), 0.9)
+    disparity[roof], correlation[roof] = 3.5, 0.2
+    changed = outvoted(correlation, disparity, np.zeros((2, 60, 60)), 0.5)
+    assert changed[roof].all()
+    assert changed.sum() == 256

@@ -175,7 +175,7 @@ def test_the_right_view_is_a_second_product(made, tmp_path):
     back = left[rows[inside], there[inside]]
     miss = np.abs(back - right[rows[inside], cols[inside]])[np.isfinite(back)]
     assert miss.size > 0.3 * left.size
-    assert np.median(miss) < 0.1
+    assert (miss < 0.2).mean() > 0.95
     assert other.snakemake("verify", "--configfile", "tiny.yaml").status == 0
 
 
