@@ -14,9 +14,9 @@ of its point that got furthest:
    filter, :mod:`stereotruth.correlation`);
 2. of each pixel: do both cameras see it past the other surfaces
    (:func:`stereotruth.occlusion.hidden_pixels`; ``geometric``, ``both``); is an edge of its surface
-   within ``edge_margin_px`` of its centre; do its neighbours carry its surface
-   (:func:`stereotruth.agreement.supported`); do the images agree with what the LiDAR has there, and
-   is it no water (:func:`stereotruth.agreement.outvoted`; ``both``); are there ``min_points``.
+   near its centre (``top``); do the images agree with what the LiDAR has there, and is it no water
+   (:func:`stereotruth.agreement.outvoted`; ``both``); do its neighbours carry its surface
+   (:func:`stereotruth.agreement.supported`; ``geometric``, ``both``); are there ``min_points``.
 
 The grid is worked on in blocks of one shard, each independent of the others; a block is cut into
 windows of a bounded number of points. The result has the same bytes for any number of workers, size
