@@ -50,7 +50,7 @@ CELL_PX = 0.5
 # with a step of SURFACE_PX before it is taken to begin AHEAD_CELLS earlier (roof edges are sampled
 # on their inner side). The ray's first NEAREST_CELLS do not count (noise would hide itself).
 TOLERANCE_PX = 0.25
-AHEAD_CELLS = 0.5
+AHEAD_CELLS = 0.75
 NEAREST_CELLS = 0.5
 # Rounds of filling cells without points: radius in cells within which three known ones are needed.
 FILL_RADII = (1, 2, 4)
