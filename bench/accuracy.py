@@ -241,7 +241,8 @@ class Made:
 
     @property
     def has_truth(self) -> bool:
-        return self.scene.city in CITIES and (self.input / "truth.zarr").is_dir()
+        place = Path("data/synthetic") / self.scene.city / self.scene.scene
+        return self.scene.city in CITIES and self.input == place
 
     def before(self, model: EpipolarModel) -> EpipolarModel:
         """The epipolar model by the ground control points alone; ``model``: the one in use."""
@@ -376,9 +377,12 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
                 result
             )
             model = EpipolarModel.from_dict(require_complete(made.disparity).attrs["epipolar"])
-            if made.refined.is_file() and config["alignment"]["refine"]:
+            if not raw.is_dir():
+                print(f"{name}: for the alignment alone, make {raw} (snakemake --cores 2 {raw})")
+            elif made.refined.is_file() and config["alignment"]["refine"]:
                 report["geometry"].append(geometry_row(name, "GCPs", made.before(model), raw))
-            report["geometry"].append(geometry_row(name, "as used", model, raw))
+            if raw.is_dir():
+                report["geometry"].append(geometry_row(name, "as used", model, raw))
         if made.has_truth and arguments.exact:
             folder = made.exact / "noise-free"
             exact = with_exact_gcps(made, folder, config, arguments.workers)
@@ -386,7 +390,8 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             result = truth.compare_scene(exact, true, None, scene=name, workers=arguments.workers)
             report["exact"].append(truth_row(f"{name} scene", result.whole.total))
             model = EpipolarModel.from_dict(require_complete(exact).attrs["epipolar"])
-            report["geometry"].append(geometry_row(name, "noise-free GCPs", model, raw))
+            if raw.is_dir():
+                report["geometry"].append(geometry_row(name, "noise-free GCPs", model, raw))
         if (made.input / "checkpoints.csv").is_file():
             figures = checkpoints.evaluate_checkpoints(
                 made.disparity, made.input / "checkpoints.csv", scene=name

@@ -162,7 +162,8 @@ class ViewFit:
 class Alignment:
     """Aligned sensor models of a pair, with how they were found.
 
-    ``reference_height``: mean of the GCPs that are used in either view, ellipsoidal m.
+    ``reference_height``: mean of the GCPs that are used in either view (without any: of the RPCs,
+    after refinement of the tie points), ellipsoidal m.
     ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
     ``refinement``: what `refine` observed and changed, empty before.
     """

@@ -488,8 +488,12 @@ def refine(
         record["after"] = record["before"]
     doubts = [] if insignificant else _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
+    height = alignment.reference_height
+    if not any(fit.gcps for fit in alignment.fits):  # it was that of the RPCs, far off perhaps
+        height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
+        reference_height=height,
         warnings=(*alignment.warnings, *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
