@@ -38,52 +38,43 @@ SUPPORT = 0.6  # share of the neighbours with points that must carry the surface
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _warp(
-    pixels: NDArray[np.float32],
-    usable_cols: int,
-    row: int,
-    col: int,
-    first_row: int,
-    first_col: int,
-    disparity: Floats,
-    out: Floats,
-) -> None:
-    rows, cols = disparity.shape
+def _warp(image: NDArray, at: Floats, out: Floats) -> None:
+    rows, cols = at.shape
     for y in range(rows):
-        r = first_row + y - row
-        for x in range(cols):
-            out[y, x] = np.nan
-            at = first_col + x - disparity[y, x] - col
-            if not (at >= 1.0 and at < usable_cols - 3.0 and 0 <= r < pixels.shape[0]):
+        for k in range(cols):
+            out[y, k] = np.nan
+            x = at[y, k]
+            if not (x >= 1.0 and x <= image.shape[1] - 3.0):
                 continue
-            i = int(at)
-            f = at - i
-            a, b, c, d = pixels[r, i - 1], pixels[r, i], pixels[r, i + 1], pixels[r, i + 2]
+            i = int(x)
+            f = x - i
+            a, b, c, d = image[y, i - 1], image[y, i], image[y, i + 1], image[y, i + 2]
             if a == 0.0 or b == 0.0 or c == 0.0 or d == 0.0:
                 continue
-            # Keys' cubic, a = -1/2
-            out[y, x] = b + 0.5 * f * (
+            out[y, k] = b + 0.5 * f * (
                 c - a + f * (2.0 * a - 5.0 * b + 4.0 * c - d + f * (3.0 * (b - c) + d - a))
             )
+
+
+def warp_rows(image: NDArray[np.floating], x: Floats) -> Floats:
+    """Values float64[h, w] of an image [h, W] at columns ``x`` [h, w] of the same rows.
+
+    Cubic convolution (Keys, a = -1/2). NaN where x is NaN, where one of the four columns is nodata
+    (0) or outside the image.
+    """
+    out = np.empty(x.shape)
+    _warp(image, x, out)
+    return out
 
 
 def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
     """Right image at (x - disparity, y) of every pixel of a window of the left grid, float64[h, w].
 
-    NaN where there is no disparity, or the right image has no value.
+    NaN where there is no disparity, or the right image has no value. The patch holds all rows.
     """
-    out = np.empty(disparity.shape)
-    _warp(
-        right.pixels,
-        right.usable.shape[1],
-        right.row,
-        right.col,
-        rows.start,
-        cols.start,
-        disparity,
-        out,
-    )
-    return out
+    top = rows.start - right.row
+    image = right.pixels[top : top + len(disparity), : right.usable.shape[1]]
+    return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -128,8 +119,8 @@ def surface_correlation(
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
 
     ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
-    where there is no label. NaN where there is no
-    label or fewer pixels than the ``window`` (odd, px) is wide; 0 where either image is constant.
+    where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
+    px) is wide; 0 where either image is constant.
     """
     out = np.empty(left.shape)
     _correlation(left, warped, disparity, slope, window // 2, out)

@@ -50,7 +50,6 @@ from .occlusion import (
     METHODS,
     Rays,
     build_surface,
-    exact_sums,
     hidden_pixels,
     seen_surface,
 )
@@ -439,8 +438,7 @@ class _Scene:
         _furthest(pixel, stage, furthest)
         status = _STATUS_OF_STAGE[furthest].reshape(shape)
         if surface is not None:
-            sums = exact_sums(points, pixel, use, status.size)
-            hidden = hidden_pixels(surface, self.rays, sums, *wide).reshape(shape)
+            hidden = hidden_pixels(surface, self.rays, pixels.sums, *wide).reshape(shape)
             status[hidden == 1] = Status.HIDDEN_IN_LEFT
             status[hidden == 2] = Status.HIDDEN_IN_RIGHT
         if edge is not None:

@@ -39,12 +39,14 @@ RIDGE = 0.1  # px², keeps planes through places in a line level across it
 class Pixels:
     """What the points of each pixel come to; arrays [h, w], NaN (0) where a pixel has none.
 
-    ``count``; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the representative point;
+    ``sums`` [h * w, 4] of :func:`stereotruth.occlusion.exact_sums`; ``count``; ``x``, ``y`` (px,
+    left grid) and ``disparity`` (px) of the representative point;
     ``highest`` (m); ``correlation`` mean of the points'; ``surface_class`` ASPRS class of the
     highest point; ``moments`` [h, w, 6]: sums over the points, about their mean, of uu, uv, vv, uz,
     vz, zz, with (u, v) the place in the left grid and z the disparity, px².
     """
 
+    sums: NDArray[np.int64]
     count: NDArray[np.int64]
     x: Floats
     y: Floats
@@ -145,6 +147,7 @@ def condense(
         place = model.ground_to_epipolar(lon, lat, highest[found])
         means[found] = np.stack([place[0], place[1], place[0] - place[2]], axis=1)
     return Pixels(
+        sums=lattice,
         count=count.reshape(shape),
         x=means[:, 0].reshape(shape),
         y=means[:, 1].reshape(shape),

@@ -41,12 +41,13 @@ from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
 from . import figures
+from .agreement import warp_rows
 from .epipolar import EpipolarModel
 from .errors import InputError
 from .evaluation.classes import tile_class
-from .evaluation.sift import MATCH_COLUMNS, TileMatches, match_rows, match_tile
+from .evaluation.sift import FIGURES, MATCH_COLUMNS, TileMatches, match_rows, match_tile
 from .evaluation.statistics import ErrorSum
-from .evaluation.warping import CorrelationSum, agreement, warp_rows
+from .evaluation.warping import CorrelationSum, agreement
 from .gates import NO_LIMITS, Limits, flag, missed
 from .grid_store import replacing, require_complete
 from .orientation import orientation, save, sensor_record
@@ -364,16 +365,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-CHECK_COLUMNS = (
-    "sift_matches",
-    "sift_mean_error_px",
-    "sift_mean_absolute_error_px",
-    "sift_median_error_px",
-    "sift_gross_share",
-    "y_parallax_median_px",
-    "y_parallax_rms_px",
-    "warp_correlation",
-)
+CHECK_COLUMNS = (*FIGURES, "warp_correlation")
 
 
 def _check_cells(checks: _Checks | None, limits: Limits) -> dict[str, Any]:

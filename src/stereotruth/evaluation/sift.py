@@ -196,22 +196,23 @@ class TileMatches:
         return match_figures(self.row_errors, self.agreeing_parallax)
 
 
+FIGURES = (
+    "sift_matches",
+    "sift_mean_error_px",
+    "sift_mean_absolute_error_px",
+    "sift_median_error_px",
+    "sift_gross_share",
+    "y_parallax_median_px",
+    "y_parallax_rms_px",
+)
+
+
 def match_figures(errors: Floats, parallax: Floats) -> dict[str, float | int | None]:
     """Figures of the errors of table 4 and of the y-parallax; px, share 0 … 1, None without any.
 
     A y-parallax needs ``MIN_PARALLAX`` matches.
     """
-    values: dict[str, float | int | None] = dict.fromkeys(
-        (
-            "sift_matches",
-            "sift_mean_error_px",
-            "sift_mean_absolute_error_px",
-            "sift_median_error_px",
-            "sift_gross_share",
-            "y_parallax_median_px",
-            "y_parallax_rms_px",
-        )
-    )
+    values: dict[str, float | int | None] = dict.fromkeys(FIGURES)
     values["sift_matches"] = errors.size
     if errors.size:
         median = float(np.median(errors))

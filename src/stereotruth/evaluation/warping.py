@@ -18,6 +18,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
+from ..agreement import warp_rows
 from ..errors import InputError
 from ..grid_store import blocks, replacing, require_complete
 
@@ -67,32 +68,6 @@ class CorrelationSum:
         variance = self.bb - self.b**2 / n
         gain = (self.ab - self.a * self.b / n) / variance if variance > 0 else 1.0
         return gain * (b - self.b / n) + self.a / n
-
-
-def warp_rows(right: Floats, x: Floats) -> Floats:
-    """Values float64[h, w] of an image [h, W] at columns ``x`` [h, w] of the same rows.
-
-    Cubic convolution (a = −0.5). NaN where x is NaN, where one of the four columns is nodata (0)
-    or outside the image.
-    """
-    width = right.shape[1]
-    known = np.isfinite(x) & (x >= 1) & (x <= width - 3)
-    i = np.where(known, np.floor(np.where(known, x, 1.0)), 1.0).astype(np.intp)
-    t = np.where(known, x, 1.0) - i
-    rows = np.arange(len(x))[:, None]
-    total = np.zeros(x.shape)
-    for k, weight in enumerate(
-        (
-            ((-0.5 * t + 1.0) * t - 0.5) * t,
-            (1.5 * t - 2.5) * t * t + 1.0,
-            ((-1.5 * t + 2.0) * t + 0.5) * t,
-            (0.5 * t - 0.5) * t * t,
-        )
-    ):
-        value = right[rows, np.clip(i + k - 1, 0, width - 1)]
-        known &= value != 0
-        total += weight * value
-    return np.where(known, total, np.nan)
 
 
 def warp_window(right: Any, disparity: Floats, rows: slice, cols: slice) -> Floats:
