@@ -12,6 +12,8 @@ Rules
   of LAS), in metres in a geographic one.
 - Orthometric heights H need a geoid grid: h = H + N. Grids give N above the GRS 80 or WGS 84
   ellipsoid. Nothing is ever downloaded.
+- Map projections are undone by polynomials that are checked against PROJ at run time, see
+  :mod:`stereotruth.crs_patches`; a coordinate may come out one step of 1e-9 degree beside PROJ's.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
   but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
 """
@@ -22,7 +24,7 @@ import logging
 import re
 import struct
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,6 +39,7 @@ from pyproj.transformer import TransformerGroup
 from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
+from .crs_patches import PatchedTransform
 from .errors import InputError
 
 log = logging.getLogger("stereotruth")
@@ -474,7 +477,7 @@ class ToWGS84:
     accuracy_m: float | None
     heights: str
     notes: tuple[str, ...]
-    _transformer: pyproj.Transformer = field(repr=False)
+    _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
 
@@ -487,7 +490,7 @@ class ToWGS84:
         does not cover them.
         """
         metres = np.asarray(z, np.float64) * self.system.height_unit_m
-        lon, lat, height = self._transformer.transform(x, y, metres)
+        lon, lat, height = self._transform(x, y, metres)
         if self._geoid is not None:
             good = np.isfinite(lon) & np.isfinite(lat)
             base = height if self._heights_follow_datum else metres
@@ -613,6 +616,9 @@ def to_wgs84(
             file=file,
             remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
         ) from error
+    transform = transformer.transform
+    if system.horizontal.is_projected:
+        transform = PatchedTransform(transform, system.horizontal_unit_m)
     grid = GeoidGrid(Path(geoid)) if geoid else None
     ellipsoid = system.horizontal.ellipsoid
     modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
@@ -626,7 +632,7 @@ def to_wgs84(
         accuracy_m=float(transformer.accuracy) if transformer.accuracy >= 0 else None,
         heights=heights,
         notes=tuple(notes + remarks),
-        _transformer=transformer,
+        _transform=transform,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.

@@ -18,6 +18,9 @@ Layout of a store (Zarr v3, sharded; n points, m cells):
 ===========================  =============  ==================================================
 
 One array for all that is read together: queries are nearly twice as fast as with one each.
+
+What ingest does to a point costs less than half of decoding it: kernels take the records apart,
+bring them to the lattice and sort them by cell without an intermediate copy of the points.
 """
 
 from __future__ import annotations
@@ -30,17 +33,25 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import laspy
 import lazrs
 import numpy as np
 import zarr
+from numba import njit
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, BloscShuffle
 
 from .crs import DEGREE_M, ToWGS84, check_area, to_wgs84
 from .errors import InputError
-from .grid_store import building, compressor, require_complete
+from .grid_store import building, require_complete
 from .runlog import progress
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 log = logging.getLogger("stereotruth")
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
@@ -53,7 +64,11 @@ CELL_BITS = 20
 CHUNK_POINTS = 1 << 16  # points per Zarr chunk
 SHARD_POINTS = 1 << 21  # points per shard file
 _ATTRIBUTES = ("classification", "return_number", "number_of_returns")
-_RECORD = np.dtype([("position", "<i4", 3), ("attributes", "u1", 3)])  # 15 bytes
+_RECORD_BYTES = 16  # of a point before it has its final place: position and attributes
+SCRATCH_POINTS = 1 << 24  # of these kept in memory, 256 MiB
+# A third of the time of zstd, level 3, to write and to read, and files no larger: a store is
+# written once and read once or twice.
+_CODEC = BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.bitshuffle)
 _ATTRS = {
     "position": {
         "units": "1e-9 degree, 1e-9 degree, 1e-4 m",
@@ -74,6 +89,7 @@ _ATTRS = {
 }
 COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
+FARTHEST_M = 2e5  # heights beyond are no heights
 
 
 # ------------------------------------------------------------------ reading LAS
@@ -212,24 +228,51 @@ def _ahead(items: Iterator) -> Iterator:
 # ------------------------------------------------------------------ ingest
 
 
+def _no_limits() -> np.ndarray:
+    return np.array([[np.iinfo(np.int64).max] * 3, [np.iinfo(np.int64).min] * 3])
+
+
 @dataclass
 class _Tally:
     """What is counted and checked along the way; nothing in it depends on the chunks."""
 
-    read: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-    classes: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
+    counts: Integers = field(default_factory=lambda: np.zeros((2, 257), np.int64))  # see _unpack
+    file_limits: Integers = field(default_factory=_no_limits)  # [2, 3], stored integers
+    lattice_limits: Integers = field(default_factory=_no_limits)  # [2, 3], kept points
     sample: list[np.ndarray] = field(default_factory=list)
     sampled: int = 0
-    low: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).max))
-    high: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).min))
 
-    def reach(self, points: laspy.ScaleAwarePointRecord) -> None:
-        """Take in all points of a chunk as they are in the file, dropped ones included."""
-        self.read += len(points)
-        stored = [points.array[axis] for axis in "XYZ"]
-        self.low = np.minimum(self.low, [values.min() for values in stored])
-        self.high = np.maximum(self.high, [values.max() for values in stored])
+    def take(
+        self,
+        points: laspy.ScaleAwarePointRecord,
+        header: laspy.LasHeader,
+        drop_classes: Sequence[int],
+    ) -> tuple[Floats, NDArray[np.uint32]]:
+        """Coordinates [3, n] and attributes [n], see _unpack, of the points to keep."""
+        unwanted = np.isin(np.arange(256), drop_classes)
+        raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
+        xyz, attributes = np.empty((3, len(points))), np.empty(len(points), np.uint32)
+        kept = _unpack(
+            raw,
+            header.point_format.id >= 6,
+            unwanted,
+            np.asarray(header.scales, np.float64),
+            np.asarray(header.offsets, np.float64),
+            xyz,
+            attributes,
+            self.counts,
+            self.file_limits,
+        )
+        return xyz[:, :kept], attributes[:kept]
+
+    @property
+    def read(self) -> int:
+        return int(self.counts.sum())
+
+    def dropped(self, drop_classes: Sequence[int]) -> dict[str, int]:
+        """Dropped points by reason; each counts under its first."""
+        by_class = {f"class {c}": int(self.counts[1, c]) for c in drop_classes if 0 <= c < 256}
+        return {"withheld": int(self.counts[1, 256])} | by_class
 
     def compare_bounds(self, header: laspy.LasHeader, file: Path) -> str | None:
         """Refuse points far outside of the header's bounds: a damaged LAZ decodes into noise.
@@ -241,7 +284,7 @@ class _Tally:
         size = maxs - mins
         if not (np.isfinite(size).all() and size.max() > 0):
             return None  # never filled in
-        low, high = self.low * scale + offset, self.high * scale + offset
+        low, high = self.file_limits * scale + offset
         beyond = np.maximum(mins - low, high - maxs)
         if (beyond <= 2 * scale).all():
             return None
@@ -253,18 +296,17 @@ class _Tally:
             raise InputError(f"damaged: {text}", file=file, remedy="fetch or write the file again")
         return text
 
-    def drop(self, reason: str, number: int) -> None:
-        self.dropped[reason] = self.dropped.get(reason, 0) + number
-
-    def keep(self, classification: np.ndarray, lon_q: np.ndarray, lat_q: np.ndarray) -> None:
-        self.classes += np.bincount(classification, minlength=256)
+    def look(self, lattice: Integers) -> None:
+        """Keep the first points for :meth:`refuse_quantised`."""
         if (missing := SAMPLE_POINTS - self.sampled) > 0:
-            self.sample.append(np.stack([lon_q[:missing], lat_q[:missing]], axis=1))
+            # 32 bits each: 4.3 degrees, more than a file covers
+            low = lattice[:2, :missing] & 0xFFFFFFFF
+            self.sample.append(low[0] << 32 | low[1])
             self.sampled += len(self.sample[-1])
 
     def refuse_quantised(self, file: Path) -> None:
         sample = np.concatenate(self.sample)
-        positions = len(np.unique(sample, axis=0))
+        positions = len(np.unique(sample))
         if len(sample) >= 1000 and positions < 0.1 * len(sample):
             raise InputError(
                 f"coordinates are quantised: {len(sample)} points lie on {positions} positions",
@@ -284,42 +326,165 @@ def _refuse_coarse(header: laspy.LasHeader, transform: ToWGS84, file: Path) -> N
         )
 
 
-def _kept(
-    points: laspy.ScaleAwarePointRecord, drop_classes: Sequence[int], tally: _Tally
-) -> np.ndarray:
-    """Mask of the points to keep; each dropped point is counted under its first reason."""
-    classification = np.asarray(points.classification)
-    keep = np.asarray(points.withheld) == 0
-    tally.drop("withheld", int(len(keep) - keep.sum()))
-    for number in drop_classes:
-        hit = keep & (classification == number)
-        tally.drop(f"class {number}", int(hit.sum()))
-        keep &= ~hit
-    return keep
+# Kernels free the GIL; nothing in them depends on how the points are cut into chunks.
 
 
-def _to_lattice(
-    transform: ToWGS84, x: np.ndarray, y: np.ndarray, z: np.ndarray, file: Path
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lattice longitude, latitude, height (int64[n]) of file coordinates."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _integer(raw: Bytes, i: int, at: int) -> int:
+    value = np.int64(raw[i, at]) | np.int64(raw[i, at + 1]) << 8
+    value |= np.int64(raw[i, at + 2]) << 16 | np.int64(raw[i, at + 3]) << 24
+    return np.int64(np.int32(value))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _unpack(
+    raw: Bytes,
+    extended: bool,
+    unwanted: NDArray[np.bool_],
+    scale: Floats,
+    offset: Floats,
+    xyz: Floats,
+    attributes: NDArray[np.uint32],
+    counts: Integers,
+    limits: Integers,
+) -> int:
+    """Fill ``xyz`` [3, n] and ``attributes`` [n] with the points to keep; returns their number.
+
+    ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
+    in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
+    class. Attributes are class + 256 return number + 65536 number of returns. ``counts`` [2, 257]:
+    of kept and of dropped points by class, the last of withheld ones. ``limits`` [2, 3]: lowest
+    and highest stored coordinates of all points.
+    """
+    kept = 0
+    low_x, low_y, low_z = limits[0]
+    high_x, high_y, high_z = limits[1]
+    for i in range(raw.shape[0]):
+        x, y, z = _integer(raw, i, 0), _integer(raw, i, 4), _integer(raw, i, 8)
+        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+        returns, flags = np.int64(raw[i, 14]), np.int64(raw[i, 15])
+        if extended:
+            kind, withheld = np.int64(raw[i, 16]), flags >> 2 & 1
+            returns = (returns & 15) << 8 | (returns >> 4) << 16
+        else:
+            kind, withheld = flags & 31, flags >> 7
+            returns = (returns & 7) << 8 | (returns >> 3 & 7) << 16
+        drop = withheld | np.int64(unwanted[kind])
+        counts[drop, 256 if withheld == 1 else kind] += 1
+        xyz[0, kept] = x * scale[0] + offset[0]
+        xyz[1, kept] = y * scale[1] + offset[1]
+        xyz[2, kept] = z * scale[2] + offset[2]
+        attributes[kept] = kind | returns
+        kept += 1 - drop
+    limits[0] = low_x, low_y, low_z
+    limits[1] = high_x, high_y, high_z
+    return kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _round(lon: Floats, lat: Floats, height: Floats, out: Integers, limits: Integers) -> bool:
+    """Fill ``out`` [3, n] with lattice coordinates and widen ``limits`` [2, 3] by them.
+
+    False if there is a point that has no place on Earth; then ``out`` is not whole.
+    """
+    for k, (values, steps, farthest) in enumerate(
+        ((lon, _PER_DEG, np.inf), (lat, _PER_DEG, np.inf), (height, _PER_M, FARTHEST_M))
+    ):
+        good = True
+        low, high = limits[0, k], limits[1, k]
+        for i in range(values.size):
+            good &= abs(values[i]) < farthest
+            q = np.int64(np.rint(values[i] * steps))
+            low, high = min(low, q), max(high, q)
+            out[k, i] = q
+        if not good:
+            return False
+        limits[0, k], limits[1, k] = low, high
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Integers) -> None:
+    """Number of the cell of each point in a raster of cells, its first cell at row, col."""
+    for i in range(out.size):
+        out[i] = ((lattice[1, i] >> CELL_BITS) - row) * width + (lattice[0, i] >> CELL_BITS) - col
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sort(
+    lattice: Integers,
+    attributes: NDArray[np.uint32],
+    cell: Integers,
+    end: Integers,
+    limits: NDArray[np.int32],
+    run: NDArray[np.int32],
+) -> None:
+    """Fill ``run`` [n, 4] with the points as scratch records, by cell, in their order in a cell.
+
+    ``cell`` [n] is the number of each point's cell; ``end`` [m], zeros, gets the end of each cell
+    in the run, ``limits`` [m, 2] its lowest and highest height.
+    """
+    for i in range(cell.size):
+        end[cell[i]] += 1
+    total = 0
+    for c in range(end.size):
+        number = end[c]
+        end[c] = total
+        total += number
+        limits[c, 0], limits[c, 1] = np.iinfo(np.int32).max, np.iinfo(np.int32).min
+    inside = (1 << CELL_BITS) - 1
+    for i in range(cell.size):
+        c = cell[i]
+        at = end[c]
+        end[c] += 1
+        height = np.int32(lattice[2, i])
+        run[at, 0] = lattice[0, i] & inside
+        run[at, 1] = lattice[1, i] & inside
+        run[at, 2] = height
+        run[at, 3] = attributes[i]
+        limits[c, 0], limits[c, 1] = min(limits[c, 0], height), max(limits[c, 1], height)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather(
+    records: NDArray[np.int32],
+    pieces: Integers,
+    position: NDArray[np.int32],
+    attributes: Bytes,
+) -> None:
+    """Fill position [3, n] and attributes [3, n] from pieces of scratch records [k, 4].
+
+    ``pieces`` [m, 2]: first record and number of records of each.
+    """
+    done = 0
+    for piece in range(pieces.shape[0]):
+        first, number = pieces[piece]
+        for k in range(3):
+            target, low = position[k, done : done + number], attributes[k, done : done + number]
+            for i in range(number):
+                target[i] = records[first + i, k]
+                low[i] = records[first + i, 3] >> 8 * k & 255
+        done += number
+
+
+def _to_lattice(transform: ToWGS84, xyz: Floats, limits: Integers, file: Path) -> NDArray[np.int64]:
+    """Lattice longitude, latitude, height (int64[3, n]) of file coordinates; widens ``limits``."""
     try:
-        lon, lat, height = transform(x, y, z)
+        lon, lat, height = transform(*xyz)
     except InputError as error:  # of the geoid grid, which does not know the file
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
-    good = np.isfinite(lon) & np.isfinite(lat) & (np.abs(height) < 2e5)
-    if not good.all():
+    out = np.empty(xyz.shape, np.int64)
+    if not _round(lon, lat, height, out, limits):
+        good = np.isfinite(lon) & np.isfinite(lat) & (np.abs(height) < FARTHEST_M)
         bad = np.flatnonzero(~good)
         raise InputError(
             f"{bad.size} points have no place on Earth in '{transform.system.name}', the first at "
-            f"({x[bad[0]]:.3f}, {y[bad[0]]:.3f}, {z[bad[0]]:.3f})",
+            "({:.3f}, {:.3f}, {:.3f})".format(*xyz[:, bad[0]]),
             file=file,
             remedy="correct lidar_crs or the file's coordinate system, or remove these points",
         )
-    return (
-        np.rint(lon * _PER_DEG).astype(np.int64),
-        np.rint(lat * _PER_DEG).astype(np.int64),
-        np.rint(height * _PER_M).astype(np.int64),
-    )
+    return out
 
 
 def _cell_key(row: np.ndarray, col: np.ndarray) -> np.ndarray:
@@ -327,61 +492,77 @@ def _cell_key(row: np.ndarray, col: np.ndarray) -> np.ndarray:
     return (np.asarray(row, np.int64) << 32) + (np.asarray(col, np.int64) + (1 << 30))
 
 
-def _order_by_cell(row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """Stable order by cell. Few cells sort as uint16, which NumPy does by radix."""
-    width = int(col.max() - col.min()) + 1
-    local = (row - row.min()) * width + (col - col.min())
-    if (int(row.max() - row.min()) + 1) * width <= 1 << 16:
-        local = local.astype(np.uint16)
-    return np.argsort(local, kind="stable")
+def _cells(lattice: Integers) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys of cells [m], sorted, and the number among these of each point's cell [n]."""
+    low_col, low_row = lattice[:2].min(axis=1) >> CELL_BITS
+    high_col, high_row = lattice[:2].max(axis=1) >> CELL_BITS
+    width, height = int(high_col - low_col) + 1, int(high_row - low_row) + 1
+    if width * height > 1 << 16:  # far apart
+        key = _cell_key(lattice[1] >> CELL_BITS, lattice[0] >> CELL_BITS)
+        return np.unique(key, return_inverse=True)
+    row, col = np.divmod(np.arange(width * height), width)
+    cell = np.empty(lattice.shape[1], np.int64)
+    _number_cells(lattice, low_row, low_col, width, cell)
+    return _cell_key(row + low_row, col + low_col), cell
 
 
 @dataclass
 class _Runs:
-    """External sort by cell: each chunk becomes one sorted run in a scratch file.
+    """External sort by cell: each chunk becomes one sorted run, a part of the scratch.
 
     A segment is what one run holds of one cell; segments of a cell, in the order of the runs, are
-    its points in the order of the file.
+    its points in the order of the file. Runs are in ``memory`` [k, 4]; where that is full, it is
+    moved to ``disk``.
     """
 
-    scratch: Path
+    memory: NDArray[np.int32]
+    disk: BinaryIO
     written: int = 0
+    held: int = 0  # in memory
     segments: list[np.ndarray] = field(default_factory=list)  # int64 [k, 3]: key, start, count
     limits: list[np.ndarray] = field(default_factory=list)  # int32 [k, 2]: lowest, highest
-    low: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).max))
-    high: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).min))
 
-    def add(
-        self,
-        lattice: tuple[np.ndarray, np.ndarray, np.ndarray],
-        attributes: Sequence[np.ndarray],
-    ) -> None:
-        lon_q, lat_q, height_q = lattice
-        if not lon_q.size:
+    def add(self, lattice: NDArray[np.int64], attributes: NDArray[np.uint32]) -> None:
+        """Take in a chunk's points: lattice coordinates [3, n], attributes [n] as of _unpack."""
+        size = attributes.size
+        if not size:
             return
-        self.low = np.minimum(self.low, [q.min() for q in lattice])
-        self.high = np.maximum(self.high, [q.max() for q in lattice])
-        row, col = lat_q >> CELL_BITS, lon_q >> CELL_BITS
-        order = _order_by_cell(row, col)
-        key = _cell_key(row, col)[order]
-        start = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-        count = np.diff(np.append(start, key.size))
-        run = np.empty(lon_q.size, _RECORD)
-        height = height_q[order].astype(np.int32)
-        run["position"][:, 0] = (lon_q - (col << CELL_BITS))[order]
-        run["position"][:, 1] = (lat_q - (row << CELL_BITS))[order]
-        run["position"][:, 2] = height
-        for k, values in enumerate(attributes):
-            run["attributes"][:, k] = values[order]
-        self.segments.append(np.stack([key[start], start + self.written, count], axis=1))
-        self.limits.append(
-            np.stack(
-                [np.minimum.reduceat(height, start), np.maximum.reduceat(height, start)], axis=1
-            )
-        )
-        with self.scratch.open("ab") as stream:
-            run.tofile(stream)
-        self.written += lon_q.size
+        if self.held + size > len(self.memory):
+            self.spill()
+        key, cell = _cells(lattice)
+        end, limits = np.zeros(key.size, np.int64), np.empty((key.size, 2), np.int32)
+        run = self.memory[self.held : self.held + size]
+        _sort(lattice, attributes, cell, end, limits, run)
+        count = np.diff(end, prepend=0)
+        here = count > 0
+        segments = np.stack([key, end - count + self.written, count], axis=1)
+        self.segments.append(segments[here])
+        self.limits.append(limits[here])
+        self.held += size
+        self.written += size
+
+    def spill(self) -> None:
+        self.disk.write(self.memory[: self.held])  # unlike ndarray.tofile it says why it fails
+        self.held = 0
+
+    def take(self, pieces: list[tuple[int, int]]) -> tuple[NDArray[np.int32], Bytes]:
+        """Position [3, n] and attributes [3, n] of pieces of runs: first record, number."""
+        where = np.array(pieces, np.int64).reshape(-1, 2)
+        total = int(where[:, 1].sum())
+        position, attributes = np.empty((3, total), np.int32), np.empty((3, total), np.uint8)
+        records = self.memory
+        if self.written > self.held:
+            # Read by hand: pages of a memory map would count as this process's memory.
+            records, done = np.empty((total, 4), np.int32), 0
+            for first, number in pieces:
+                self.disk.seek(first * _RECORD_BYTES)
+                target = memoryview(records[done : done + number]).cast("B")
+                if self.disk.readinto(target) != number * _RECORD_BYTES:
+                    raise OSError("the scratch file of the points is cut short")
+                done += number
+            where = np.array([[0, total]])
+        _gather(records, where, position, attributes)
+        return position, attributes
 
     def write(self, group: zarr.Group) -> None:
         """Write points and cell table in final order."""
@@ -403,7 +584,7 @@ class _Runs:
                 shape=values.shape,
                 dtype=values.dtype,
                 chunks=values.shape,
-                compressors=compressor(),
+                compressors=_CODEC,
                 dimension_names=("cell",),
                 attributes=_ATTRS[name],
             )
@@ -412,37 +593,31 @@ class _Runs:
             name: group.create_array(
                 name,
                 shape=(3, self.written),
-                dtype=_RECORD[name].base,
+                dtype=dtype,
                 chunks=(3, CHUNK_POINTS),
                 shards=(3, SHARD_POINTS),
-                compressors=compressor(),
+                compressors=_CODEC,
                 dimension_names=("component", "point"),
                 attributes=_ATTRS[name],
+                config={"write_empty_chunks": True},  # does not look whether they are
             )
-            for name in _RECORD.names
+            for name, dtype in (("position", "i4"), ("attributes", "u1"))
         }
-        # Read by hand: pages of a memory map would count as this process's memory.
-        with self.scratch.open("rb", buffering=0) as runs:
-            for begin in range(0, self.written, SHARD_POINTS):
-                end = min(begin + SHARD_POINTS, self.written)
-                shard = np.empty(end - begin, _RECORD)
-                target = memoryview(shard).cast("B")
-                at = int(np.searchsorted(start_of, begin, side="right")) - 1
-                done = begin
-                while done < end:
-                    _, start, count = segments[at].tolist()
-                    skip = done - int(start_of[at])
-                    take = min(count - skip, end - done)
-                    runs.seek((start + skip) * _RECORD.itemsize)
-                    where = slice(
-                        (done - begin) * _RECORD.itemsize, (done - begin + take) * _RECORD.itemsize
-                    )
-                    if runs.readinto(target[where]) != take * _RECORD.itemsize:
-                        raise OSError(f"{self.scratch}: scratch file cut short")
-                    done += take
-                    at += 1
-                for name, array in arrays.items():
-                    array[:, begin:end] = np.ascontiguousarray(shard[name].T)
+        if self.written > self.held:
+            self.spill()
+        for begin in range(0, self.written, SHARD_POINTS):
+            end = min(begin + SHARD_POINTS, self.written)
+            at = int(np.searchsorted(start_of, begin, side="right")) - 1
+            pieces, done = [], begin
+            while done < end:
+                _, start, count = segments[at].tolist()
+                skip = done - int(start_of[at])
+                pieces.append((start + skip, min(count - skip, end - done)))
+                done += pieces[-1][1]
+                at += 1
+            position, attributes = self.take(pieces)
+            arrays["position"][:, begin:end] = position
+            arrays["attributes"][:, begin:end] = attributes
 
 
 def _bounds(low: np.ndarray, high: np.ndarray) -> list[float]:
@@ -462,13 +637,14 @@ def ingest(
     drop_classes: Sequence[int] = (7, 18),
     scene: str = "",
     provenance: Mapping[str, Any] | None = None,
-    chunk_points: int = 250_000,
+    chunk_points: int = 100_000,
     workers: int = 1,
 ) -> dict[str, Any]:
     """Bring one LAS, LAZ or COPC file (1.0 to 1.4, any point format) into a point store.
 
-    Memory is that of one reading chunk and one shard, whatever the size of the file; a scratch file
-    of 15 bytes per point lies inside the unfinished store.
+    Memory is that of one reading chunk, one shard and :data:`SCRATCH_POINTS`, whatever the size of
+    the file; where it has more points, they pass through a scratch file without a name, 16 bytes
+    each, on the disk of the store.
 
     Withheld points are dropped, and those of ``drop_classes``: by default noise, 7 (low) and 18
     (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
@@ -492,49 +668,47 @@ def ingest(
     if remark := _surplus(header, file):
         notes.append(remark)
     tally = _Tally()
-    scale, offset = np.asarray(header.scales), np.asarray(header.offsets)
-    with building(store) as unfinished:
+    with (
+        building(store) as unfinished,
+        TemporaryFile(dir=unfinished.parent) as disk,
+    ):
         group = zarr.open_group(unfinished, mode="w", zarr_format=3)
-        runs = _Runs(unfinished / "runs.scratch")
+        room = max(min(SCRATCH_POINTS, header.point_count), chunk_points)
+        runs = _Runs(np.empty((room, 4), np.int32), disk)
         chunks = _chunks(file, header, chunk_points)
         if workers > 1:
             chunks = _ahead(chunks)
         total = -(-header.point_count // chunk_points)
         for points in progress(chunks, total, f"{file.name}: chunks of points read"):
-            tally.reach(points)
-            keep = _kept(points, drop_classes, tally)
-            x, y, z = (
-                points.array[axis][keep] * scale[k] + offset[k] for k, axis in enumerate("XYZ")
-            )
-            lattice = _to_lattice(transform, x, y, z, file)
-            attributes = [np.asarray(getattr(points, name))[keep] for name in _ATTRIBUTES]
-            tally.keep(attributes[0], lattice[0], lattice[1])
+            xyz, attributes = tally.take(points, header, drop_classes)
+            tally.compare_bounds(header, file)
+            lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
+            tally.look(lattice)
             runs.add(lattice, attributes)
         if remark := tally.compare_bounds(header, file):
             notes.append(remark)
         if runs.written == 0:
             raise InputError(
-                f"no point is left of {tally.read}: {_listed(tally.dropped)}",
+                f"no point is left of {tally.read}: {_listed(tally.dropped(drop_classes))}",
                 file=file,
                 remedy="remove the file, or drop fewer classes",
             )
         tally.refuse_quantised(file)
-        bounds = _bounds(runs.low, runs.high)
+        bounds = _bounds(*tally.lattice_limits)
         lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
         if remark := check_area(transform.system, lon, lat, file):
             notes.append(remark)
         if bounds[4] < -600 or bounds[5] > 9500:
             notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
         runs.write(group)
-        runs.scratch.unlink()
         summary = {
             "points": {
                 "header": header.point_count,
                 "read": tally.read,
                 "kept": runs.written,
-                "dropped": tally.dropped,
+                "dropped": tally.dropped(drop_classes),
             },
-            "classes": {str(c): int(n) for c, n in enumerate(tally.classes) if n},
+            "classes": {str(c): int(n) for c, n in enumerate(tally.counts[0]) if n},
             "bounds": bounds,
             "crs": transform.describe(),
             "notes": notes,
@@ -559,7 +733,7 @@ def ingest(
         file.name,
         runs.written,
         tally.read,
-        _listed(tally.dropped),
+        _listed(tally.dropped(drop_classes)),
         *bounds[4:],
     )
     return summary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import struct
 from pathlib import Path
@@ -87,9 +88,24 @@ def by_position(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np.ndar
 def test_points_keep_their_place_and_attributes(tmp_path, version, pdrf, suffix) -> None:
     """Against pyproj on the coordinates that laspy reads back: within one lattice step."""
     file = tmp_path / f"a.{suffix}"
-    classes = np.random.default_rng(1).integers(0, 7, 3000)
-    xyz = write_las(file, pdrf=pdrf, version=version, classification=classes)
-    result = ingest(file, tmp_path / "a.zarr", lidar_crs="EPSG:32650")
+    rng = np.random.default_rng(1)
+    classes, most = rng.integers(0, 7, 3000), 15 if pdrf >= 6 else 7
+    fields = {
+        "return_number": rng.integers(0, most + 1, 3000),
+        "number_of_returns": rng.integers(0, most + 1, 3000),
+        "synthetic": rng.integers(0, 2, 3000),  # neighbours of the bits that are read
+        "key_point": rng.integers(0, 2, 3000),
+        "scan_direction_flag": rng.integers(0, 2, 3000),
+        "user_data": rng.integers(0, 256, 3000),
+    }
+    if pdrf >= 6:
+        classes = rng.integers(0, 256, 3000)
+        fields |= {
+            "overlap": rng.integers(0, 2, 3000),
+            "scanner_channel": rng.integers(0, 4, 3000),
+        }
+    xyz = write_las(file, pdrf=pdrf, version=version, classification=classes, **fields)
+    result = ingest(file, tmp_path / "a.zarr", lidar_crs="EPSG:32650", drop_classes=())
     assert result["points"]["header"] == result["points"]["read"] == 3000
     assert result["points"]["kept"] == 3000
     got = everything(PointStore(tmp_path / "a.zarr"))
@@ -124,13 +140,27 @@ def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch
     monkeypatch.setattr(points, "CHUNK_POINTS", 1024)
     write_las(tmp_path / "a.laz", 20_000)
     digests = set()
-    for k, (chunk, workers) in enumerate([(20_000, 1), (333, 1), (7000, 2), (1_000_000, 1)]):
+    for k, (chunk, workers, kept_in_memory) in enumerate(
+        [(20_000, 1, 1 << 20), (333, 1, 1 << 20), (7000, 2, 9000), (900, 1, 0), (10**6, 1, 1)]
+    ):
+        monkeypatch.setattr(points, "SCRATCH_POINTS", kept_in_memory)
         store = tmp_path / f"{k}.zarr"
         ingest(tmp_path / "a.laz", store, chunk_points=chunk, workers=workers)
         digests.add(tree_digest(store))
         assert not list(store.rglob("*scratch*"))
     assert len(digests) == 1
     assert PointStore(tmp_path / "0.zarr").count == 20_000
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_full_disk_says_so() -> None:
+    with Path("/dev/full").open("wb", buffering=0) as disk:
+        runs = points._Runs(np.empty((1000, 4), np.int32), disk)
+        lattice, attributes = np.zeros((3, 1000), np.int64), np.zeros(1000, np.uint32)
+        runs.add(lattice, attributes)
+        with pytest.raises(OSError, match="No space left") as error:
+            runs.add(lattice, attributes)
+    assert error.value.errno == errno.ENOSPC
 
 
 def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
