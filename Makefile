@@ -1,11 +1,12 @@
 # make tiles/<City>   set up, then make the tiles of a city of config/cities.tsv
 # make test           set up, then pass the tests
+# make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup test lint lock dataset verify clean FORCE
+.PHONY: setup test test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -25,6 +26,9 @@ dataset verify: %: $(READY) FORCE
 test: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup
 
+test-cluster: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" tests/cluster/run.sh
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -34,8 +38,8 @@ lint: $(READY)
 
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:
-	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra dev --universal \
-	  --python-version 3.11 --generate-hashes --no-annotate --quiet \
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra dev --extra cluster \
+	  --universal --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 
 clean:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 from packaging.markers import default_environment
@@ -27,7 +28,7 @@ def locked_versions(text: str) -> dict[str, list[Requirement]]:
 def disagreements(pyproject: str, lock: str) -> list[str]:
     """What the lock file lacks or holds in a version that pyproject.toml does not admit."""
     project = tomllib.loads(pyproject)["project"]
-    asked = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    asked = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
     pins = locked_versions(lock)
     wrong = []
     for text in asked:

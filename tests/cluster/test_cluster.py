@@ -1,0 +1,118 @@
+"""Two cities through a real SLURM: the same bytes as a local run, and a retry with more memory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from stereotruth.simulate.__main__ import make_scene
+
+from ..workflow.conftest import SIZE, TINY, Project, copy_project, row_of
+from ..workflow.test_end_to_end import hashes
+
+pytestmark = pytest.mark.skipif(
+    "TEST_CLUSTER" not in os.environ, reason="starts a SLURM: run make test-cluster"
+)
+CITIES = {
+    name: replace(
+        TINY, name=name, world_seed=seed, scenes=(replace(TINY.scenes[0], name=f"{name}-1"),)
+    )
+    for name, seed in (("East", 7), ("West", 8))
+}
+CALL = [*(f"tiles/{city}" for city in CITIES), "--configfile", "two.yaml"]
+# The profile as it is, but for waits that large clusters need.
+SLURM = [
+    *("--profile", "profiles/slurm", "--latency-wait", "10"),
+    *("--slurm-keep-successful-logs", "--slurm-logdir", "logs/slurm"),
+    *("--slurm-status-command", "squeue", "--slurm-init-seconds-before-status-checks", "2"),
+]
+# Less than the first attempt of one job needs: a Snakemake and the imports alone take 400 MB.
+TOO_LITTLE = "300 if wildcards.city == 'West' and attempt < 2 else 4300 * attempt"
+
+
+@dataclass
+class Job:
+    """What SLURM says about a job that has ended."""
+
+    number: int
+    state: str
+    memory: str
+    comment: str
+
+
+@dataclass
+class Runs:
+    """The same two cities, made here and by SLURM."""
+
+    local: Project
+    slurm: Project
+    jobs: list[Job]
+
+
+def project_with_two_cities(folder: Path, data: Path) -> Project:
+    project = copy_project(folder)
+    shutil.copytree(data, folder / "in")
+    rows = [
+        row_of(Path("in", name), scene=city.scenes[0].name, city=name)
+        for name, city in CITIES.items()
+    ]
+    project.add_scene("two", rows, **SIZE)
+    return project
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    folder = tmp_path_factory.mktemp("cluster")
+    for name, city in CITIES.items():
+        make_scene(city, city.scenes[0], folder / "data" / name, spacing_m=0.4, seed=1)
+    local = project_with_two_cities(folder / "local", folder / "data")
+    run = local.snakemake(*CALL)
+    assert run.status == 0, run.text[-4000:]
+
+    slurm = project_with_two_cities(folder / "slurm", folder / "data")
+    slurm.edit(
+        "profiles/slurm/config.yaml",
+        "project:\n    mem_mb: 4300 * attempt",
+        f"project:\n    mem_mb: {TOO_LITTLE}",
+    )
+    run = slurm.snakemake(*CALL, *SLURM)
+    assert run.status == 0, run.text[-8000:]
+    table = subprocess.run(
+        ["squeue", "--states=all", "--noheader", "--sort=i", "--format=%i|%T|%m|%k"],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    lines = (line.split("|") for line in table.stdout.splitlines())
+    return Runs(local, slurm, [Job(int(number), *rest) for number, *rest in lines])
+
+
+@pytest.mark.parametrize("folder", ["results/project", "tiles"])
+def test_slurm_makes_the_same_bytes_as_a_local_run(runs: Runs, folder: str) -> None:
+    expected = hashes(runs.local.folder / folder)
+    assert all(any(city in file for file in expected) for city in CITIES)
+    assert hashes(runs.slurm.folder / folder) == expected
+
+
+def test_a_job_killed_for_its_memory_is_retried_with_more(runs: Runs) -> None:
+    project = [job for job in runs.jobs if "rule_project" in job.comment and "West" in job.comment]
+    assert [(job.state, job.memory) for job in project] == [
+        ("FAILED", "300M"),
+        ("COMPLETED", "8600M"),
+    ]
+    said = runs.slurm.folder / f"logs/slurm/rule_project/West_West-1/{project[0].number}.log"
+    assert "exceeded memory limit" in said.read_text()
+
+
+def test_small_jobs_share_one_submission(runs: Runs) -> None:
+    """Two scenes with two LiDAR files each: one job of four, one of two."""
+    for rule in ("ingest", "align"):
+        jobs = [job for job in runs.jobs if f"_{rule}" in job.comment]
+        assert [job.state for job in jobs] == ["COMPLETED"]
+    assert all(job.state == "COMPLETED" for job in runs.jobs if "project" not in job.comment)
