@@ -27,33 +27,37 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import dask
 import numpy as np
 import zarr
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from .agreement import VOTE_PX, outvoted, supported, surface_correlation, warp_to_left
-from .correlation import Array2D, Patch, correlate, in_frame, read_patch
+from .correlation import Array2D, Patch, correlate, read_patch
 from .epipolar import EpipolarModel
 from .errors import InputError
 from .grid_store import Layer, blocks, building, create_grid, require_complete
+from .local_projection import LocalProjection
 from .occlusion import (
     EDGE,
     FILL_RADII,
     METHODS,
     Rays,
-    build_surface,
+    Surface,
+    SurfaceBuilder,
     hidden_pixels,
     seen_surface,
 )
-from .points import LATTICE_DEG, Points, PointStore, query_points
+from .pixel_points import Collection, PixelPoints, places
+from .points import CELL_BITS, LATTICE_DEG, LATTICE_M, PointStore
 from .provenance import describe, digest
 from .representative import REPRESENTATIVES, Labels, Pixels, at_centres, at_points, condense
 from .right_view import MirroredImage, MirroredModel, mirrored
@@ -66,7 +70,9 @@ Box = tuple[float, float, float, float]
 
 CHUNK = 256
 SHARD = 1024
-MAX_POINTS = 2_500_000  # expected in a window; some 120 bytes each at the peak
+MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
+READ_POINTS = 1 << 20  # about as many are read at once,
+BLOCK = 1 << 16  # and as many go through the projection, while they are in the cache
 WATER_CLASS = 9  # ASPRS
 
 
@@ -82,18 +88,6 @@ class Status(IntEnum):
     OUT_OF_FRAME = 6
     BELOW_MINIMUM_COUNT = 7
     EDGE_IN_PIXEL = 8
-
-
-# The tests of points in their order; a point's stage is the test that it failed.
-_ORDER = (
-    Status.NO_POINTS,
-    Status.OUT_OF_FRAME,
-    Status.HIDDEN_IN_LEFT,
-    Status.LOW_CORRELATION,
-    Status.LABELLED,
-)
-_STAGE = {status: np.uint8(stage) for stage, status in enumerate(_ORDER)}
-_STATUS_OF_STAGE = np.array(_ORDER, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -241,12 +235,6 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
     }
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _furthest(pixel: NDArray[np.int64], stage: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
-    for k in range(pixel.size):
-        out[pixel[k]] = max(out[pixel[k]], stage[k])
-
-
 # --------------------------------------------------------------------------------------- windows
 
 
@@ -271,18 +259,39 @@ class AlignmentSigma:
         return cls(np.nan_to_num(nodes, nan=float(np.nanmax(nodes, initial=0.0))), known["step_px"])
 
     def at(self, x: Floats, y: Floats) -> Floats:
-        """[3, …] at pixels, bilinear between the nodes."""
+        """[3, rows, cols] at columns ``x`` and rows ``y``, bilinear between the nodes."""
         rows, cols = self.nodes.shape[1:]
+        out = np.empty((3, y.size, x.size))
         v, u = np.clip(y / self.step, 0, rows - 1), np.clip(x / self.step, 0, cols - 1)
-        j, i = (
-            np.minimum(v.astype(int), max(rows - 2, 0)),
-            np.minimum(u.astype(int), max(cols - 2, 0)),
-        )
-        below, beside = np.minimum(j + 1, rows - 1), np.minimum(i + 1, cols - 1)
-        v, u = v - j, u - i
-        n = self.nodes
-        upper = (1 - u) * n[:, j, i] + u * n[:, j, beside]
-        return (1 - v) * upper + v * ((1 - u) * n[:, below, i] + u * n[:, below, beside])
+        _bilinear(self.nodes, v, u, out)
+        return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bilinear(nodes: Floats, v: Floats, u: Floats, out: Floats) -> None:
+    """``out`` [k, v.size, u.size]: values between ``nodes`` [k, rows, cols]."""
+    last_row, last_col = nodes.shape[1] - 1, nodes.shape[2] - 1
+    for k in range(nodes.shape[0]):
+        for y in range(v.size):
+            j = min(int(v[y]), max(last_row - 1, 0))
+            below, f = min(j + 1, last_row), v[y] - j
+            for x in range(u.size):
+                i = min(int(u[x]), max(last_col - 1, 0))
+                beside, e = min(i + 1, last_col), u[x] - i
+                upper = (1.0 - e) * nodes[k, j, i] + e * nodes[k, j, beside]
+                lower = (1.0 - e) * nodes[k, below, i] + e * nodes[k, below, beside]
+                out[k, y, x] = (1.0 - f) * upper + f * lower
+
+
+class Reach(NamedTuple):
+    """Where the points of a window are: box of those that it can show, with their heights (m);
+    box of those that can hide these, with the greatest height there."""
+
+    box: Box
+    low: float
+    high: float
+    around: Box
+    top: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +340,16 @@ class _Scene:
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
+        ground = self.outline(rows, cols, low, high)
+        if ground.size == 0:
+            return None
+        (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
+        # Two pixels more, for the curvature of the edges.
+        spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
+        return west - spare[0], south - spare[1], east + spare[0], north + spare[1]
+
+    def outline(self, rows: slice, cols: slice, low: float, high: float) -> Floats:
+        """lon, lat [2, n] (degrees) along the edges of a window and its margin at two heights."""
         margin = self.settings.margin
         x = np.linspace(cols.start - margin - 1.0, cols.stop + margin, 5)
         y = np.linspace(rows.start - margin - 1.0, rows.stop + margin, 5)
@@ -339,24 +358,15 @@ class _Scene:
         ground = np.hstack(
             [np.stack(self.model.epipolar_to_ground(edge_x, edge_y, h)) for h in (low, high)]
         )
-        ground = ground[:, np.isfinite(ground).all(axis=0)]
-        if ground.size == 0:
-            return None
-        (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
-        # Two pixels more, for the curvature of the edges.
-        spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
-        return west - spare[0], south - spare[1], east + spare[0], north + spare[1]
+        return ground[:, np.isfinite(ground).all(axis=0)]
 
     def heights(self, box: Box) -> tuple[float, float] | None:
         """Lowest and highest point (m) of the stores' cells that a box touches."""
         found = [r for r in (store.height_range(*box) for store in self.stores) if r is not None]
         return (min(r[0] for r in found), max(r[1] for r in found)) if found else None
 
-    def boxes(self, rows: slice, cols: slice) -> tuple[Box, Box] | None:
-        """Boxes of the points of a window: those that it can show; those that can hide them.
-
-        None if there are no points.
-        """
+    def reach(self, rows: slice, cols: slice) -> Reach | None:
+        """Of a window; None if there are no points."""
         low = min(store.bounds[4] for store in self.stores)
         top = high = max(store.bounds[5] for store in self.stores)
         box = None
@@ -366,29 +376,78 @@ class _Scene:
             if found is None:
                 return None
             low, high = found
-        reach = self.rays.reach(cols, rows)
-        spare = (sum(FILL_RADII) + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
+        moves = self.rays.reach(cols, rows)
+        spare = self.spare
         around = box
         for _ in range(3):
             rise = top - low
             around = (
-                box[0] + reach[0, 0] * rise - spare[0],
-                box[1] + reach[1, 0] * rise - spare[1],
-                box[2] + reach[0, 1] * rise + spare[0],
-                box[3] + reach[1, 1] * rise + spare[1],
+                box[0] + moves[0, 0] * rise - spare[0],
+                box[1] + moves[1, 0] * rise - spare[1],
+                box[2] + moves[0, 1] * rise + spare[0],
+                box[3] + moves[1, 1] * rise + spare[1],
             )
             top = self.heights(around)[1]
-        return box, around
+        return Reach(box, low, high, around, top)
 
-    def expected(self, box: Box) -> float:
-        """About how many points lie in a box, if the stores are evenly filled."""
+    @property
+    def spare(self) -> Floats:
+        """Degrees (lon, lat) around the ground that a window needs: holes are filled from there."""
+        return (sum(FILL_RADII) + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
+
+    def strips(self, rows: slice, cols: slice, reach: Reach) -> list[Box]:
+        """Boxes, one for some rows of cells of the stores each, of the points a window needs.
+
+        They cover the hull of what it can show and of the tracks of the rays from there. A box
+        around the hull of a turned image would hold up to twice as many points.
+        """
+        ground = self.outline(rows, cols, reach.low, reach.high)
+        box = reach.box
+        if self.settings.uses_geometry:
+            box = reach.around
+            corners = np.array(
+                [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]
+            )
+            moves = np.hstack([*(self.rays.track @ corners.T), np.zeros((2, 1))])
+            moves *= reach.top - reach.low
+            ground = (ground[:, :, None] + moves[:, None]).reshape(2, -1)
+        hull = ground[:, ConvexHull(ground.T).vertices]
+        after = np.roll(hull, -1, axis=1)
+        rise = after[1] - hull[1]
+        slope = (after[0] - hull[0]) / np.where(rise == 0.0, np.inf, rise)
+        spare = self.spare
+        side = LATTICE_DEG * (1 << CELL_BITS)
+        first, last = (int(np.floor(edge / side)) for edge in (box[1], box[3]))
+        step = max(round(READ_POINTS / max(self.expected([box]), 1.0) * (last + 1 - first)), 1)
+        found = []
+        for row in range(first, last + 1, step):
+            # Half a step below the border, so that no point lies on it.
+            south, north = (
+                np.clip(edge * side - 0.5 * LATTICE_DEG, box[1], box[3])
+                for edge in (row, row + step)
+            )
+            # Where the sides of the hull, cut off at the strip's borders, begin and end.
+            ends = np.clip([hull[1], after[1]], south - spare[1], north + spare[1])
+            lon = hull[0] + slope * (ends - hull[1])
+            touched = np.ptp(ends, axis=0) > 0.0
+            if touched.any():
+                west, east = lon[:, touched].min(), lon[:, touched].max()
+                found.append((west - spare[0], south, east + spare[0], north))
+        return found
+
+    def expected(self, boxes: Sequence[Box]) -> float:
+        """About how many points lie in boxes, if the stores are evenly filled."""
         total = 0.0
         for store in self.stores:
             west, south, east, north = store.bounds[:4]
-            share = 1.0
-            for a, b, low, high in ((box[0], box[2], west, east), (box[1], box[3], south, north)):
-                share *= max(min(b, high) - max(a, low), 0.0) / max(high - low, 1e-12)
-            total += store.count * share
+            for box in boxes:
+                share = 1.0
+                for a, b, low, high in (
+                    (box[0], box[2], west, east),
+                    (box[1], box[3], south, north),
+                ):
+                    share *= max(min(b, high) - max(a, low), 0.0) / max(high - low, 1e-12)
+                total += store.count * share
         return total
 
     # -- one window
@@ -398,53 +457,35 @@ class _Scene:
 
         Counts: points in the window, in both frames, used.
         """
-        boxes = self.boxes(rows, cols)
-        if boxes is None:
+        reach = self.reach(rows, cols)
+        if reach is None:
             return None
         settings, margin = self.settings, self.settings.margin
-        points = query_points(self.stores, *boxes[settings.uses_geometry])
-        if len(points) == 0:
-            return None
-        surface = build_surface(points, self.rays) if settings.uses_geometry else None
         wide = (
             slice(rows.start - margin, rows.stop + margin),
             slice(cols.start - margin, cols.stop + margin),
         )
-        shape = wide[0].stop - wide[0].start, wide[1].stop - wide[1].start
-        xy = self.model.ground_to_epipolar(points.lon, points.lat, points.height)
-        with np.errstate(invalid="ignore"):
-            inside = (
-                (xy[0] >= wide[1].start - 0.5)
-                & (xy[0] < wide[1].stop - 0.5)
-                & (xy[1] >= wide[0].start - 0.5)
-                & (xy[1] < wide[0].stop - 0.5)
-                & np.isfinite(xy[2])
-            )
-        if not inside.any():
+        left, right = self.patches(wide, reach)
+        found = self.collect(self.strips(rows, cols, reach), wide, left, right)
+        if found is None:
             return None
-        xy = np.ascontiguousarray(xy[:, inside])
-        points = Points(*(getattr(points, f.name)[inside] for f in fields(Points)))
-        pixel = (np.floor(xy[1] + 0.5).astype(np.int64) - wide[0].start) * shape[1]
-        pixel += np.floor(xy[0] + 0.5).astype(np.int64) - wide[1].start
-        low, high = int(np.floor(xy[2].min())) - 1, int(np.floor(xy[2].max())) + 3
-        left = read_patch(self.images[0], *wide, settings.images_window)
-        right = read_patch(self.images[1], wide[0], slice(low, high), settings.images_window)
-
-        stage, use, edge, correlation = self.test_points(xy, pixel, wide, left, right)
-        pixels = condense(
-            self.model, points, xy, pixel, use, correlation, shape, settings.representative
-        )
-        furthest = np.zeros(shape[0] * shape[1], dtype=np.uint8)
-        _furthest(pixel, stage, furthest)
-        status = _STATUS_OF_STAGE[furthest].reshape(shape)
+        points, local, surface = found
+        use, edge = np.ones(points.points.size, dtype=np.bool_), None
+        if settings.uses_seen_surface:
+            use, edge = seen_surface(points, settings.edge_margin_px)
+        seen, correlation = use, None
+        if settings.method == "correlation":
+            correlation = np.full(use.size, np.nan, dtype=np.float32)
+            correlation[use] = correlate(left, right, places(points, use), settings.window)
+            use = use & (correlation >= settings.correlation_threshold)
+        pixels = condense(self.model, local, points, use, correlation, settings.representative)
+        status = self.test_points(points, seen, pixels)
         if surface is not None:
-            hidden = hidden_pixels(surface, self.rays, pixels.sums, *wide).reshape(shape)
+            hidden = hidden_pixels(surface, self.rays, pixels.sums, *wide).reshape(status.shape)
             status[hidden == 1] = Status.HIDDEN_IN_LEFT
             status[hidden == 2] = Status.HIDDEN_IN_RIGHT
-        if edge is not None:
-            on_edge = np.zeros(status.size, dtype=np.bool_)
-            on_edge[pixel[edge]] = True
-            status[(status == Status.LABELLED) & on_edge.reshape(shape)] = Status.EDGE_IN_PIXEL
+        if edge is not None and settings.representative == "top":
+            status[(status == Status.LABELLED) & edge] = Status.EDGE_IN_PIXEL
         labels = self.labels(pixels, status == Status.LABELLED, wide)
         agreement = pixels.correlation
         if settings.method == "both":
@@ -456,38 +497,75 @@ class _Scene:
         few = (status == Status.LABELLED) & (pixels.count < settings.min_points)
         status[few] = Status.BELOW_MINIMUM_COUNT
         return self.collected(pixels, labels, agreement, status, wide), self.counted(
-            pixel, stage, status
+            points, pixels, status
         )
 
+    def patches(self, wide: tuple[slice, slice], reach: Reach) -> tuple[Patch, Patch]:
+        """Of the left image, the window; of the right one, all that its points can be seen in."""
+        x, y, height = (
+            grid.reshape(-1)
+            for grid in np.meshgrid(
+                np.linspace(wide[1].start - 1.0, wide[1].stop, 5),
+                np.linspace(wide[0].start - 1.0, wide[0].stop, 5),
+                [reach.low, reach.high],
+            )
+        )
+        x_right = self.model.ground_to_epipolar(
+            *self.model.epipolar_to_ground(x, y, height), height
+        )[2]
+        x_right = x_right[np.isfinite(x_right)]
+        # A few pixels more, for what is not linear in between.
+        cols = slice(int(x_right.min(initial=0.0)) - 8, int(x_right.max(initial=0.0)) + 9)
+        window = self.settings.images_window
+        return read_patch(self.images[0], *wide, window), read_patch(
+            self.images[1], wide[0], cols, window
+        )
+
+    def collect(
+        self, strips: Sequence[Box], wide: tuple[slice, slice], left: Patch, right: Patch
+    ) -> tuple[PixelPoints, LocalProjection, Surface | None] | None:
+        """The points of a window by pixel, and the surface of all points around; None if none."""
+        if not strips:
+            return None
+        box = [step(strip[k] for strip in strips) for k, step in enumerate((min, min, max, max))]
+        heights = self.heights(box)
+        if heights is None:
+            return None
+        low = [int(np.floor(edge / LATTICE_DEG)) for edge in box[:2]]
+        high = [int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]]
+        shape = wide[0].stop - wide[0].start, wide[1].stop - wide[1].start
+        low_h, high_h = (round(height / LATTICE_M) for height in heights)
+        local = LocalProjection.of(self.model, (*low, low_h), (*high, high_h))
+        first = wide[0].start, wide[1].start
+        collection = Collection(shape, first, (low[0], low[1]), left, right)
+        builder = SurfaceBuilder(self.rays, (low[0], low[1]), (high[0], high[1]))
+        for strip in strips:
+            for store in self.stores:
+                points = store.query(*strip)
+                for start in range(0, len(points), BLOCK):
+                    where = slice(start, start + BLOCK)
+                    lattice = points.lon_q[where], points.lat_q[where], points.h_q[where]
+                    collection.add(
+                        *lattice, points.classification[where], local.at_points(*lattice)
+                    )
+                    if self.settings.uses_geometry:
+                        builder.add(*lattice)
+        points = collection.sorted()
+        if points.points.size == 0 and not points.outside.any():
+            return None
+        return points, local, builder.built() if self.settings.uses_geometry else None
+
     def test_points(
-        self,
-        xy: Floats,
-        pixel: NDArray[np.int64],
-        wide: tuple[slice, slice],
-        left: Patch,
-        right: Patch,
-    ) -> tuple[
-        NDArray[np.uint8],
-        NDArray[np.bool_],
-        NDArray[np.bool_] | None,
-        NDArray[np.float32] | None,
-    ]:
-        """Per point: stage (see _ORDER), which are used, which see an edge, correlation."""
-        settings = self.settings
-        use = in_frame(left, right, xy)
-        stage = np.where(use, _STAGE[Status.LABELLED], _STAGE[Status.OUT_OF_FRAME])
-        edge = correlation = None
-        if settings.uses_seen_surface:
-            framed = use
-            use, edge = seen_surface(xy, pixel, framed, *wide, settings.edge_margin_px)
-            stage[framed & ~use] = _STAGE[Status.HIDDEN_IN_LEFT]
-        if settings.method == "correlation":
-            correlation = np.full(use.size, np.nan, dtype=np.float32)
-            correlation[use] = correlate(left, right, xy[:, use], settings.window)
-            fail = use & ~(correlation >= settings.correlation_threshold)
-            stage[fail] = _STAGE[Status.LOW_CORRELATION]
-            use &= ~fail
-        return stage, use, edge if settings.representative == "top" else None, correlation
+        self, points: PixelPoints, seen: NDArray[np.bool_], pixels: Pixels
+    ) -> NDArray[np.uint8]:
+        """Status of each pixel by its point that got furthest."""
+        status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
+        status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
+        status[points.count > 0] = Status.HIDDEN_IN_LEFT
+        if self.settings.method == "correlation":
+            status[points.any(seen)] = Status.LOW_CORRELATION
+        status[pixels.count > 0] = Status.LABELLED
+        return status
 
     def labels(self, pixels: Pixels, valid: NDArray[np.bool_], wide: tuple[slice, slice]) -> Labels:
         """Labels of the valid pixels by the settings' representative."""
@@ -510,9 +588,7 @@ class _Scene:
         top, side = wide[0].start - left.row, wide[1].start - left.col
         shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
         surface = labels.disparity, labels.slope
-        found = surface_correlation(
-            shown.astype(np.float64), warped, *surface, self.settings.window
-        )
+        found = surface_correlation(shown, warped, *surface, self.settings.window)
         changed = outvoted(found, *surface, self.settings.correlation_threshold)
         changed |= (status == Status.LABELLED) & (pixels.surface_class == WATER_CLASS)
         status[changed] = Status.CHANGED
@@ -529,7 +605,7 @@ class _Scene:
         """The layers of a window, without its margin."""
         margin = self.settings.margin
         inner = slice(margin, -margin), slice(margin, -margin)
-        y, x = np.mgrid[wide][:, *inner].astype(np.float64)
+        y, x = (np.arange(w.start + margin, w.stop - margin, dtype=np.float64) for w in wide)
         if self.view == "right":
             x = self.model.shape[1] - 1 - x
         sigma, sigma_x, sigma_y = self.alignment_sigma.at(x, y)
@@ -552,27 +628,25 @@ class _Scene:
         return result
 
     def counted(
-        self, pixel: NDArray[np.int64], stage: NDArray[np.uint8], status: NDArray[np.uint8]
+        self, points: PixelPoints, pixels: Pixels, status: NDArray[np.uint8]
     ) -> NDArray[np.int64]:
         """Points of a window without its margin: all, in both frames, used."""
-        own = np.zeros(status.shape, dtype=np.bool_)
-        inner = slice(self.settings.margin, -self.settings.margin)
-        own[inner, inner] = True
-        own = own.reshape(-1)[pixel]
-        labelled = np.isin(status, (Status.LABELLED, Status.BELOW_MINIMUM_COUNT)).reshape(-1)[pixel]
-        used = own & (stage == _STAGE[Status.LABELLED]) & labelled
-        framed = own & (stage > _STAGE[Status.OUT_OF_FRAME])
-        return np.array([own.sum(), framed.sum(), used.sum()])
+        inner = (slice(self.settings.margin, -self.settings.margin),) * 2
+        framed = points.count[inner].sum()
+        outside = points.outside.reshape(points.shape)[inner].sum()
+        labelled = np.isin(status[inner], (Status.LABELLED, Status.BELOW_MINIMUM_COUNT))
+        used = pixels.count[inner][labelled].sum()
+        return np.array([framed + outside, framed, used])
 
     # -- one block
 
     def windows(self, rows: slice, cols: slice) -> list[tuple[slice, slice]]:
         """The block cut along its longer side until no window expects too many points."""
-        boxes = self.boxes(rows, cols)
-        if boxes is None:
+        reach = self.reach(rows, cols)
+        if reach is None:
             return []
         tall, broad = rows.stop - rows.start, cols.stop - cols.start
-        many = self.expected(boxes[self.settings.uses_geometry]) > self.max_points
+        many = self.expected(self.strips(rows, cols, reach)) > self.max_points
         if not many or max(tall, broad) <= 128:
             return [(rows, cols)]
         if tall > broad:

@@ -19,18 +19,19 @@ results do not depend on blocks, files or their order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter
 
+from .pixel_points import PX, PixelPoints, Records
 from .points import LATTICE_DEG, LATTICE_M, Points
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
 
 EDGE = 5  # px; see seen_surface
 METHODS = ("correlation", "geometric", "both", "none")
@@ -74,51 +75,12 @@ class Model(Protocol):
         """(lon, lat) in degrees where the left image's ray meets a height."""
 
 
-# ----------------------------------------------------------------- tops of pixels and of cells
+# ------------------------------------------------------------------- what a pixel's centre sees
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _highest(index: Ints, value: Floats, use: NDArray[np.bool_], highest: Floats) -> None:
-    for k in range(index.size):
-        if use[k] and value[k] > highest[index[k]]:
-            highest[index[k]] = value[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _below_top(
-    index: Ints,
-    value: Floats,
-    use: NDArray[np.bool_],
-    highest: Floats,
-    tolerance: float,
-    out: NDArray[np.bool_],
-) -> None:
-    for k in range(index.size):
-        out[k] = use[k] and value[k] >= highest[index[k]] - tolerance
-
-
-def top_surface(
-    index: Ints, value: Floats, use: NDArray[np.bool_], size: int, tolerance: float
-) -> NDArray[np.bool_]:
-    """Which of the points in ``use`` are at most ``tolerance`` below the highest of their bin.
-
-    ``index`` [n] is the bin (0 … size - 1) of each point, ``value`` [n] its height or disparity.
-    """
-    highest = np.full(size, -np.inf)
-    _highest(index, value, use, highest)
-    out = np.empty(index.size, dtype=np.bool_)
-    _below_top(index, value, use, highest, tolerance, out)
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fine_tops(xy: Floats, use: NDArray[np.bool_], first: tuple[int, int], tops: Floats) -> None:
-    """Greatest disparity in each of _FINE² parts of a pixel; ``tops`` [rows, cols] of parts."""
-    for k in range(xy.shape[1]):
-        if use[k]:
-            i = int(np.floor((xy[0, k] + 0.5 - first[1]) * _FINE))
-            j = int(np.floor((xy[1, k] + 0.5 - first[0]) * _FINE))
-            tops[j, i] = max(tops[j, i], xy[0, k] - xy[2, k])
+_NOTHING = np.int32(-(1 << 30))  # disparity (steps) below all that occur
+_SURFACE = round(SURFACE_PX * PX)
+_PART = PX // _FINE
+_UNCOVERED, _ON_SURFACE = np.uint8(1), np.uint8(2)
 
 
 def _surrounded(limit: int) -> NDArray[np.bool_]:
@@ -130,126 +92,222 @@ def _surrounded(limit: int) -> NDArray[np.bool_]:
     return table
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count(pixel: Ints, use: NDArray[np.bool_], out: Ints) -> None:
-    for k in range(pixel.size):
-        if use[k]:
-            out[pixel[k]] += 1
+_SURROUNDED = _surrounded(EMPTY_OCTANTS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _octant(du: float, dv: float) -> int:
     """0 … 7 in the order of the angle: quadrant, then its first or second half."""
-    mixed = (du < 0.0) != (dv < 0.0)
-    quadrant = (4 if dv < 0.0 else 0) + (2 if mixed else 0)
+    mixed = (du < 0) != (dv < 0)
+    quadrant = (4 if dv < 0 else 0) + (2 if mixed else 0)
     return quadrant + (1 if (abs(dv) > abs(du)) != mixed else 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _uncovered(
-    xy: Floats,
-    pixel: Ints,
-    use: NDArray[np.bool_],
-    first: tuple[int, int],
-    tops: Floats,
-    ceiling: Floats,
-    reach: Floats,
-    tolerance: float,
-    surrounded: NDArray[np.bool_],
-    out: NDArray[np.bool_],
-) -> None:
-    """``out``: points in ``use`` that parts of higher disparity do not surround.
+def _range(
+    points: Records, start: Ints, p: int, flags: NDArray[np.uint8], low: Steps, high: Steps
+) -> int:
+    """Least and greatest disparity of a pixel's uncovered points, and how many there are."""
+    least, greatest, n = -_NOTHING, _NOTHING, 0
+    for k in range(start[p], start[p + 1]):
+        if flags[k] & _UNCOVERED:
+            least = min(least, points[k].disparity)
+            greatest = max(greatest, points[k].disparity)
+            n += 1
+    low[p], high[p] = least, greatest
+    return n
 
-    ``ceiling`` and ``reach`` (px) by pixel: no part within reach is higher; where to look.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ranges(
+    points: Records,
+    start: Ints,
+    flags: NDArray[np.uint8],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+) -> None:
+    for p in range(count.size):
+        count[p] = _range(points, start, p, flags, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
+    """Greatest disparity in each of the _FINE² parts of a pixel."""
+    first = p * _FINE * _FINE
+    tops[first : first + _FINE * _FINE] = _NOTHING
+    for k in range(start[p], start[p + 1]):
+        i, j = (points[k].u + PX // 2) // _PART, (points[k].v + PX // 2) // _PART
+        at = first + j * _FINE + i
+        tops[at] = max(tops[at], points[k].disparity)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _uncovered(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    near: NDArray[np.int32],
+    top: Steps,
+    ceiling: Steps,
+    surrounded: NDArray[np.bool_],
+    flags: NDArray[np.uint8],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+) -> None:
+    """Takes _UNCOVERED from the points that parts of higher disparity surround.
+
+    ``near``: points in 3 x 3 pixels; ``top`` of each pixel, ``ceiling``: the greatest ``top``
+    within reach. ``low``, ``high``, ``count`` (see _range) are brought up to date.
     """
-    for k in range(pixel.size):
-        out[k] = use[k]
-        limit = xy[0, k] - xy[2, k] + tolerance
-        if not use[k] or ceiling[pixel[k]] <= limit:
+    tops = np.empty(top.size * _FINE * _FINE, np.int32)  # only what is needed is written
+    known = np.zeros(top.size, np.bool_)
+    rows, cols = shape
+    for p in range(top.size):
+        if ceiling[p] <= low[p] + _SURFACE:
             continue
-        u = (xy[0, k] + 0.5 - first[1]) * _FINE
-        v = (xy[1, k] + 0.5 - first[0]) * _FINE
-        i, j = int(np.floor(u)), int(np.floor(v))
-        far = reach[pixel[k]] * _FINE
-        n = int(np.ceil(far))
-        octants = 0
-        for b in range(max(j - n, 0), min(j + n + 1, tops.shape[0])):
-            dv = b + 0.5 - v
-            for a in range(max(i - n, 0), min(i + n + 1, tops.shape[1])):
-                du = a + 0.5 - u
-                if tops[b, a] > limit and du * du + dv * dv <= far * far:
-                    octants |= 1 << _octant(du, dv)
-        out[k] = not surrounded[octants]
+        distance = 3.0 / np.sqrt(max(near[p], 1))
+        reach = min(max(1.7 * distance, COVER_PX), MAX_COVER_PX)
+        n = int(reach + 0.875)  # the parts' centres reach to 3 / 8 px, places to 1 / 2 px
+        far = (reach * PX) ** 2
+        row, col = p // cols, p % cols
+        covered = False
+        for k in range(start[p], start[p + 1]):
+            limit = points[k].disparity + _SURFACE
+            if ceiling[p] <= limit:
+                continue
+            octants = 0
+            for b in range(max(row - n, 0), min(row + n + 1, rows)):
+                for a in range(max(col - n, 0), min(col + n + 1, cols)):
+                    q = b * cols + a
+                    if top[q] <= limit:
+                        continue
+                    if not known[q]:
+                        known[q] = True
+                        _fine_tops(points, start, q, tops)
+                    du = (a - col) * PX - PX // 2 + _PART // 2 - points[k].u
+                    dv = (b - row) * PX - PX // 2 + _PART // 2 - points[k].v
+                    for part in range(_FINE * _FINE):
+                        if tops[q * _FINE * _FINE + part] > limit:
+                            s = du + part % _FINE * _PART
+                            t = dv + part // _FINE * _PART
+                            if s * s + t * t <= far:
+                                octants |= 1 << _octant(s, t)
+                if surrounded[octants]:
+                    flags[k] = 0
+                    covered = True
+                    break
+        if covered:
+            count[p] = _range(points, start, p, flags, low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(
-    xy: Floats,
-    use: NDArray[np.bool_],
-    first: tuple[int, int],
-    distance: Floats,
-    disparity: Floats,
-) -> None:
-    """Per pixel: disparity of the point in ``use`` nearest to its centre (ties: the greater)."""
-    rows, cols = distance.shape
-    for k in range(xy.shape[1]):
-        if not use[k]:
-            continue
-        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
-        i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
-        d = xy[0, k] - xy[2, k]
-        for b in range(max(j - 1, 0), min(j + 2, rows)):
-            for a in range(max(i - 1, 0), min(i + 2, cols)):
-                q = (x - a) ** 2 + (y - b) ** 2
-                if q < distance[b, a] or (q == distance[b, a] and d > disparity[b, a]):
-                    distance[b, a] = q
-                    disparity[b, a] = d
+    points: Records, start: Ints, q: int, across: int, down: int, flags: NDArray[np.uint8], best
+) -> tuple[int, int]:
+    """(Squared distance to the centre, disparity) of the nearest: ``best``, or a point of pixel q.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _around(
-    xy: Floats,
-    use: NDArray[np.bool_],
-    first: tuple[int, int],
-    disparity: Floats,
-    tolerance: float,
-    other: Floats,
-    octants: Ints,
-    count: Ints,
-) -> None:
-    """Per pixel, of the points in it and in those beside it.
-
-    ``other``: squared distance of the centre to the nearest one of another surface; ``octants``:
-    bits of those in which its own surface has points; ``count``: how many there are.
+    q lies ``across``, ``down`` px from the centre; of equals, the greater disparity.
     """
-    rows, cols = disparity.shape
-    for k in range(xy.shape[1]):
-        if not use[k]:
-            continue
-        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
-        i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
-        d = xy[0, k] - xy[2, k]
-        for b in range(max(j - 1, 0), min(j + 2, rows)):
-            for a in range(max(i - 1, 0), min(i + 2, cols)):
-                count[b, a] += 1
-                if abs(d - disparity[b, a]) <= tolerance:
-                    octants[b, a] |= 1 << _octant(x - a, y - b)
-                else:
-                    q = (x - a) ** 2 + (y - b) ** 2
-                    other[b, a] = min(other[b, a], q)
+    distance, disparity = best
+    for k in range(start[q], start[q + 1]):
+        if flags[k] & _UNCOVERED:
+            u, v = across * PX + points[k].u, down * PX + points[k].v
+            r, d = u * u + v * v, np.int64(points[k].disparity)
+            if r < distance or (r == distance and d > disparity):
+                distance, disparity = r, d
+    return distance, disparity
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _near_surface(
-    xy: Floats,
-    pixel: Ints,
-    use: NDArray[np.bool_],
-    disparity: Floats,
-    tolerance: float,
-    out: NDArray[np.bool_],
+def _on_edge(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    p: int,
+    flags: NDArray[np.uint8],
+    distance: int,
+    disparity: int,
+    margin: float,
+    surrounded: NDArray[np.bool_],
+) -> bool:
+    """See :func:`seen_surface`; ``distance`` (squared) and ``disparity`` by _nearest."""
+    rows, cols = shape
+    row, col = p // cols, p % cols
+    other = np.inf
+    octants = 0
+    n = 0
+    for b in range(max(row - 1, 0), min(row + 2, rows)):
+        for a in range(max(col - 1, 0), min(col + 2, cols)):
+            q = b * cols + a
+            for k in range(start[q], start[q + 1]):
+                if flags[k] & _UNCOVERED:
+                    n += 1
+                    u, v = (a - col) * PX + points[k].u, (b - row) * PX + points[k].v
+                    if abs(points[k].disparity - disparity) <= _SURFACE:
+                        octants |= 1 << _octant(u, v)
+                    else:
+                        other = min(other, float(u * u + v * v))
+    if n >= MANY and not surrounded[octants]:
+        return True
+    return np.sqrt(other) < np.sqrt(float(distance)) + 2.0 * margin * PX
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+    margin: float,
+    surrounded: NDArray[np.bool_],
+    flags: NDArray[np.uint8],
+    seen: NDArray[np.int32],
+    edge: NDArray[np.bool_],
 ) -> None:
-    for k in range(pixel.size):
-        out[k] = use[k] and abs(xy[0, k] - xy[2, k] - disparity[pixel[k]]) <= tolerance
+    rows, cols = shape
+    quarter = PX * PX // 4  # squared; points of other pixels are no nearer
+    for p in range(count.size):
+        seen[p] = 0
+        edge[p] = False
+        if count[p] == 0:
+            continue
+        row, col = p // cols, p % cols
+        none = (np.int64(1 << 62), np.int64(_NOTHING))
+        distance, disparity = _nearest(points, start, p, 0, 0, flags, none)
+        around = 0
+        sides = 0
+        corners = 0
+        flat = True
+        for b in range(max(row - 1, 0), min(row + 2, rows)):
+            for a in range(max(col - 1, 0), min(col + 2, cols)):
+                q = b * cols + a
+                if count[q] == 0:
+                    continue
+                if distance >= quarter and q != p:
+                    distance, disparity = _nearest(
+                        points, start, q, a - col, b - row, flags, (distance, disparity)
+                    )
+                around += count[q]
+                sides += (b == row) != (a == col)
+                corners += b != row and a != col
+        for b in range(max(row - 1, 0), min(row + 2, rows)):
+            for a in range(max(col - 1, 0), min(col + 2, cols)):
+                q = b * cols + a
+                if count[q] > 0:
+                    flat &= high[q] <= disparity + _SURFACE and low[q] >= disparity - _SURFACE
+        # One surface, with points on four sides or corners, leaves no gap of three octants.
+        if not (flat and (around < MANY or sides == 4 or corners == 4)):
+            edge[p] = _on_edge(
+                points, start, shape, p, flags, distance, disparity, margin, surrounded
+            )
+        for k in range(start[p], start[p + 1]):
+            if flags[k] & _UNCOVERED and abs(points[k].disparity - disparity) <= _SURFACE:
+                flags[k] |= _ON_SURFACE
+                seen[p] += 1
 
 
 def box_sum(values: NDArray) -> NDArray:
@@ -259,15 +317,22 @@ def box_sum(values: NDArray) -> NDArray:
     return sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
 
 
+def _box_max(values: Steps, reach: int) -> Steps:
+    """Maximum over squares of 2 * reach + 1 px, cut off at the edges."""
+    for axis in (0, 1):
+        out = values.copy()
+        near, far = np.moveaxis(values, axis, 0), np.moveaxis(out, axis, 0)
+        for step in range(1, reach + 1):
+            np.maximum(far[step:], near[:-step], out=far[step:])
+            np.maximum(far[:-step], near[step:], out=far[:-step])
+        values = out
+    return values
+
+
 def seen_surface(
-    xy: Floats,
-    pixel: Ints,
-    use: NDArray[np.bool_],
-    rows: slice,
-    cols: slice,
-    edge_margin_px: float,
+    window: PixelPoints, edge_margin_px: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which of the points in ``use`` lie on the surface that their pixel's centre sees.
+    """Which points [n] lie on the surface that their pixel's centre sees; pixels [h, w] on edges.
 
     A point is covered if points of another surface, nearer to the left camera by more than
     SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
@@ -275,71 +340,28 @@ def seen_surface(
     beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
     within SURFACE_PX. There are none if the pixel only holds points of another surface.
 
-    The second result tells which of them lie in a pixel on an edge. Either the points of its
-    surface do not surround the centre: they leave a gap of more than EMPTY_OCTANTS, as beside a
-    wall that no point tells of (not where points are so sparse that gaps come by chance). Or,
-    half-way between the nearest points of its surface and of another one, the edge passes within
-    ``edge_margin_px`` of the centre, so that it may as well see the other one.
+    On an edge: either the points of its surface do not surround the centre: they leave a gap of
+    more than EMPTY_OCTANTS, as beside a wall that no point tells of (not where points are so sparse
+    that gaps come by chance). Or, half-way between the nearest points of its surface and of another
+    one, the edge passes within ``edge_margin_px`` of the centre, so that it may as well see the
+    other one.
 
-    ``pixel`` is the row-major index into ``rows`` x ``cols``; ``xy`` [4, n] as in
-    :func:`stereotruth.correlation.correlate`. The outermost EDGE rings of pixels lack neighbours.
+    The outermost EDGE rings of pixels lack neighbours.
     """
-    shape = rows.stop - rows.start, cols.stop - cols.start
-    first = (rows.start, cols.start)
-    tops = np.full((shape[0] * _FINE, shape[1] * _FINE), -np.inf)
-    _fine_tops(xy, use, first, tops)
-    count = np.zeros(shape[0] * shape[1], dtype=np.int64)
-    _count(pixel, use, count)
-    distance = 3.0 / np.sqrt(np.maximum(box_sum(count.reshape(shape)), 1))
-    reach = np.clip(1.7 * distance, COVER_PX, MAX_COVER_PX)
-    highest = tops.reshape(shape[0], _FINE, shape[1], _FINE).max(axis=(1, 3))
-    ceiling = maximum_filter(highest, 2 * int(np.ceil(MAX_COVER_PX)) + 1, mode="nearest")
-    uncovered = np.empty(use.size, dtype=np.bool_)
-    _uncovered(
-        xy,
-        pixel,
-        use,
-        first,
-        tops,
-        ceiling.reshape(-1),
-        reach.reshape(-1),
-        SURFACE_PX,
-        _surrounded(EMPTY_OCTANTS),
-        uncovered,
-    )
-    distance, disparity = np.full(shape, np.inf), np.full(shape, np.nan)
-    _nearest(xy, uncovered, first, distance, disparity)
-    other = np.full(shape, np.inf)
-    octants, around = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    _around(xy, uncovered, first, disparity, SURFACE_PX, other, octants, around)
-    edge = ~_surrounded(EMPTY_OCTANTS)[octants] & (around >= MANY)
-    edge |= np.sqrt(other) < np.sqrt(distance) + 2.0 * edge_margin_px
-    out = np.empty(use.size, dtype=np.bool_)
-    _near_surface(xy, pixel, uncovered, disparity.reshape(-1), SURFACE_PX, out)
-    return out, out & edge.reshape(-1)[pixel]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add(
-    index: Ints, use: NDArray[np.bool_], lon_q: Ints, lat_q: Ints, h_q: Ints, sums: Ints
-) -> None:
-    for k in range(index.size):
-        if use[k]:
-            i = index[k]
-            sums[i, 0] += 1
-            sums[i, 1] += lon_q[k]
-            sums[i, 2] += lat_q[k]
-            sums[i, 3] += h_q[k]
-
-
-def exact_sums(points: Points, index: Ints, use: NDArray[np.bool_], size: int) -> Ints:
-    """int64 [size, 4] per bin: number of the points in ``use``, sums of lon_q, lat_q, h_q.
-
-    Integers of the points' lattice: exact, whatever the order of the points.
-    """
-    sums = np.zeros((size, 4), dtype=np.int64)
-    _add(index, use, points.lon_q, points.lat_q, points.h_q, sums)
-    return sums
+    points, start, shape = window.points, window.start, window.shape
+    size = start.size - 1
+    low, high = np.empty(size, np.int32), np.empty(size, np.int32)
+    count, seen = np.empty(size, np.int32), np.empty(size, np.int32)
+    flags = np.full(points.size, _UNCOVERED)
+    _ranges(points, start, flags, low, high, count)
+    top = high.copy()
+    ceiling = _box_max(top.reshape(shape), int(np.ceil(MAX_COVER_PX))).reshape(-1)
+    near = box_sum(count.reshape(shape)).reshape(-1)
+    _uncovered(points, start, shape, near, top, ceiling, _SURROUNDED, flags, low, high, count)
+    edge = np.empty(size, dtype=np.bool_)
+    _seen(points, start, shape, low, high, count, edge_margin_px, _SURROUNDED, flags, seen, edge)
+    edge &= seen > 0
+    return (flags & _ON_SURFACE) != 0, edge.reshape(shape)
 
 
 # ------------------------------------------------------------------------------ scene geometry
@@ -435,54 +457,168 @@ class Surface:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_holes(height: NDArray[np.float32], radius: int, out: NDArray[np.float32]) -> None:
+def _floor_divide(q: int, divisor: int, inverse: float) -> int:
+    """q // divisor of 0 <= q < 2**31 and a divisor below 2**20; exact, and without a division."""
+    return np.int64((q + 0.5) * inverse)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _raise_tops(
+    lon_q: Ints,
+    lat_q: Ints,
+    h_q: Ints,
+    first: tuple[int, int],
+    cell: tuple[int, int],
+    top: Steps,
+    index: Steps,
+    height: Steps,
+) -> None:
+    """Takes points into the greatest height of each cell; fills ``index`` and ``height``."""
+    cols = top.shape[1]
+    inverse = (1.0 / cell[0], 1.0 / cell[1])
+    west, south = first[0] * cell[0], first[1] * cell[1]
+    for k in range(lon_q.size):
+        i = _floor_divide(lon_q[k] - west, cell[0], inverse[0])
+        j = _floor_divide(lat_q[k] - south, cell[1], inverse[1])
+        index[k] = j * cols + i
+        height[k] = h_q[k]
+        top[j, i] = max(top[j, i], height[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_tops(
+    index: Steps, height: Steps, top: Steps, tolerance: int, count: Steps, below: Steps
+) -> None:
+    """Per cell, of the points at most ``tolerance`` below its top: number, sum of the depths."""
+    for k in range(index.size):
+        depth = top[index[k]] - height[k]
+        if depth <= tolerance:
+            count[index[k]] += 1
+            below[index[k]] += depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _means_of_tops(
+    top: Steps, count: Steps, below: Steps, per_m: int, out: NDArray[np.float32]
+) -> None:
+    for k in range(top.size):
+        n = np.int64(count[k])
+        out[k] = (n * top[k] - below[k]) / n / per_m if n > 0 else -np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tile_tops(height: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """The highest of each square of _TILE cells."""
+    out[:] = -np.inf
+    for j in range(height.shape[0]):
+        for i in range(height.shape[1]):
+            out[j // _TILE, i // _TILE] = max(out[j // _TILE, i // _TILE], height[j, i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _holes(height: NDArray[np.float32], tops: NDArray[np.float32], out: Ints) -> int:
+    """Fills ``out`` with the flat indices of unknown cells near known ones; returns their number.
+
+    Near: in a tile beside one with known cells; no hole is filled from further away.
+    """
     rows, cols = height.shape
+    n = 0
     for j in range(rows):
-        for i in range(cols):
-            out[j, i] = height[j, i]
-            if height[j, i] > -np.inf:
+        for q in range(tops.shape[1]):
+            p = j // _TILE
+            near = tops[max(p - 1, 0) : p + 2, max(q - 1, 0) : q + 2]
+            if near.max() == -np.inf:
                 continue
-            known = 0
-            lowest = np.float32(np.inf)
-            for b in range(max(j - radius, 0), min(j + radius + 1, rows)):
-                for a in range(max(i - radius, 0), min(i + radius + 1, cols)):
-                    if height[b, a] > -np.inf:
-                        known += 1
-                        lowest = min(lowest, height[b, a])
-            if known >= 3:
-                out[j, i] = lowest
+            for i in range(q * _TILE, min((q + 1) * _TILE, cols)):
+                if height[j, i] == -np.inf:
+                    out[n] = j * cols + i
+                    n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_holes(height: NDArray[np.float32], holes: Ints, radius: int) -> int:
+    """Fills ``holes`` (flat indices); moves those that stay to the front, returns their number."""
+    rows, cols = height.shape
+    value = np.empty(holes.size, np.float32)
+    for n in range(holes.size):
+        j, i = holes[n] // cols, holes[n] % cols
+        value[n] = -np.inf
+        known = 0
+        lowest = np.float32(np.inf)
+        for b in range(max(j - radius, 0), min(j + radius + 1, rows)):
+            for a in range(max(i - radius, 0), min(i + radius + 1, cols)):
+                if height[b, a] > -np.inf:
+                    known += 1
+                    lowest = min(lowest, height[b, a])
+        if known >= 3:
+            value[n] = lowest
+    left = 0
+    for n in range(holes.size):
+        if value[n] > -np.inf:
+            height[holes[n] // cols, holes[n] % cols] = value[n]
+        else:
+            holes[left] = holes[n]
+            left += 1
+    return left
+
+
+@dataclass(eq=False)
+class SurfaceBuilder:
+    """Takes points, block by block, into the surface of a box of the ground.
+
+    ``low``, ``high``: corners (lattice lon, lat), both included; no point lies beyond.
+    """
+
+    rays: Rays
+    low: tuple[int, int]
+    high: tuple[int, int]
+    parts: list[tuple[Steps, Steps]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.first = tuple(int(q // side) for q, side in zip(self.low, self.rays.cell))
+        last = [q // side for q, side in zip(self.high, self.rays.cell)]
+        shape = last[1] - self.first[1] + 1, last[0] - self.first[0] + 1
+        self.top = np.full(shape, np.iinfo(np.int32).min, dtype=np.int32)
+
+    def add(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> None:
+        """Points by lattice coordinates."""
+        index, height = np.empty(lon_q.size, np.int32), np.empty(lon_q.size, np.int32)
+        _raise_tops(lon_q, lat_q, h_q, self.first, self.rays.cell, self.top, index, height)
+        self.parts.append((index, height))
+
+    def built(self) -> Surface:
+        """The surface of all that was taken.
+
+        A cell's height is the mean of its top surface. Cells without points take the lowest of
+        their neighbours, if three are known, in rounds of growing radius (roofs do not grow).
+        """
+        top = self.top.reshape(-1)
+        count, below = np.zeros(top.size, np.int32), np.zeros(top.size, np.int32)
+        tolerance = int(SURFACE_PX / self.rays.px_per_m * _PER_M)
+        for index, depth in self.parts:
+            _sum_tops(index, depth, top, tolerance, count, below)
+        self.parts = []
+        height = np.empty(self.top.shape, dtype=np.float32)
+        _means_of_tops(top, count, below, _PER_M, height.reshape(-1))
+        ceiling = np.empty([-(-n // _TILE) for n in height.shape], dtype=np.float32)
+        _tile_tops(height, ceiling)
+        holes = np.empty(height.size, dtype=np.int64)  # only what is needed is written
+        n = _holes(height, ceiling, holes)
+        for radius in FILL_RADII:
+            n = _fill_holes(height, holes[:n], radius)
+        _tile_tops(height, ceiling)
+        return Surface(height, ceiling, self.first[1], self.first[0])
 
 
 def build_surface(points: Points, rays: Rays) -> Surface | None:
-    """The surface of all given points; None if there are none.
-
-    A cell's height is the mean of its top surface. Cells without points take the lowest of their
-    neighbours, if three are known, in rounds of growing radius (roofs do not grow).
-    """
+    """The surface of all given points; None if there are none."""
     if len(points) == 0:
         return None
-    i = points.lon_q // rays.cell[0]
-    j = points.lat_q // rays.cell[1]
-    col, row = int(i.min()), int(j.min())
-    shape = int(j.max()) - row + 1, int(i.max()) - col + 1
-    index = (j - row) * shape[1] + (i - col)
-    everyone = np.ones(len(points), dtype=np.bool_)
-    size = shape[0] * shape[1]
-    top = top_surface(index, points.height, everyone, size, SURFACE_PX / rays.px_per_m)
-    sums = exact_sums(points, index, top, size)
-    height = np.full(size, -np.inf, dtype=np.float32)
-    known = sums[:, 0] > 0
-    height[known] = sums[known, 3] / sums[known, 0] / _PER_M
-    height = height.reshape(shape)
-    for radius in FILL_RADII:
-        filled = np.empty_like(height)
-        _fill_holes(height, radius, filled)
-        height = filled
-    tiles = [-(-n // _TILE) for n in shape]
-    padded = np.full([n * _TILE for n in tiles], -np.inf, dtype=np.float32)
-    padded[: shape[0], : shape[1]] = height
-    ceiling = padded.reshape(tiles[0], _TILE, tiles[1], _TILE).max(axis=(1, 3))
-    return Surface(height, ceiling, row, col)
+    low, high = ((int(edge(points.lon_q)), int(edge(points.lat_q))) for edge in (np.min, np.max))
+    builder = SurfaceBuilder(rays, low, high)
+    builder.add(points.lon_q, points.lat_q, points.h_q)
+    return builder.built()
 
 
 # ---------------------------------------------------------------------------------------- rays

@@ -19,10 +19,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .epipolar import EpipolarModel
-from .occlusion import SURFACE_PX, box_sum, exact_sums
-from .points import LATTICE_DEG, LATTICE_M, Points
+from .local_projection import LocalProjection
+from .occlusion import SURFACE_PX
+from .pixel_points import PX, PixelPoints, Records
+from .points import LATTICE_DEG, LATTICE_M
+from .right_view import MirroredModel
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 REPRESENTATIVES = ("top", "paper")
@@ -30,7 +34,6 @@ REPRESENTATIVES = ("top", "paper")
 HEIGHT_NOISE_M = 0.02
 FEW = 3  # degrees of freedom below which the points' own spread says nothing:
 FEW_NOISE_M = 0.05  # then this is taken
-_PER_PX = 1 << 16  # positions, disparities and correlations are summed as integers of 2^-16 px
 _PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
 RIDGE = 0.1  # px², keeps planes through places in a line level across it
 
@@ -39,8 +42,8 @@ RIDGE = 0.1  # px², keeps planes through places in a line level across it
 class Pixels:
     """What the points of each pixel come to; arrays [h, w], NaN (0) where a pixel has none.
 
-    ``sums`` [h * w, 4] of :func:`stereotruth.occlusion.exact_sums`; ``count``; ``x``, ``y`` (px,
-    left grid) and ``disparity`` (px) of the representative point;
+    ``sums`` int64[h * w, 4]: number of points, exact sums of their lattice coordinates; ``count``;
+    ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the representative point;
     ``highest`` (m); ``correlation`` mean of the points'; ``surface_class`` ASPRS class of the
     highest point; ``moments`` [h, w, 6]: sums over the points, about their mean, of uu, uv, vv, uz,
     vz, zz, with (u, v) the place in the left grid and z the disparity, px².
@@ -59,99 +62,111 @@ class Pixels:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _collect(
-    pixel: NDArray[np.int64],
+    points: Records,
+    start: Ints,
     use: Bools,
-    h_q: NDArray[np.int64],
-    classification: NDArray[np.uint8],
-    xy: Floats,
-    means: Floats,
+    origin: tuple[int, int],
     correlation: NDArray[np.float32],
-    top: NDArray[np.int64],
-    sums: NDArray[np.int64],
+    sums: Ints,
+    highest: Floats,
+    surface_class: NDArray[np.uint8],
+    mean_correlation: Floats,
+    moments: Floats,
 ) -> None:
-    """``top`` [n, 2]: greatest height and the class there (of equals, the greater).
-
-    ``sums`` [n, 10]: u, v, z, uu, uv, vv, uz, vz, zz about ``means`` [n, 3], and correlation.
-    """
-    for k in range(pixel.size):
-        if not use[k]:
+    """Per pixel from its points in ``use``; sums of products are of steps about known places."""
+    square = float(PX) * PX
+    for p in range(start.size - 1):
+        n = lon = lat = height = 0
+        top = np.int32(-(1 << 31))
+        top_class = np.uint8(0)
+        least = np.int32((1 << 31) - 1)
+        for k in range(start[p], start[p + 1]):
+            if not use[k]:
+                continue
+            point = points[k]
+            n += 1
+            lon += point.lon
+            lat += point.lat
+            height += point.height
+            least = min(least, point.disparity)
+            if point.height > top or (point.height == top and point.surface_class > top_class):
+                top, top_class = point.height, point.surface_class
+        sums[p, 0], sums[p, 3] = n, height
+        sums[p, 1], sums[p, 2] = lon + n * origin[0], lat + n * origin[1]
+        surface_class[p] = top_class
+        highest[p] = top / _PER_M if n else np.nan
+        mean_correlation[p] = np.nan
+        moments[p] = 0.0
+        if n == 0:
             continue
-        i = pixel[k]
-        if h_q[k] > top[i, 0] or (h_q[k] == top[i, 0] and classification[k] > top[i, 1]):
-            top[i, 0] = h_q[k]
-            top[i, 1] = classification[k]
-        u = np.int64(np.rint((xy[0, k] - means[i, 0]) * _PER_PX))
-        v = np.int64(np.rint((xy[1, k] - means[i, 1]) * _PER_PX))
-        z = np.int64(np.rint((xy[0, k] - xy[2, k] - means[i, 2]) * _PER_PX))
-        sums[i, 0] += u
-        sums[i, 1] += v
-        sums[i, 2] += z
-        sums[i, 3] += u * u
-        sums[i, 4] += u * v
-        sums[i, 5] += v * v
-        sums[i, 6] += u * z
-        sums[i, 7] += v * z
-        sums[i, 8] += z * z
+        su = sv = sz = suu = suv = svv = suz = svz = szz = together = 0
+        for k in range(start[p], start[p + 1]):
+            if not use[k]:
+                continue
+            u, v = np.int64(points[k].u), np.int64(points[k].v)
+            z = np.int64(points[k].disparity) - least
+            su += u
+            sv += v
+            sz += z
+            suu += u * u
+            suv += u * v
+            svv += v * v
+            suz += u * z
+            svz += v * z
+            szz += z * z
+            if correlation.size:
+                together += np.int64(np.rint(np.float64(correlation[k]) * PX))
         if correlation.size:
-            sums[i, 9] += np.int64(np.rint(np.float64(correlation[k]) * _PER_PX))
+            mean_correlation[p] = together / n / PX
+        u, v, z = float(su), float(sv), float(sz)
+        moments[p, 0] = (suu - u * u / n) / square
+        moments[p, 1] = (suv - u * v / n) / square
+        moments[p, 2] = (svv - v * v / n) / square
+        moments[p, 3] = (suz - u * z / n) / square
+        moments[p, 4] = (svz - v * z / n) / square
+        moments[p, 5] = (szz - z * z / n) / square
 
 
 def condense(
-    model: EpipolarModel,
-    points: Points,
-    xy: Floats,
-    pixel: NDArray[np.int64],
+    model: EpipolarModel | MirroredModel,
+    local: LocalProjection,
+    window: PixelPoints,
     use: Bools,
     correlation: NDArray[np.float32] | None,
-    shape: tuple[int, int],
     representative: str,
 ) -> Pixels:
-    """The pixels of a window from its points in ``use``.
+    """The pixels of a window from its points in ``use`` [n].
 
-    ``xy`` [4, n] are x_left, y_left, x_right, y_right of the points in px, ``pixel`` their
-    row-major index into ``shape``, ``correlation`` [n] theirs or None.
+    ``local`` is that of the ``model`` for a box with all points; ``correlation`` [n] of the points
+    or None.
     """
-    size = shape[0] * shape[1]
-    lattice = exact_sums(points, pixel, use, size)
-    count = lattice[:, 0]
-    found = np.flatnonzero(count)
-    n = count[found]
-    lon, lat = lattice[found, 1] / n / _PER_DEG, lattice[found, 2] / n / _PER_DEG
-    place = model.ground_to_epipolar(lon, lat, lattice[found, 3] / n / _PER_M)
-    means = np.full((size, 3), np.nan)
-    means[found] = np.stack([place[0], place[1], place[0] - place[2]], axis=1)
-    top = np.full((size, 2), np.iinfo(np.int64).min)
-    sums = np.zeros((size, 10), dtype=np.int64)
-    nothing = np.empty(0, dtype=np.float32)
+    size, shape = window.start.size - 1, window.shape
+    sums = np.empty((size, 4), dtype=np.int64)
+    highest, mean, moments = np.empty(size), np.empty(size), np.empty((size, 6))
+    surface_class = np.empty(size, dtype=np.uint8)
     _collect(
-        pixel,
+        window.points,
+        window.start,
         use,
-        points.h_q,
-        points.classification,
-        xy,
-        means,
-        nothing if correlation is None else correlation,
-        top,
+        window.origin,
+        np.empty(0, dtype=np.float32) if correlation is None else correlation,
         sums,
+        highest,
+        surface_class,
+        mean,
+        moments,
     )
-    highest, mean = np.full(size, np.nan), np.full(size, np.nan)
-    highest[found] = top[found, 0] / _PER_M
-    if correlation is not None:
-        mean[found] = sums[found, 9] / n / _PER_PX
-    surface_class = np.zeros(size, dtype=np.uint8)
-    surface_class[found] = top[found, 1]
-    u, v, z = (sums[:, k].astype(np.float64) for k in range(3))
-    crossed = np.stack([u * u, u * v, v * v, u * z, v * z, z * z], axis=1)
-    moments = (sums[:, 3:9] - crossed / np.maximum(count, 1)[:, None]) / float(_PER_PX) ** 2
+    place = local.at_means(sums)
     if representative == "paper":
-        place = model.ground_to_epipolar(lon, lat, highest[found])
-        means[found] = np.stack([place[0], place[1], place[0] - place[2]], axis=1)
+        found = np.flatnonzero(sums[:, 0])
+        lon, lat = (sums[found, axis] / sums[found, 0] / _PER_DEG for axis in (1, 2))
+        place[:, found] = model.ground_to_epipolar(lon, lat, highest[found])
     return Pixels(
-        sums=lattice,
-        count=count.reshape(shape),
-        x=means[:, 0].reshape(shape),
-        y=means[:, 1].reshape(shape),
-        disparity=means[:, 2].reshape(shape),
+        sums=sums,
+        count=sums[:, 0].reshape(shape),
+        x=place[0].reshape(shape),
+        y=place[1].reshape(shape),
+        disparity=(place[0] - place[2]).reshape(shape),
         highest=highest.reshape(shape),
         correlation=mean.reshape(shape),
         surface_class=surface_class.reshape(shape),
@@ -253,13 +268,48 @@ def at_points(pixels: Pixels, valid: Bools, px_per_m: float) -> Labels:
     )
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rests(
+    moments: Floats, count: Ints, valid: Bools, slope: Floats, squares: Floats, freedom: Floats
+) -> None:
+    """Sums of squares about the surface's slope, and degrees of freedom; 0 where not ``valid``."""
+    for j in range(valid.shape[0]):
+        for i in range(valid.shape[1]):
+            squares[j, i] = freedom[j, i] = 0.0
+            if not valid[j, i]:
+                continue
+            uu, uv, vv = moments[j, i, 0], moments[j, i, 1], moments[j, i, 2]
+            uz, vz, zz = moments[j, i, 3], moments[j, i, 4], moments[j, i, 5]
+            gx, gy = slope[0, j, i], slope[1, j, i]
+            rest = zz - 2.0 * (gx * uz + gy * vz)
+            rest = rest + gx * gx * uu + 2.0 * gx * gy * uv + gy * gy * vv
+            squares[j, i] = max(rest, 0.0)
+            freedom[j, i] = count[j, i] - 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pooled(
+    squares: Floats, freedom: Floats, valid: Bools, few: float, least: float, out: Floats
+) -> None:
+    """Variances over 3 x 3 pixels, added in one order; NaN where not ``valid``."""
+    rows, cols = valid.shape
+    for j in range(rows):
+        for i in range(cols):
+            out[j, i] = np.nan
+            if not valid[j, i]:
+                continue
+            total = n = 0.0
+            for b in range(max(j - 1, 0), min(j + 2, rows)):
+                for a in range(max(i - 1, 0), min(i + 2, cols)):
+                    total += squares[b, a]
+                    n += freedom[b, a]
+            out[j, i] = max(total / n if n >= FEW else few, least)
+
+
 def _noise(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float) -> Floats:
     """Variance (px²) of a point's disparity about its surface, pooled over 3 x 3 pixels."""
-    uu, uv, vv, uz, vz, zz = np.moveaxis(pixels.moments, -1, 0)
-    gx, gy = slope
-    rest = zz - 2.0 * (gx * uz + gy * vz) + gx * gx * uu + 2.0 * gx * gy * uv + gy * gy * vv
-    squares = box_sum(np.where(valid, np.maximum(rest, 0.0), 0.0))
-    freedom = box_sum(np.where(valid, pixels.count - 1.0, 0.0))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.where(freedom >= FEW, squares / freedom, (FEW_NOISE_M * px_per_m) ** 2)
-    return np.maximum(variance, (HEIGHT_NOISE_M * px_per_m) ** 2)
+    squares, freedom, out = (np.empty(valid.shape) for _ in range(3))
+    _rests(pixels.moments, pixels.count, valid, slope, squares, freedom)
+    floors = (FEW_NOISE_M * px_per_m) ** 2, (HEIGHT_NOISE_M * px_per_m) ** 2
+    _pooled(squares, freedom, valid, *floors, out)
+    return out

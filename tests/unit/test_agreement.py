@@ -40,7 +40,7 @@ def test_surface_correlation_stays_on_the_surface() -> None:
     disparity = np.zeros((60, 60))
     disparity[:, 30:] = 20.0
     found = surface_correlation(left, warped, disparity, LEVEL[:, :60, :60], 9)
-    assert found[:, :30] == pytest.approx(1.0, abs=1e-9)
+    assert found[:, :30] == pytest.approx(1.0, abs=1e-5)
     assert np.abs(found[:, 30:]).mean() < 0.25
     # With one surface, the same pixels would be mixed.
     mixed = surface_correlation(left, warped, np.zeros((60, 60)), LEVEL[:, :60, :60], 9)
@@ -54,7 +54,7 @@ def test_correlation_is_that_of_numpy() -> None:
     window = np.s_[2:9, 3:10]
     known = np.isfinite(warped[window])
     expected = np.corrcoef(left[window][known], warped[window][known])[0, 1]
-    assert found[5, 6] == pytest.approx(expected, abs=1e-12)
+    assert found[5, 6] == pytest.approx(expected, abs=1e-5)
     assert np.isnan(found[3, 4])
     assert (
         surface_correlation(left, np.full((21, 21), 5.0), np.zeros((21, 21)), LEVEL[:, :21, :21], 7)

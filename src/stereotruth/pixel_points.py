@@ -1,0 +1,230 @@
+"""The points of a window in the order of its pixels.
+
+Points arrive in the order of the store, are projected, and those in both frames are sorted by pixel
+(a counting sort), so that all that follows goes through memory once, pixel by pixel, and finds the
+points of a pixel's neighbours at once. Places in the images are integers of 2**-16 px from there
+on (rounded by 8e-6 px at most): sums are exact and comparisons the same in every window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .correlation import Patch
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Records = NDArray[np.void]
+
+PX = 1 << 16  # steps per px
+POINT = np.dtype(
+    [
+        ("disparity", np.int32),  # steps
+        ("lon", np.int32),  # lattice steps from the window's origin
+        ("lat", np.int32),
+        ("height", np.int32),  # lattice steps
+        ("u", np.int16),  # steps from the pixel's centre, in the left image
+        ("v", np.int16),
+        ("parallax", np.int16),  # y_right - y_left, steps; at most half a pixel is told
+        ("surface_class", np.uint8),
+    ],
+    align=True,  # 24 bytes
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelPoints:
+    """Points of a window of ``shape`` (rows, cols) whose first pixel is (row, col) ``first``.
+
+    ``points`` POINT[n] are those in both frames; pixel p (row-major) has those from ``start[p]`` to
+    ``start[p + 1]``. ``outside`` [pixels]: number of points that are not in both frames.
+    ``origin``: lattice (lon, lat) from which the points count.
+    """
+
+    points: Records
+    start: Ints
+    outside: NDArray[np.int32]
+    shape: tuple[int, int]
+    first: tuple[int, int]
+    origin: tuple[int, int]
+
+    @property
+    def count(self) -> NDArray[np.int32]:
+        """Number of points in both frames by pixel, [rows, cols]."""
+        return np.diff(self.start).astype(np.int32).reshape(self.shape)
+
+    def any(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which pixels [rows, cols] have one of the ``chosen`` points [n]."""
+        out = np.zeros(self.start.size - 1, dtype=np.bool_)
+        _any(self.start, chosen, out)
+        return out.reshape(self.shape)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _any(start: Ints, chosen: NDArray[np.bool_], out: NDArray[np.bool_]) -> None:
+    for p in range(out.size):
+        for k in range(start[p], start[p + 1]):
+            out[p] |= chosen[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _places(
+    points: Records,
+    start: Ints,
+    chosen: NDArray[np.bool_],
+    first: tuple[int, int],
+    cols: int,
+    out: Floats,
+) -> None:
+    n = 0
+    for p in range(start.size - 1):
+        for k in range(start[p], start[p + 1]):
+            if chosen[k]:
+                u = (first[1] + p % cols) * PX + points[k].u
+                v = (first[0] + p // cols) * PX + points[k].v
+                out[0, n], out[1, n] = u / PX, v / PX
+                out[2, n] = (u - points[k].disparity) / PX
+                out[3, n] = (v + points[k].parallax) / PX
+                n += 1
+
+
+def places(window: PixelPoints, chosen: NDArray[np.bool_]) -> Floats:
+    """float64[4, m] = x_left, y_left, x_right, y_right (px) of the ``chosen`` points [n]."""
+    out = np.empty((4, int(chosen.sum())))
+    _places(window.points, window.start, chosen, window.first, window.shape[1], out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _usable(usable: NDArray[np.uint8], origin: tuple[int, int], x: float, y: float) -> bool:
+    c = int(np.floor(x)) - origin[1]
+    r = int(np.floor(y)) - origin[0]
+    return 0 <= r < usable.shape[0] and 0 <= c < usable.shape[1] and usable[r, c] != 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take(
+    lon_q: Ints,
+    lat_q: Ints,
+    h_q: Ints,
+    surface_class: NDArray[np.uint8],
+    xy: Floats,
+    origin: tuple[int, int],
+    first: tuple[int, int],
+    shape: tuple[int, int],
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    left_origin: tuple[int, int],
+    right_origin: tuple[int, int],
+    points: Records,
+    pixel: NDArray[np.int32],
+    count: Ints,
+    outside: NDArray[np.int32],
+) -> int:
+    """Fills ``points`` and ``pixel`` with those in both frames; returns how many these are."""
+    n = 0
+    half = PX // 2
+    for k in range(lon_q.size):
+        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
+        if not (-1.0 < x < shape[1] and -1.0 < y < shape[0] and np.isfinite(xy[2, k])):
+            continue
+        u, v = np.int64(np.rint(xy[0, k] * PX)), np.int64(np.rint(xy[1, k] * PX))
+        col, row = (u + half) // PX, (v + half) // PX
+        i, j = col - first[1], row - first[0]
+        if i < 0 or j < 0 or i >= shape[1] or j >= shape[0]:
+            continue
+        p = j * shape[1] + i
+        # The test is of the places as rounded: what is read later lies in the frame.
+        u_right = np.int64(np.rint(xy[2, k] * PX))
+        shift = np.int64(np.rint(xy[3, k] * PX)) - v
+        shift = min(max(shift, -half), half - 1)
+        if not (
+            _usable(left, left_origin, u / PX, v / PX)
+            and _usable(right, right_origin, u_right / PX, (v + shift) / PX)
+        ):
+            outside[p] += 1
+            continue
+        point = points[n]
+        point.disparity = u - u_right
+        point.lon = lon_q[k] - origin[0]
+        point.lat = lat_q[k] - origin[1]
+        point.height = h_q[k]
+        point.u = u - col * PX
+        point.v = v - row * PX
+        point.parallax = shift
+        point.surface_class = surface_class[k]
+        pixel[n] = p
+        count[p + 1] += 1
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scatter(points: Records, pixel: NDArray[np.int32], place: Ints, out: Records) -> None:
+    for k in range(pixel.size):
+        out[place[pixel[k]]] = points[k]
+        place[pixel[k]] += 1
+
+
+@dataclass(eq=False)
+class Collection:
+    """Takes the points of a window, block by block."""
+
+    shape: tuple[int, int]
+    first: tuple[int, int]
+    origin: tuple[int, int]
+    left: Patch
+    right: Patch
+    parts: list[tuple[Records, NDArray[np.int32]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        size = self.shape[0] * self.shape[1]
+        self.count = np.zeros(size + 1, dtype=np.int64)
+        self.outside = np.zeros(size, dtype=np.int32)
+
+    def add(
+        self,
+        lon_q: Ints,
+        lat_q: Ints,
+        h_q: Ints,
+        surface_class: NDArray[np.uint8],
+        xy: Floats,
+    ) -> None:
+        """Points by lattice coordinates and class, and where they are seen: ``xy`` [4, n], px."""
+        points = np.empty(lon_q.size, dtype=POINT)
+        pixel = np.empty(lon_q.size, dtype=np.int32)
+        n = _take(
+            lon_q,
+            lat_q,
+            h_q,
+            surface_class,
+            xy,
+            self.origin,
+            self.first,
+            self.shape,
+            self.left.usable,
+            self.right.usable,
+            (self.left.row, self.left.col),
+            (self.right.row, self.right.col),
+            points,
+            pixel,
+            self.count,
+            self.outside,
+        )
+        if n:
+            self.parts.append((points[:n].copy(), pixel[:n].copy()))
+
+    def sorted(self) -> PixelPoints:
+        """All that was taken; empties the collection."""
+        start = np.cumsum(self.count)
+        points = np.empty(int(start[-1]), dtype=POINT)
+        place = start[:-1].copy()
+        for part in range(len(self.parts)):
+            _scatter(*self.parts[part], place, points)
+            self.parts[part] = None
+        self.parts = []
+        return PixelPoints(points, start, self.outside, self.shape, self.first, self.origin)
