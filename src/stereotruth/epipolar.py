@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .grid_store import replacing
-from .rpc import SensorModel, project_point
+from .rpc import SensorModel, project_block
 
 log = logging.getLogger("stereotruth")
 
@@ -65,10 +65,14 @@ MAX_DOMAIN = 300_000.0  # px; the largest scenes have some 50 000
 # ------------------------------------------------------------------------------------- kernels
 # One image's packed model: [0:6] x and y affine, [6] col_min, [7] cells per px along columns,
 # [8] row_min, [9] cells per px along rows, [10] n, [11] start of the x coefficients (0: none),
-# [12:12 + n²] coefficients of y, then those of x.
+# [12:12 + n²] coefficients of y, then those of x. The same splines follow as polynomials, 16
+# coefficients for each of their (n - 3)² cells: those of y from m[12 + n²] or, if there is an x,
+# m[12 + 2 n²] on, then those of x; [4 b + a] belongs to f**a g**b.
+_BLOCK = 256  # points worked on together
+_POWERS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6  # of weights
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _weights(f: float) -> tuple[float, float, float, float]:
     e = 1.0 - f
     return (
@@ -145,26 +149,116 @@ def forward_with_slopes(
     )
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _cell(m: Floats, s: float, t: float) -> int:
+    """Number of the spline's cell in which a place lies; -1 outside of the domain."""
+    last = int(m[10]) - 4
+    inside = (s >= 0.0) & (s <= last + 1.0) & (t >= 0.0) & (t <= last + 1.0)
+    i, j = min(int(s if inside else 0.0), last), min(int(t if inside else 0.0), last)
+    return j * (last + 1) + i if inside else -1
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _bicubic(
+    f: float,
+    g: float,
+    p0: tuple[float, float, float, float],
+    p1: tuple[float, float, float, float],
+    p2: tuple[float, float, float, float],
+    p3: tuple[float, float, float, float],
+) -> float:
+    """Polynomial of a cell: one tuple for each power of g, in it one for each power of f."""
+    a = p0[0] + f * (p0[1] + f * (p0[2] + f * p0[3]))
+    b = p1[0] + f * (p1[1] + f * (p1[2] + f * p1[3]))
+    c = p2[0] + f * (p2[1] + f * (p2[2] + f * p2[3]))
+    d = p3[0] + f * (p3[1] + f * (p3[2] + f * p3[3]))
+    return a + g * (b + g * (c + g * d))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _powers(m: Floats, k: int) -> tuple[float, float, float, float]:
+    return m[k], m[k + 1], m[k + 2], m[k + 3]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def forward_point(m: Floats, col: float, row: float) -> tuple[float, float]:
     """Epipolar (x, y) in px of one image point; ``m`` is a packed image model."""
-    n = int(m[10])
-    top = n - 3.0
     s = (col - m[6]) * m[7]
     t = (row - m[8]) * m[9]
-    if not (s >= 0.0 and s <= top and t >= 0.0 and t <= top):
+    cell = _cell(m, s, t)
+    if cell < 0:
         x, y, _, _, _, _ = forward_with_slopes(m, col, row)
         return x, y
-    i = min(int(s), n - 4)
-    j = min(int(t), n - 4)
-    w = _weights(s - i)
-    v = _weights(t - j)
-    k = 12 + j * n + i
+    n = int(m[10])
+    f, g = s - cell % (n - 3), t - cell // (n - 3)
     x = m[0] * col + m[1] * row + m[2]
-    y = m[3] * col + m[4] * row + m[5] + _patch(m, k, n, w, v)
+    y = m[3] * col + m[4] * row + m[5]
+    k = 12 + n * n * (2 if m[11] > 0.0 else 1) + 16 * cell
+    y += _bicubic(f, g, _powers(m, k), _powers(m, k + 4), _powers(m, k + 8), _powers(m, k + 12))
     if m[11] > 0.0:
-        x += _patch(m, k + int(m[11]) - 12, n, w, v)
+        k += 16 * (n - 3) ** 2
+        x += _bicubic(f, g, _powers(m, k), _powers(m, k + 4), _powers(m, k + 8), _powers(m, k + 12))
     return x, y
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cell_of_all(m: Floats, col: Floats, row: Floats, f: Floats, g: Floats) -> int:
+    """Number of the spline's cell in which a block of points lies, with their places f, g in it.
+
+    -1 if the points do not share a cell, or lie outside of the domain; then f, g are not filled.
+    """
+    col_min, per_col, row_min, per_row = m[6], m[7], m[8], m[9]
+    low, high = 1 << 30, -1
+    for k in range(col.size):
+        f[k] = (col[k] - col_min) * per_col
+        g[k] = (row[k] - row_min) * per_row
+        cell = _cell(m, f[k], g[k])
+        low, high = min(low, cell), max(high, cell)
+    if low != high:
+        return -1
+    side = int(m[10]) - 3
+    i, j = low % side, low // side
+    for k in range(col.size):
+        f[k] -= i
+        g[k] -= j
+    return low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _affine(m: Floats, k: int, col: Floats, row: Floats, out: Floats) -> None:
+    a, b, c = m[k], m[k + 1], m[k + 2]
+    for i in range(col.size):
+        out[i] = a * col[i] + b * row[i] + c
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_bicubic(m: Floats, k: int, f: Floats, g: Floats, out: Floats) -> None:
+    p0, p1, p2, p3 = _powers(m, k), _powers(m, k + 4), _powers(m, k + 8), _powers(m, k + 12)
+    for i in range(f.size):
+        out[i] += _bicubic(f[i], g[i], p0, p1, p2, p3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _forward_block(
+    m: Floats, col: Floats, row: Floats, f: Floats, g: Floats, x: Floats, y: Floats
+) -> None:
+    """Fill ``x`` and ``y`` with what forward_point gives, to the bit; ``f``, ``g`` are scratch.
+
+    The cells of the spline are thousands of pixels wide: the points of a block nearly always share
+    one, and then its coefficients are loaded once.
+    """
+    cell = _cell_of_all(m, col, row, f, g)
+    if cell < 0:
+        for k in range(col.size):
+            x[k], y[k] = forward_point(m, col[k], row[k])
+        return
+    n = int(m[10])
+    _affine(m, 0, col, row, x)
+    _affine(m, 3, col, row, y)
+    k = 12 + n * n * (2 if m[11] > 0.0 else 1) + 16 * cell
+    _add_bicubic(m, k, f, g, y)
+    if m[11] > 0.0:
+        _add_bicubic(m, k + 16 * (n - 3) ** 2, f, g, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -210,27 +304,28 @@ def ground_points_to_epipolar(
     """Fill ``out`` [4, n] with x_left, y_left, x_right, y_right of n ground points.
 
     ``sensors`` [2, 96] are the packed sensor models, ``left`` and ``right`` the packed epipolar
-    ones. Goes in blocks, so that the projection is vectorised and stays in the cache.
+    ones. Goes in blocks, so that all loops are vectorised and stay in the cache.
     """
-    block = 512
-    col = np.empty(block)
-    row = np.empty(block)
-    for start in range(0, lon.size, block):
-        size = min(block, lon.size - start)
-        for image in range(2):
-            packed = sensors[image]
-            for i in range(size):
-                c, r = project_point(packed, lon[start + i], lat[start + i], height[start + i])
-                col[i] = c
-                row[i] = r
-            m = left if image == 0 else right
-            for i in range(size):
-                x, y = forward_point(m, col[i], row[i])
-                out[2 * image, start + i] = x
-                out[2 * image + 1, start + i] = y
+    # Arrays of their own: LLVM vectorises no loop that writes to two rows of one.
+    columns, rows = np.empty(_BLOCK), np.empty(_BLOCK)
+    s, t = np.empty(_BLOCK), np.empty(_BLOCK)
+    for start in range(0, lon.size, _BLOCK):
+        end = min(start + _BLOCK, lon.size)
+        col, row = columns[: end - start], rows[: end - start]
+        f, g = s[: end - start], t[: end - start]
+        for k in range(2):
+            project_block(sensors[k], lon[start:end], lat[start:end], height[start:end], col, row)
+            m = left if k == 0 else right
+            _forward_block(m, col, row, f, g, out[2 * k, start:end], out[2 * k + 1, start:end])
 
 
 # ---------------------------------------------------------------------------------- image model
+
+
+def _cells(spline: Floats) -> Floats:
+    """[n - 3, n - 3, 4, 4]: the polynomials of a spline's cells, by powers of g and f."""
+    windows = np.lib.stride_tricks.sliding_window_view(spline, (4, 4))
+    return np.einsum("bq,jiqp,ap->jiba", _POWERS, windows, _POWERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +355,10 @@ class ImageModel:
             n,
             12 + n * n if x.size else 0,
         ]
-        packed = np.concatenate([header, np.asarray(self.y_spline).reshape(-1), x.reshape(-1)])
+        splines = [np.asarray(self.y_spline, dtype=np.float64), *([x] if x.size else [])]
+        packed = np.concatenate(
+            [header, *(c.reshape(-1) for c in splines), *(_cells(c).reshape(-1) for c in splines)]
+        )
         object.__setattr__(self, "packed", packed)
 
     def forward(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:

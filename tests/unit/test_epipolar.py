@@ -275,6 +275,58 @@ def test_ground_goes_through_the_sensors(curved: EpipolarModel) -> None:
     assert np.abs(np.subtract((lon, lat), points[:2])).max() < 1e-11
 
 
+def plain_projection(sensor: dict, lon, lat, height) -> tuple[np.ndarray, np.ndarray]:
+    """(col, row) by RPC00B as NGA STDI-0002 writes it, from the JSON alone."""
+    rpc = sensor["rpc"]
+    x = (lon - rpc["long_off"]) / rpc["long_scale"]
+    y = (lat - rpc["lat_off"]) / rpc["lat_scale"]
+    z = (height - rpc["height_off"]) / rpc["height_scale"]
+    terms = [1, x, y, z, x * y, x * z, y * z, x**2, y**2, z**2, x * y * z, x**3, x * y**2]
+    terms += [x * z**2, x**2 * y, y**3, y * z**2, x**2 * z, y**2 * z, z**3]
+
+    def ratio(name: str) -> np.ndarray:
+        sums = [
+            sum(c * term for c, term in zip(rpc[f"{name}_{part}_coeff"], terms))
+            for part in ("num", "den")
+        ]
+        return sums[0] / sums[1] * rpc[f"{name}_scale"] + rpc[f"{name}_off"]
+
+    image = np.stack([ratio("samp"), ratio("line"), np.ones_like(lon)])
+    return tuple(np.array(sensor["affine"]) @ image)
+
+
+def test_ground_to_epipolar_is_the_plain_formula(curved: EpipolarModel) -> None:
+    """Far and near points in any order: blocks within a cell of the spline, across, and outside."""
+    stored = json.loads(json.dumps(curved.to_dict()))
+    together, apart = ground(1000, seed=1), ground(1000, seed=2)
+    together[:2] = [[LON], [LAT]] + (together[:2] - [[LON], [LAT]]) * 0.01
+    apart[:2] = [[LON], [LAT]] + (apart[:2] - [[LON], [LAT]]) * 4.0
+    points = np.hstack([together, apart])
+    got = curved.ground_to_epipolar(*points)
+    worst = 0.0
+    for k, side in enumerate(("left", "right")):
+        col, row = plain_projection(stored[f"{side}_sensor"], *points)
+        domain = stored[f"{side}_to_epipolar"]["spline_domain"]
+        inside = (col > domain["col_min"]) & (col < domain["col_max"])
+        inside &= (row > domain["row_min"]) & (row < domain["row_max"])
+        assert inside[:1000].all() and not inside[1000:].all()
+        expected = [
+            evaluate_by_hand(stored[f"{side}_to_epipolar"], *place)
+            for place in zip(col[inside], row[inside])
+        ]
+        worst = max(worst, np.abs(got[2 * k : 2 * k + 2, inside] - np.transpose(expected)).max())
+    assert worst < 1e-4  # measured: 2e-12
+
+
+def test_a_point_comes_out_the_same_in_any_company(curved: EpipolarModel) -> None:
+    points = ground(1500) * [[1], [1], [3]]
+    whole = curved.ground_to_epipolar(*points)
+    order = np.argsort(points[0])
+    assert np.array_equal(curved.ground_to_epipolar(*points[:, order]), whole[:, order])
+    for k in range(0, 1500, 97):
+        assert np.array_equal(curved.ground_to_epipolar(*points[:, k]), whole[:, k : k + 1])
+
+
 def test_the_same_fit_twice(curved: EpipolarModel) -> None:
     again = fit(curved.left, curved.right)
     assert again.to_dict() == curved.to_dict()
