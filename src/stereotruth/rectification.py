@@ -86,6 +86,16 @@ def _kernel(s: float) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
     """Weights of the source samples first, first + 1, … for the value at ``at``; sum 1."""
+    if scale == 1.0:  # the same without branches
+        f = at - first - 2.0
+        e = 1.0 - f
+        weights[0] = (((f - 2.0) * f + 1.0) * f) / 12.0
+        weights[5] = (((e - 2.0) * e + 1.0) * e) / 12.0
+        weights[1] = (((-7.0 * f + 15.0) * f - 8.0) * f) / 12.0
+        weights[4] = (((-7.0 * e + 15.0) * e - 8.0) * e) / 12.0
+        weights[2] = (4.0 * f - 7.0) * f * f / 3.0 + 1.0
+        weights[3] = (4.0 * e - 7.0) * e * e / 3.0 + 1.0
+        return
     total = 0.0
     for k in range(weights.size):
         weights[k] = _kernel((at - (first + k)) / scale)
@@ -254,7 +264,21 @@ def sample(
 ) -> float:
     """Weighted sum of source samples; NaN where a sample with weight is nodata or missing."""
     rows, cols = source.shape
-    total = 0.0
+    if (
+        first_row >= 0
+        and first_col >= 0
+        and first_row + down.size <= rows
+        and first_col + across.size <= cols
+    ):
+        total = 0.0
+        for j in range(down.size):
+            part = 0.0
+            for i in range(across.size):
+                part += across[i] * source[first_row + j, first_col + i]
+            total += down[j] * part
+        if not np.isnan(total):
+            return total
+    total = 0.0  # at an edge or at nodata: samples without weight do not count
     for j in range(down.size):
         if abs(down[j]) < NO_WEIGHT:
             continue
