@@ -26,6 +26,7 @@ of windows, and order of blocks, stores and points.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import IntEnum
@@ -35,16 +36,16 @@ from typing import Any, NamedTuple
 
 import dask
 import numpy as np
-import zarr
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from .agreement import VOTE_PX, outvoted, supported, surface_correlation, warp_to_left
+from .block_store import BlockStore, making
 from .correlation import Array2D, Patch, correlate, read_patch
 from .epipolar import EpipolarModel
 from .errors import InputError
-from .grid_store import Layer, blocks, building, create_grid, require_complete
+from .grid_store import Layer, Strip, blocks, require_complete
 from .local_projection import LocalProjection
 from .occlusion import (
     EDGE,
@@ -58,7 +59,7 @@ from .occlusion import (
 )
 from .pixel_points import Collection, PixelPoints, places
 from .points import CELL_BITS, LATTICE_DEG, LATTICE_M, PointStore
-from .provenance import describe, digest
+from .provenance import describe, digest, source_digest
 from .representative import REPRESENTATIVES, Labels, Pixels, at_centres, at_points, condense
 from .right_view import MirroredImage, MirroredModel, mirrored
 from .runlog import BlockProgress
@@ -657,13 +658,28 @@ class _Scene:
             halves = [(rows, slice(cols.start, middle)), (rows, slice(middle, cols.stop))]
         return [window for half in halves for window in self.windows(*half)]
 
-    def block(self, out: Path, rows: slice, cols: slice) -> NDArray[np.int64]:
-        """Label one block and write it; returns pixels by status, and the counts of points."""
-        group = zarr.open_group(out, mode="r+")
+    def key(self, content: str, rows: slice, cols: slice) -> str:
+        """Digest of all that the labels of a block follow from: ``content`` and its points."""
+        if self.view == "right":
+            cols = mirrored(cols, self.model.shape[1])
+        boxes = self.boxes(rows, cols)
+        touched = []
+        if boxes is not None:
+            box = boxes[self.settings.uses_geometry]
+            touched = sorted(
+                _identity(store.attrs)
+                for store in self.stores
+                if store.height_range(*box) is not None
+            )
+        return digest({"content": content, "points": touched})
+
+    def block(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
+        """Label one block and write it, with its pixels by status and counts of points."""
         where = rows, cols
         if self.view == "right":
             cols = mirrored(cols, self.model.shape[1])
         shape = rows.stop - rows.start, cols.stop - cols.start
+        fill = layers(self.settings, self.view)
         arrays: dict[str, NDArray] = {}
         points = np.zeros(3, dtype=np.int64)
         for r, c in self.windows(rows, cols):
@@ -676,7 +692,7 @@ class _Scene:
             )
             for name, layer in found[0].items():
                 if name not in arrays:
-                    arrays[name] = np.full(shape, group[name].fill_value, dtype=layer.dtype)
+                    arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
                 arrays[name][part] = layer
             points += found[1]
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
@@ -684,9 +700,8 @@ class _Scene:
             left, right = (status == s for s in (Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT))
             status[left], status[right] = Status.HIDDEN_IN_RIGHT, Status.HIDDEN_IN_LEFT
             arrays = {name: array[:, ::-1] for name, array in arrays.items()}
-        for name, array in arrays.items():
-            group[name][where] = array
-        return np.concatenate([np.bincount(status.reshape(-1), minlength=len(Status)), points])
+        counts = np.bincount(status.reshape(-1), minlength=len(Status))
+        out.write(where, key, arrays, [*counts.tolist(), *points.tolist()])
 
 
 # ----------------------------------------------------------------------------------------- stage
@@ -694,6 +709,12 @@ class _Scene:
 
 def _apart(a: Box, b: Box) -> bool:
     return a[0] > b[2] or b[0] > a[2] or a[1] > b[3] or b[1] > a[3]
+
+
+def _identity(attrs: Mapping[str, Any]) -> str:
+    """What stands for the values of a store; something new each time if it does not tell."""
+    made_of = attrs.get("provenance") or {"unknown": os.urandom(8).hex()}
+    return attrs.get("content") or digest(made_of)
 
 
 def _in_words(box: Box) -> str:
@@ -750,7 +771,8 @@ def project_scene(
     code: str = "",
     scene: str = "",
     max_points: int = MAX_POINTS,
-) -> dict[str, Any]:
+    strip: Strip | None = None,
+) -> dict[str, Any] | None:
     """Project the points of a scene and write its disparity grid; returns the summary.
 
     ``left_store``, ``right_store``: rectified images made by `rectify`; ``point_stores``: made by
@@ -759,6 +781,10 @@ def project_scene(
     ``geometric`` (visibility in both views from the points), ``both`` (geometric, and what the
     images contradict is ``changed``), ``none``. ``scheduler`` is what Dask's compute takes;
     ``workers`` the number of its threads. ``code``: digest of the source, for the provenance.
+
+    Blocks that an earlier call has left, made of the same, are taken over (see
+    :mod:`stereotruth.block_store`). ``strip``: make its blocks only, for a later call without it,
+    and return None.
 
     The store [y, x] on the epipolar grid of the view: see :func:`layers`; attributes ``epipolar``
     (the model), ``view``, ``summary``, ``points_bounds``, ``provenance``. Summary: ``pixels`` by
@@ -770,10 +796,12 @@ def project_scene(
     settings = Settings(
         method, window, correlation_threshold, representative, edge_margin_px, min_points
     )
-    paths = sorted(Path(path) for path in point_stores)
+    # Absolute, since workers of a Dask cluster live in other folders.
+    left_store, right_store, out = (Path(p).absolute() for p in (left_store, right_store, out))
+    paths = sorted(Path(path).absolute() for path in point_stores)
     if not paths:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
-    job = _Scene(Path(left_store), Path(right_store), tuple(paths), settings, max_points, view)
+    job = _Scene(left_store, right_store, tuple(paths), settings, max_points, view)
     model, stores = job.model, job.stores
     corners = np.array([store.bounds for store in stores])
     bounds = [*corners[:, :2].min(0), *corners[:, 2:4].max(0)]
@@ -807,25 +835,39 @@ def project_scene(
         "settings": parameters,
         "provenance": describe(inputs, parameters, code),
     }
-    with building(out) as unfinished:
-        create_grid(
-            unfinished,
-            model.shape,
-            layers(settings, view),
-            chunk=CHUNK,
-            shard=SHARD,
-            attrs=attrs,
-        )
+    left_attrs = require_complete(left_store).attrs
+    content = digest(
+        {
+            "images": [_identity(require_complete(p).attrs) for p in (left_store, right_store)],
+            "epipolar": left_attrs["epipolar"],
+            "alignment_sigma": left_attrs.get("alignment_sigma"),
+            "parameters": parameters,
+            "code": code or source_digest("disparity"),
+        }
+    )
+    grid = making(
+        out,
+        model.shape,
+        layers(settings, view),
+        chunk=CHUNK,
+        shard=SHARD,
+        shared=strip is not None,
+    )
+    with grid as unfinished:
+        every = blocks(model.shape, SHARD)
+        part = every if strip is None else strip.of(every)
+        keys = [job.key(content, *block) for block in part]
         tasks = [
             dask.delayed(job.block, pure=False)(
-                unfinished, rows, cols, dask_key_name=f"block-{number:07d}"
+                unfinished, keys[number], *part[number], dask_key_name=f"block-{number:07d}"
             )
-            for number, (rows, cols) in enumerate(blocks(model.shape, SHARD))
+            for number in unfinished.missing(part, keys, workers)
         ]
         with BlockProgress(len(tasks), "disparity"):
-            counts = np.sum(
-                dask.compute(*tasks, scheduler=scheduler, num_workers=workers), axis=0
-            ).tolist()
+            dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
+        if strip is not None:
+            return None
+        counts = np.sum(unfinished.results(every), axis=0).tolist()
         pixels = {status.name.lower(): counts[status] for status in Status}
         in_grid, framed, used = counts[len(Status) :]
         if framed == 0:
@@ -836,7 +878,7 @@ def project_scene(
             "points": {"in_grid": in_grid, "in_frame": framed, "used": used},
             "labelled_share": round(pixels["labelled"] / max(reached, 1), 6),
         }
-        zarr.open_group(unfinished, mode="r+").attrs["summary"] = summary
+        unfinished.publish(out, every, attrs | {"summary": summary})
     log.info(
         "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
         settings.method,

@@ -2,7 +2,7 @@
 
 A store is built beside its final place (``<name>.partial``), gets the attribute ``complete`` last
 and is then renamed, so that a killed run never leaves something that looks finished; the one
-opener of each kind of store checks that attribute.
+opener of each kind of store checks that attribute. One process at a time makes a product.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from .errors import InputError
+from .locking import exclusive
 
 CONVENTIONS = (
     "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
@@ -54,11 +55,12 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        yield scratch
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
+    with exclusive(path):
+        try:
+            yield scratch
+            scratch.replace(path)
+        finally:
+            scratch.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -66,20 +68,21 @@ def building(path: str | Path) -> Iterator[Path]:
     """A fresh scratch folder that becomes ``path`` if the block ends well, else it goes."""
     path = Path(path)
     scratch = path.with_name(path.name + ".partial")
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield scratch
-        group = zarr.open_group(scratch, mode="r+")
-        group.attrs["complete"] = True
-        with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
-            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-            zarr.consolidate_metadata(group.store)
-        shutil.rmtree(path, ignore_errors=True)
-        scratch.rename(path)
-    except BaseException:
+    with exclusive(path):
         shutil.rmtree(scratch, ignore_errors=True)
-        raise
+        scratch.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield scratch
+            group = zarr.open_group(scratch, mode="r+")
+            group.attrs["complete"] = True
+            with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
+                warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+                zarr.consolidate_metadata(group.store)
+            shutil.rmtree(path, ignore_errors=True)
+            scratch.rename(path)
+        except BaseException:
+            shutil.rmtree(scratch, ignore_errors=True)
+            raise
 
 
 def create_grid(
@@ -134,6 +137,34 @@ def blocks(shape: tuple[int, int], size: int) -> list[tuple[slice, slice]]:
         for r in range(0, shape[0], size)
         for c in range(0, shape[1], size)
     ]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Rows of a grid that one of several jobs makes: part ``number`` (from 0 on) of ``count``."""
+
+    number: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Strip:
+        """From ``3-of-8``."""
+        number, _, count = text.partition("-of-")
+        return cls(int(number), int(count))
+
+    def __str__(self) -> str:
+        return f"{self.number}-of-{self.count}"
+
+    def of(self, windows: list[tuple[slice, slice]]) -> list[tuple[slice, slice]]:
+        """The windows in the strip's rows: equal numbers of rows of windows."""
+        starts = sorted({rows.start for rows, _ in windows})
+        first, end = ((self.number + k) * len(starts) // self.count for k in (0, 1))
+        return [window for window in windows if window[0].start in starts[first:end]]
+
+    def tell(self, path: str | Path) -> None:
+        """Write the file that tells that the strip is made."""
+        with replacing(path) as scratch:
+            scratch.write_text(f'{{"strip": "{self}"}}\n')
 
 
 def require_complete(path: str | Path) -> zarr.Group:

@@ -17,7 +17,6 @@ from typing import Any
 import dask
 import numpy as np
 import rasterio
-import zarr
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
@@ -25,9 +24,11 @@ from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window
 
+from .block_store import BlockStore, making
 from .epipolar import EpipolarModel, Floats, ImageModel, fit_epipolar
 from .errors import InputError
-from .grid_store import Layer, blocks, building, create_grid
+from .grid_store import Layer, Strip, blocks
+from .provenance import digest, file_sha256, source_digest
 from .rpc import SensorModel
 from .runlog import BlockProgress
 
@@ -478,19 +479,22 @@ def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
 def rectify_image(
     source: Source,
     model: ImageModel,
-    target: zarr.Array,
+    target: BlockStore,
+    shape: tuple[int, int],
     *,
+    key: str,
     workers: int,
     what: str = "rectified image",
+    strip: Strip | None = None,
 ) -> dict[str, Any]:
-    """Resample one image into its epipolar grid, shard by shard; returns facts for the attributes.
+    """Resample one image into its epipolar grid, block by block; returns facts for the attributes.
 
-    A task reads the window of the source that its shard needs; the result does not depend on
-    ``workers`` or on the order of the tasks.
+    A task reads the window of the source that its block needs; the result does not depend on
+    ``workers`` or on the order of the tasks. Blocks that are there with the same ``key`` are taken
+    over. ``strip``: only its blocks.
 
-    Raises InputError if no pixel of the grid gets a value.
+    Raises InputError if no pixel of the whole grid gets a value.
     """
-    shape = target.shape
     step, error = _lattice_step(model, shape)
     scale = _widening(model, shape)
     reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
@@ -509,23 +513,25 @@ def rectify_image(
             bounds += [low, high - low]
         return lattice, bounds
 
-    def run(rows: slice, cols: slice) -> int:
+    def run(rows: slice, cols: slice) -> None:
         found = window(rows, cols)
         if found is None:
-            return 0
+            target.write((rows, cols), key, {}, 0)
+            return
         lattice, (col, width, row, height) = found
         pixels = source.read(col, row, width, height)
         lattice[0] -= col
         lattice[1] -= row
         out = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=np.uint16)
         valid = resample(pixels, lattice, step, scale, out)
-        if valid:
-            target[rows, cols] = out
-        return valid
+        target.write((rows, cols), key, {"image": out}, valid)
 
+    every = blocks(shape, SHARD)
+    part = every if strip is None else strip.of(every)
     # In the order of source rows, so that GDAL's cache serves neighbours in files of strips.
     todo = []
-    for rows, cols in blocks(shape, SHARD):
+    for number in target.missing(part, [key] * len(part), workers):
+        rows, cols = part[number]
         middle = model.inverse((cols.start + cols.stop) / 2, (rows.start + rows.stop) / 2)
         todo.append((float(np.nan_to_num(middle[1])) // SHARD, rows, cols))
     todo.sort(key=lambda item: item[0])
@@ -534,15 +540,17 @@ def rectify_image(
         for i, (_, rows, cols) in enumerate(todo)
     ]
     with BlockProgress(len(tasks), what):
-        counts = dask.compute(*tasks, scheduler="threads", num_workers=workers)
-    valid = int(sum(counts))
+        dask.compute(*tasks, scheduler="threads", num_workers=workers)
+    if strip is not None:
+        return {}
+    valid = int(sum(target.results(every)))
     if valid == 0:
         raise InputError(
             "image has nothing but nodata where the two images overlap",
             file=source.path,
             remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
         )
-    log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / target.size)
+    log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
     return {
         "source": source.path.name,
         "source_nodata": source.nodata,
@@ -578,7 +586,7 @@ def rectify(
     left_sensor: SensorModel,
     right_sensor: SensorModel,
     reference_height: float,
-    epipolar_json: str | Path,
+    epipolar_json: str | Path | None,
     left_store: str | Path,
     right_store: str | Path,
     *,
@@ -586,6 +594,7 @@ def rectify(
     height_range: tuple[float, float] | None = None,
     label_sigma: LabelSigma | None = None,
     provenance: Mapping[str, Any] | None = None,
+    strip: Strip | None = None,
 ) -> EpipolarModel:
     """Fit the epipolar model of an aligned pair and resample both images into Zarr grids.
 
@@ -594,9 +603,14 @@ def rectify(
     ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model and
     ``provenance``. All three products appear when they are whole, or not at all.
 
+    Blocks that an earlier call has left, made of the same images by the same model and code, are
+    taken over (see :mod:`stereotruth.block_store`). ``strip``: make its blocks only,
+    for a later call without it.
+
     Raises InputError for images that cannot be read, do not overlap, are one view, or hold nothing
     but nodata.
     """
+    code = source_digest("rectification")
     with ExitStack() as stack:
         # GDAL's default, 5 % of the machine's memory, can be more than a job may use
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=CACHE_MB))
@@ -610,9 +624,10 @@ def rectify(
             height_range=height_range,
             names=(str(left_image), str(right_image)),
         )
-        folders = [stack.enter_context(building(path)) for path in (left_store, right_store)]
-        for view, source, image, folder in zip(
-            ("left", "right"), (left, right), (model.left_image, model.right_image), folders
+        finished = []
+        for view, source, image, store in (
+            ("left", left, model.left_image, left_store),
+            ("right", right, model.right_image, right_store),
         ):
             layer = Layer(
                 dtype="uint16",
@@ -630,17 +645,36 @@ def rectify(
             }
             if label_sigma is not None and view == "left":
                 attrs["alignment_sigma"] = sigma_nodes(model, label_sigma)
-            arrays = create_grid(
-                folder,
+            grid = stack.enter_context(
+                making(
+                    store,
+                    model.shape,
+                    {"image": layer},
+                    chunk=CHUNK,
+                    shard=SHARD,
+                    shared=strip is not None,
+                )
+            )
+            made_of = {
+                "image": file_sha256(source.path),
+                "size": source.size,
+                "model": image.to_dict(),
+                "code": code,
+            }
+            attrs["resampling"] = rectify_image(
+                source,
+                image,
+                grid,
                 model.shape,
-                {"image": layer},
-                chunk=CHUNK,
-                shard=SHARD,
-                attrs=attrs,
+                key=digest(made_of),
+                workers=workers,
+                what=f"{view} epipolar image",
+                strip=strip,
             )
-            facts = rectify_image(
-                source, image, arrays["image"], workers=workers, what=f"{view} epipolar image"
-            )
-            zarr.open_group(folder, mode="r+").attrs["resampling"] = facts
-        model.save(epipolar_json, provenance)
+            finished.append((grid, store, attrs))
+        if strip is None:
+            for grid, store, attrs in finished:
+                grid.publish(store, blocks(model.shape, SHARD), attrs)
+            if epipolar_json is not None:
+                model.save(epipolar_json, provenance)
     return model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
 from collections.abc import Iterable, Iterator
@@ -20,8 +21,8 @@ log = logging.getLogger("stereotruth")
 def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     """Run one job: log to terminal and file; end with one clear line where the input is at fault.
 
-    ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1;
-    anything else is a defect and keeps its traceback.
+    ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1,
+    and so does a full disk; anything else is a defect and keeps its traceback.
     """
     cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
     path = Path(log_file)
@@ -38,13 +39,31 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     except InputError as error:
         log.error("error: %s", error)
         raise SystemExit(1) from None
-    except Exception:
-        log.exception("unexpected failure")
-        raise
+    except Exception as error:
+        if (full := _disk_full(error)) is None:
+            log.exception("unexpected failure")
+            raise
+        log.error(
+            "error: %s: no space left on the disk. Remedy: make space there, and run again: "
+            "what is done is kept",
+            full.filename or Path.cwd(),
+        )
+        raise SystemExit(1) from None
     finally:
         for handler in handlers:
             log.removeHandler(handler)
             handler.close()
+
+
+def _disk_full(error: BaseException | None) -> OSError | None:
+    """The error of a full disk or quota behind an exception, if that is what it is."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return error
+        if isinstance(error, BaseExceptionGroup):
+            return next(filter(None, map(_disk_full, error.exceptions)), None)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def progress(items: Iterable, total: int, what: str) -> Iterator:

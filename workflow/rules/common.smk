@@ -8,12 +8,14 @@ from snakemake.exceptions import WorkflowError
 
 from stereotruth import sheets
 from stereotruth.errors import InputError
+from stereotruth.locking import FileLock
 from stereotruth.provenance import PACKAGE, file_sha256, source_digest
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
 SCHEMAS = Path(workflow.basedir) / "workflow" / "schemas"
 CONDA = Path(workflow.basedir) / "envs" / "workflow.yaml"
 SYNTHETIC_FOLDER = "data/synthetic"
+VIEWS = ("left", "right")
 
 
 def is_synthetic(scene):
@@ -36,7 +38,8 @@ def read_sheets():
     lidar = {}
     for name, scene in scenes.items():
         sheet = config["scenes"]
-        if not scene.gcps and not config["alignment"]["refine"]:
+        aligned = config["alignment"]["refine"] or name in config["alignment"]["fixed"]
+        if not scene.gcps and not aligned:
             raise InputError(
                 f"scene {name!r} has no GCPs, and alignment.refine is false",
                 file=sheet,
@@ -50,6 +53,14 @@ def read_sheets():
             sheets.require_files(scene, sheet, ["left_image", "right_image", "gcps", "geoid"])
             files = sheets.find_lidar(scene, sheet)
         lidar[name] = sheets.store_names(files)
+    for name, file in config["alignment"]["fixed"].items():
+        if name not in scenes or not Path(file).is_file():
+            raise InputError(
+                f"alignment.fixed: {name}: {file}: "
+                + ("no such file" if name in scenes else "no such scene"),
+                file=config["scenes"],
+                remedy="take a scene of the sheet, and the path of its alignment.json",
+            )
     return cities, scenes, lidar
 
 
@@ -63,6 +74,8 @@ wildcard_constraints:
     city="|".join(CITIES),
     scene="|".join(SCENES),
     view="left|right",
+    side="|_right",
+    strip="[0-9]+-of-[0-9]+",
     lidar="[^/]+",
 
 
@@ -97,6 +110,8 @@ def right_image(wildcards):
 
 def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
+    if given := config["alignment"]["fixed"].get(wildcards.scene):
+        return given
     stage = "refine" if config["alignment"]["refine"] else "align"
     return f"results/{stage}/{wildcards.city}/{wildcards.scene}/alignment.json"
 
@@ -104,7 +119,15 @@ def alignment_of(wildcards):
 def refinements(wildcards):
     """The alignments that a city's labels are made with, where they are not those of rule align."""
     files = [alignment_of(scene) for scene in scenes_of(wildcards.city)]
-    return [file for file in files if not file.startswith("results/align/")]
+    return [file for file in files if file.startswith("results/refine/")]
+
+
+def strips_made(wildcards, file):
+    """The files that tell that the strips of a scene are made; none if one job makes it all."""
+    strips = config["strips"]
+    count = strips if isinstance(strips, int) else strips.get(wildcards.scene, 1)
+    names = [f"{k}-of-{count}" for k in range(count)] if count > 1 else []
+    return expand(file, **wildcards, strip=names)
 
 
 def truth_of_city(city, kind):
@@ -119,6 +142,26 @@ def point_stores(wildcards):
         scene=wildcards.scene,
         lidar=LIDAR[wildcards.scene],
     )
+
+
+RUN_LOCK = FileLock(".snakemake/run.lock")
+
+
+def refuse_second_run():
+    """End this run if another one works in this directory.
+
+    Snakemake's own lock stays when it is killed; this one does not (profiles/default turns the
+    other off).
+    """
+    if not RUN_LOCK.take(Path.cwd(), wait=False):
+        raise WorkflowError(
+            f"{Path.cwd()}: another run is at work here ({RUN_LOCK.holder}). "
+            "Remedy: wait until it ends, or stop it"
+        )
+
+
+onstart:
+    refuse_second_run()
 
 
 def complaints(snakemake_logs):

@@ -1,8 +1,19 @@
+PROJECTION = {
+    "method": config["occlusion"]["method"],
+    "window": config["occlusion"]["window"],
+    "correlation_threshold": config["occlusion"]["correlation_threshold"],
+    "representative": config["project"]["representative"],
+    "edge_margin_px": config["project"]["edge_margin_px"],
+    "min_points": config["project"]["min_points_per_px"],
+}
+
+
 rule project:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
         points=point_stores,
+        strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}.zarr"),
     log:
@@ -17,8 +28,7 @@ rule project:
         runtime=240,
     params:
         view="left",
-        occlusion=config["occlusion"],
-        project={key: v for key, v in config["project"].items() if key != "right_view"},
+        settings=PROJECTION,
         code=source_digest("disparity"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
@@ -27,6 +37,11 @@ rule project:
 
 
 use rule project as project_right with:
+    input:
+        left=rules.rectify.output.left,
+        right=rules.rectify.output.right,
+        points=point_stores,
+        strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_right_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}_right.zarr"),
     log:
@@ -35,8 +50,35 @@ use rule project as project_right with:
         "benchmarks/project_right/{city}/{scene}.tsv"
     params:
         view="right",
-        occlusion=config["occlusion"],
-        project={key: v for key, v in config["project"].items() if key != "right_view"},
+        settings=PROJECTION,
         code=source_digest("disparity"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
+
+
+rule project_strip:
+    input:
+        left=rules.rectify.output.left,
+        right=rules.rectify.output.right,
+        points=point_stores,
+    output:
+        done=temp("results/project/{city}/strips/{scene}{side}_{strip}.json"),
+    log:
+        "logs/project_strip/{city}/{scene}{side}_{strip}.log",
+    benchmark:
+        "benchmarks/project_strip/{city}/{scene}{side}_{strip}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=4000,
+        runtime=120,
+    params:
+        view=lambda w: "right" if w.side else "left",
+        store="results/project/{city}/{scene}{side}.zarr",
+        settings=PROJECTION,
+        code=source_digest("disparity"),
+    message:
+        "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"
+    script:
+        "../scripts/project_strip.py"

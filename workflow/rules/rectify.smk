@@ -3,6 +3,7 @@ rule rectify:
         left=left_image,
         right=right_image,
         alignment=alignment_of,
+        strips=lambda w: strips_made(w, "results/rectify/{city}/{scene}/strips/{strip}.json"),
     output:
         epipolar="results/rectify/{city}/{scene}/epipolar.json",
         left=directory("results/rectify/{city}/{scene}/left.zarr"),
@@ -23,3 +24,29 @@ rule rectify:
         "Making epipolar images of scene {wildcards.scene}"
     script:
         "../scripts/rectify.py"
+
+
+rule rectify_strip:
+    input:
+        left=left_image,
+        right=right_image,
+        alignment=alignment_of,
+    output:
+        done=temp("results/rectify/{city}/{scene}/strips/{strip}.json"),
+    log:
+        "logs/rectify_strip/{city}/{scene}_{strip}.log",
+    benchmark:
+        "benchmarks/rectify_strip/{city}/{scene}_{strip}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
+        code=source_digest("rectification", "alignment"),
+    message:
+        "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"
+    script:
+        "../scripts/rectify_strip.py"

@@ -2,24 +2,20 @@
 
 from stereotruth.disparity import project_scene
 from stereotruth.runlog import job
+from stereotruth.workers import dask_scheduler
 
 if __name__ == "__main__":
-    scene = snakemake.wildcards.scene
-    occlusion, settings = snakemake.params.occlusion, snakemake.params.project
-    with job(snakemake.log[0], f"project {scene}"):
+    scene, address = snakemake.wildcards.scene, snakemake.config["dask"]["scheduler_address"]
+    with job(snakemake.log[0], f"project {scene}"), dask_scheduler(address) as scheduler:
         project_scene(
             snakemake.input.left,
             snakemake.input.right,
             snakemake.input.points,
             snakemake.output.disparity,
             view=snakemake.params.view,
-            method=occlusion["method"],
-            window=occlusion["window"],
-            correlation_threshold=occlusion["correlation_threshold"],
-            representative=settings["representative"],
-            edge_margin_px=settings["edge_margin_px"],
-            min_points=settings["min_points_per_px"],
+            **snakemake.params.settings,
             workers=snakemake.threads,
+            scheduler=scheduler,
             code=snakemake.params.code,
             scene=scene,
         )

@@ -1,0 +1,226 @@
+"""Grids in the making, block by block: what a killed job has done, and what an edit leaves valid.
+
+A grid store is made in a folder beside its final place (``.<name>.work``), which is no output of
+any rule, so that it outlives jobs, killed or not:
+
+===================  ==============================================================================
+``store/``           the arrays, without attributes of the scene
+``done/<i>-<j>``     record of block (i, j), one shard of each array: ``key``, a digest of all that
+                     its content follows from; SHA-256 of its files; what its maker returned
+``layout.json``      shape, arrays and chunks
+``lock``             held by the job at work here, shared by the parts of one scene
+===================  ==============================================================================
+
+A record is written after the files of its block, in one piece. A later job takes over the blocks
+whose records have the key that it would give them and whose files are as recorded, and makes the
+others: after a kill those that were in flight, after one more LiDAR file those that it touches.
+:meth:`BlockStore.publish` puts hard links to all files (copies where there are no links) into the
+final place, in one step. Whatever was taken over, the published bytes are those of a fresh run.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import zarr
+from numpy.typing import NDArray
+
+from .grid_store import Layer, building, create_grid, replacing
+from .locking import FileLock
+from .provenance import digest, file_sha256
+
+log = logging.getLogger("stereotruth")
+
+Block = tuple[slice, slice]
+FORMAT = 1  # of records
+
+
+def link(source: Path, target: Path) -> None:
+    """Hard link, or a copy where the file system has none."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+@dataclass(frozen=True)
+class BlockStore:
+    """The grid in the making at ``folder``; plain values, so that it can go to other processes."""
+
+    folder: Path
+    layers: tuple[str, ...]
+    shard: int
+
+    @property
+    def store(self) -> Path:
+        """The Zarr store with the arrays."""
+        return self.folder / "store"
+
+    def _place(self, block: Block) -> tuple[int, int]:
+        return block[0].start // self.shard, block[1].start // self.shard
+
+    def _record(self, block: Block) -> Path:
+        i, j = self._place(block)
+        return self.folder / "done" / f"{i}-{j}.json"
+
+    def _files(self, block: Block) -> dict[str, Path]:
+        i, j = self._place(block)
+        return {name: self.store / name / "c" / str(i) / str(j) for name in self.layers}
+
+    def write(
+        self, block: Block, key: str, arrays: Mapping[str, NDArray[Any]], result: Any
+    ) -> None:
+        """Write a block, one value per pixel of its ``arrays``, and its record.
+
+        Arrays that are not given hold their fill values. ``result`` is JSON-ready.
+        """
+        group = zarr.open_group(self.store, mode="r+")
+        for name, values in arrays.items():
+            group[name][block] = values
+        files = {
+            name: file_sha256(path) for name, path in self._files(block).items() if path.exists()
+        }
+        record = {"format": FORMAT, "key": key, "sha256": files, "result": result}
+        with replacing(self._record(block)) as scratch:
+            scratch.write_text(json.dumps(record))
+
+    def _valid(self, block: Block, key: str) -> dict[str, Any] | None:
+        """The record of a block that is there as ``key`` wants it, else None."""
+        try:
+            record = json.loads(self._record(block).read_text())
+        except (FileNotFoundError, json.JSONDecodeError):
+            return None
+        if record["key"] != key or record["format"] != FORMAT:
+            return None
+        for name, path in self._files(block).items():
+            wanted = record["sha256"].get(name)
+            if (file_sha256(path) if path.exists() else None) != wanted:
+                return None
+        return record
+
+    def missing(self, blocks: Sequence[Block], keys: Sequence[str], workers: int) -> list[int]:
+        """Which of the blocks, by number, are to be made; what is there of them is removed.
+
+        ``keys``: what the content of each block follows from, as given to :meth:`write`.
+        """
+
+        def check(block: Block, key: str) -> bool:
+            if self._valid(block, key) is not None:
+                return False
+            self._record(block).unlink(missing_ok=True)
+            for path in self._files(block).values():
+                path.unlink(missing_ok=True)
+            return True
+
+        with ThreadPoolExecutor(workers) as pool:
+            wanted = list(pool.map(check, blocks, keys))
+        todo = [number for number, make in enumerate(wanted) if make]
+        if len(todo) < len(blocks):
+            log.info("%d of %d blocks are there from before", len(blocks) - len(todo), len(blocks))
+        return todo
+
+    def results(self, blocks: Iterable[Block]) -> list[Any]:
+        """What the makers of finished blocks gave as ``result``."""
+        return [json.loads(self._record(block).read_text())["result"] for block in blocks]
+
+    def publish(self, path: str | Path, blocks: Iterable[Block], attrs: Mapping[str, Any]) -> None:
+        """Put the whole grid to ``path``, with ``attrs`` and the digest ``content`` of its pixels.
+
+        The pixels of two stores are the same if ``content`` is.
+        """
+        blocks = list(blocks)
+        records = [json.loads(self._record(block).read_text()) for block in blocks]
+        content = {
+            str(file.relative_to(self.store)): record["sha256"].get(name)
+            for block, record in zip(blocks, records)
+            for name, file in self._files(block).items()
+        }
+        layout = json.loads((self.folder / "layout.json").read_text())
+        with building(path) as unfinished:
+            shutil.copytree(self.store, unfinished, ignore=_only_metadata(self))
+            for block, record in zip(blocks, records):
+                for name, file in self._files(block).items():
+                    if name in record["sha256"]:
+                        link(file, unfinished / file.relative_to(self.store))
+            group = zarr.open_group(unfinished, mode="r+")
+            group.attrs.update({**attrs, "content": digest({"layout": layout, "blocks": content})})
+
+
+def _only_metadata(store: BlockStore) -> Any:
+    grids = {str(store.store / name) for name in store.layers}
+    return lambda folder, names: ["c"] if folder in grids else []
+
+
+@contextmanager
+def making(
+    path: str | Path,
+    shape: tuple[int, int],
+    layers: Mapping[str, Layer],
+    *,
+    chunk: int,
+    shard: int,
+    shared: bool = False,
+) -> Iterator[BlockStore]:
+    """Work on the grid store that is to be at ``path``; see :func:`grid_store.create_grid`.
+
+    Waits while another process works on it. ``shared``: this one makes a part of the blocks only,
+    while others may make other parts.
+    """
+    path = Path(path)
+    folder = path.with_name(f".{path.name}.work")
+    found = BlockStore(folder, tuple(layers), shard)
+    layout = {
+        "format": FORMAT,
+        "shape": list(shape),
+        "chunk": chunk,
+        "shard": shard,
+        "layers": {name: asdict(layer) for name, layer in layers.items()},
+    }
+    layout = json.loads(json.dumps(layout, default=str))
+    lock = FileLock(folder / "lock")
+    try:
+        lock.take(path, shared=shared)
+        while not _has_layout(folder, layout):
+            lock.take(path)
+            if not _has_layout(folder, layout):
+                _lay_out(found, shape, layers, chunk, layout)
+            lock.take(path, shared=shared)
+        if not shared:  # what a killed writer left of its last file
+            for rest in found.store.rglob("*.partial"):
+                rest.unlink()
+        yield found
+    finally:
+        lock.close()
+
+
+def _has_layout(folder: Path, layout: Mapping[str, Any]) -> bool:
+    try:
+        return json.loads((folder / "layout.json").read_text()) == layout
+    except (FileNotFoundError, json.JSONDecodeError):
+        return False
+
+
+def _lay_out(
+    store: BlockStore,
+    shape: tuple[int, int],
+    layers: Mapping[str, Layer],
+    chunk: int,
+    layout: Mapping[str, Any],
+) -> None:
+    """Empty the folder and make empty arrays in it."""
+    (store.folder / "layout.json").unlink(missing_ok=True)
+    for old in (store.store, store.folder / "done"):
+        shutil.rmtree(old, ignore_errors=True)
+    create_grid(store.store, shape, layers, chunk=chunk, shard=store.shard, attrs={})
+    with replacing(store.folder / "layout.json") as scratch:
+        scratch.write_text(json.dumps(layout))

@@ -1,0 +1,22 @@
+"""One strip of a scene's points to the blocks of its disparity grid."""
+
+from stereotruth.disparity import project_scene
+from stereotruth.grid_store import Strip
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
+    with job(snakemake.log[0], f"project {scene} {strip}"):
+        project_scene(
+            snakemake.input.left,
+            snakemake.input.right,
+            snakemake.input.points,
+            snakemake.params.store,
+            view=snakemake.params.view,
+            **snakemake.params.settings,
+            workers=snakemake.threads,
+            code=snakemake.params.code,
+            scene=scene,
+            strip=strip,
+        )
+        strip.tell(snakemake.output.done)
