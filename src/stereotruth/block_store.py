@@ -5,14 +5,12 @@ any rule, so that it outlives jobs, killed or not:
 
 ===================  ==============================================================================
 ``store/``           the arrays, without attributes of the scene
-``done/<i>-<j>``     record of block (i, j), one shard of each array: ``key``, a digest of all that
-                     its content follows from; SHA-256 of its files; what its maker returned
+``done/``            record of each block, one shard of each array; see :mod:`stereotruth.ledger`
 ``layout.json``      shape, arrays and chunks
 ``lock``             held by the job at work here, shared by the parts of one scene
 ===================  ==============================================================================
 
-A record is written after the files of its block, in one piece. A later job takes over the blocks
-whose records have the key that it would give them and whose files are as recorded, and makes the
+A later job takes over the blocks whose records have the key that it would give them, and makes the
 others: after a kill those that were in flight, after one more LiDAR file those that it touches.
 :meth:`BlockStore.publish` puts hard links to all files (copies where there are no links) into the
 final place, in one step. Whatever was taken over, the published bytes are those of a fresh run.
@@ -22,7 +20,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,22 +32,14 @@ import zarr
 from numpy.typing import NDArray
 
 from .grid_store import Layer, building, create_grid, replacing
+from .ledger import Ledger, link
 from .locking import FileLock
-from .provenance import digest, file_sha256
+from .provenance import digest
 
 log = logging.getLogger("stereotruth")
 
 Block = tuple[slice, slice]
-FORMAT = 1  # of records
-
-
-def link(source: Path, target: Path) -> None:
-    """Hard link, or a copy where the file system has none."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+FORMAT = 1  # of the layout
 
 
 @dataclass(frozen=True)
@@ -66,16 +55,16 @@ class BlockStore:
         """The Zarr store with the arrays."""
         return self.folder / "store"
 
-    def _place(self, block: Block) -> tuple[int, int]:
-        return block[0].start // self.shard, block[1].start // self.shard
+    @property
+    def _done(self) -> Ledger:
+        return Ledger(self.folder / "done")
 
-    def _record(self, block: Block) -> Path:
-        i, j = self._place(block)
-        return self.folder / "done" / f"{i}-{j}.json"
+    def _name(self, block: Block) -> str:
+        return f"{block[0].start // self.shard}-{block[1].start // self.shard}"
 
     def _files(self, block: Block) -> dict[str, Path]:
-        i, j = self._place(block)
-        return {name: self.store / name / "c" / str(i) / str(j) for name in self.layers}
+        i, j = self._name(block).split("-")
+        return {name: self.store / name / "c" / i / j for name in self.layers}
 
     def write(
         self, block: Block, key: str, arrays: Mapping[str, NDArray[Any]], result: Any
@@ -87,26 +76,7 @@ class BlockStore:
         group = zarr.open_group(self.store, mode="r+")
         for name, values in arrays.items():
             group[name][block] = values
-        files = {
-            name: file_sha256(path) for name, path in self._files(block).items() if path.exists()
-        }
-        record = {"format": FORMAT, "key": key, "sha256": files, "result": result}
-        with replacing(self._record(block)) as scratch:
-            scratch.write_text(json.dumps(record))
-
-    def _valid(self, block: Block, key: str) -> dict[str, Any] | None:
-        """The record of a block that is there as ``key`` wants it, else None."""
-        try:
-            record = json.loads(self._record(block).read_text())
-        except (FileNotFoundError, json.JSONDecodeError):
-            return None
-        if record["key"] != key or record["format"] != FORMAT:
-            return None
-        for name, path in self._files(block).items():
-            wanted = record["sha256"].get(name)
-            if (file_sha256(path) if path.exists() else None) != wanted:
-                return None
-        return record
+        self._done.put(self._name(block), key, self._files(block), result)
 
     def missing(self, blocks: Sequence[Block], keys: Sequence[str], workers: int) -> list[int]:
         """Which of the blocks, by number, are to be made; what is there of them is removed.
@@ -114,44 +84,35 @@ class BlockStore:
         ``keys``: what the content of each block follows from, as given to :meth:`write`.
         """
 
-        def check(block: Block, key: str) -> bool:
-            if self._valid(block, key) is not None:
-                return False
-            self._record(block).unlink(missing_ok=True)
-            for path in self._files(block).values():
-                path.unlink(missing_ok=True)
-            return True
+        def there(block: Block, key: str) -> bool:
+            return self._done.find(self._name(block), key, self._files(block)) is not None
 
         with ThreadPoolExecutor(workers) as pool:
-            wanted = list(pool.map(check, blocks, keys))
-        todo = [number for number, make in enumerate(wanted) if make]
-        if len(todo) < len(blocks):
-            log.info("%d of %d blocks are there from before", len(blocks) - len(todo), len(blocks))
-        return todo
+            found = list(pool.map(there, blocks, keys))
+        if any(found):
+            log.info("%d of %d blocks are there from before", sum(found), len(found))
+        return [number for number, done in enumerate(found) if not done]
 
     def results(self, blocks: Iterable[Block]) -> list[Any]:
         """What the makers of finished blocks gave as ``result``."""
-        return [json.loads(self._record(block).read_text())["result"] for block in blocks]
+        return [self._done.get(self._name(block)).result for block in blocks]
 
     def publish(self, path: str | Path, blocks: Iterable[Block], attrs: Mapping[str, Any]) -> None:
         """Put the whole grid to ``path``, with ``attrs`` and the digest ``content`` of its pixels.
 
         The pixels of two stores are the same if ``content`` is.
         """
-        blocks = list(blocks)
-        records = [json.loads(self._record(block).read_text()) for block in blocks]
-        content = {
-            str(file.relative_to(self.store)): record["sha256"].get(name)
-            for block, record in zip(blocks, records)
-            for name, file in self._files(block).items()
-        }
+        content, files = {}, []
+        for block in blocks:
+            sums = self._done.get(self._name(block)).sha256
+            for name, file in self._files(block).items():
+                content[str(file.relative_to(self.store))] = sums.get(name)
+                files += [file] if name in sums else []
         layout = json.loads((self.folder / "layout.json").read_text())
         with building(path) as unfinished:
             shutil.copytree(self.store, unfinished, ignore=_only_metadata(self))
-            for block, record in zip(blocks, records):
-                for name, file in self._files(block).items():
-                    if name in record["sha256"]:
-                        link(file, unfinished / file.relative_to(self.store))
+            for file in files:
+                link(file, unfinished / file.relative_to(self.store))
             group = zarr.open_group(unfinished, mode="r+")
             group.attrs.update({**attrs, "content": digest({"layout": layout, "blocks": content})})
 

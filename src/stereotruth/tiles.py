@@ -21,6 +21,7 @@ tile) is that which gives most labelled pairs, then most pairs, then most labell
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import logging
 import math
@@ -29,8 +30,8 @@ import shutil
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from contextlib import ExitStack, nullcontext
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,8 +51,10 @@ from .evaluation.statistics import ErrorSum
 from .evaluation.warping import CorrelationSum, agreement
 from .gates import NO_LIMITS, Limits, flag, missed
 from .grid_store import replacing, require_complete
+from .ledger import Ledger, link
+from .locking import exclusive
 from .orientation import orientation, save, sensor_record
-from .provenance import describe, digest, file_sha256
+from .provenance import describe, digest, file_sha256, source_digest
 from .runlog import progress
 from .splits import NONE, Place, scaled_counts, split_tiles
 
@@ -330,6 +333,21 @@ class _Checks:
         """By names of the manifest."""
         return self.matches.figures() | {"warp_correlation": _finite(self.warping.coefficient)}
 
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready, to the last bit."""
+        matches = {f.name: getattr(self.matches, f.name).tolist() for f in fields(self.matches)}
+        return {"kind": self.kind, "matches": matches, "warping": asdict(self.warping)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> _Checks:
+        """The inverse of :meth:`to_dict`."""
+        types = {"surface_class": np.uint8}
+        matches = {
+            name: np.array(column, dtype=types.get(name, np.float64))
+            for name, column in values["matches"].items()
+        }
+        return cls(values["kind"], TileMatches(**matches), CorrelationSum(**values["warping"]))
+
 
 @dataclass
 class _SceneChecks:
@@ -423,85 +441,190 @@ def round_disparity(disparity: NDArray[np.float64], dtype: str) -> NDArray[np.fl
     return disparity.astype(dtype).astype(np.float32)
 
 
-def _write_tile(
-    folder: Path,
-    source: _Source,
-    window: Window,
-    number: int,
-    *,
-    city: str,
-    prefix: str,
-    size: int,
-    dtype: str,
-    nodata: float,
-    building_share: float,
-    limits: Limits,
-    provenance: Mapping[str, Any],
-) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
-    """Write one tile's files; its manifest row (without split), ring on the ground, and checks."""
-    rows = slice(window.row0, window.row0 + size)
-    here = (rows, slice(window.col0, window.col0 + size))
-    start = window.col0 - window.offset
-    left, right = source.left[here], source.right[rows, start : start + size]
-    disparity = source.disparity[here].astype(np.float64) - window.offset
-    status, height = source.status[here], source.height[here]
-    known = np.isfinite(disparity)
-    stored = round_disparity(disparity, dtype)
-    name = f"{prefix}_{number}"
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """How the tiles of a city are cut and written."""
+
+    city: str
+    prefix: str
+    size: int
+    dtype: str
+    nodata: float
+    building_share: float
+    limits: Limits
+    code: str
+    work: Path  # where the files of finished tiles wait, with the ledger
+    provenance: Mapping[str, Any]
+
+    @property
+    def ledger(self) -> Ledger:
+        """Records of the tiles whose files are there."""
+        return Ledger(self.work / "done")
+
+
+@dataclass(frozen=True, eq=False)
+class _Crop:
+    """The pixels of a tile, and what they are called."""
+
+    left: NDArray[np.uint16]
+    right: NDArray[np.uint16]
+    disparity: NDArray[np.float64]  # of the pair, NaN where there is none
+    stored: NDArray[np.float32]  # the same as the file has it
+    status: NDArray[np.uint8]
+    of_right: NDArray[np.float32] | None
+    status_of_right: NDArray[np.uint8] | None
+
+    @classmethod
+    def of(cls, source: _Source, window: Window, cut: _Cut) -> _Crop:
+        rows, start = slice(window.row0, window.row0 + cut.size), window.col0 - window.offset
+        here = (rows, slice(window.col0, window.col0 + cut.size))
+        there = (rows, slice(start, start + cut.size))
+        disparity = source.disparity[here].astype(np.float64) - window.offset
+        of_right = status_of_right = None
+        if window.labelled and source.of_right is not None:
+            values = source.of_right["disparity"][there].astype(np.float64) - window.offset
+            of_right = round_disparity(values, cut.dtype)
+            status_of_right = source.of_right["status"][there]
+        return cls(
+            left=source.left[here],
+            right=source.right[there],
+            disparity=disparity,
+            stored=round_disparity(disparity, cut.dtype),
+            status=source.status[here],
+            of_right=of_right,
+            status_of_right=status_of_right,
+        )
+
+    def arrays(self) -> list[NDArray[Any]]:
+        """All that the tile's files but the orientation follow from."""
+        found = (getattr(self, f.name) for f in fields(self))
+        return [np.ascontiguousarray(array) for array in found if array is not None]
+
+
+def _names(source: _Source, window: Window, number: int, prefix: str) -> dict[str, str]:
+    """Paths of a tile's files in the city's folder, by kind."""
     group = "" if window.labelled else "unlabelled/"
-    files = {
+    names = {
         "left": f"{group}left/{prefix}_left_{number}.tiff",
         "right": f"{group}right/{prefix}_right_{number}.tiff",
-        "orientation": f"orientation/{name}.json",
+        "orientation": f"orientation/{prefix}_{number}.json",
     }
-    write_tiff(folder / files["left"], left, nodata=0)
-    write_tiff(folder / files["right"], right, nodata=0)
-    checks = None
     if window.labelled:
-        checks = _check(source, here, left, right, known, stored, building_share)
-        files["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
-        files["status"] = f"status/{prefix}_status_{number}.tiff"
-        meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
-        options = {"nodata": nodata, "half": dtype == "float16", "tile": name}
-        _write_labels(folder / files["disp"], np.where(known, stored, np.nan), **options)
-        write_tiff(folder / files["status"], status, description=meanings)
+        names["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
+        names["status"] = f"status/{prefix}_status_{number}.tiff"
         if source.of_right is not None:
-            there = (rows, slice(start, start + size))
-            of_right = source.of_right["disparity"][there].astype(np.float64) - window.offset
-            files["disp_right"] = f"disp_right/{prefix}_disparity_right_{number}.tiff"
-            files["status_right"] = f"status_right/{prefix}_status_right_{number}.tiff"
-            _write_labels(folder / files["disp_right"], round_disparity(of_right, dtype), **options)
-            write_tiff(
-                folder / files["status_right"],
-                source.of_right["status"][there],
-                description=meanings,
-            )
+            names["disp_right"] = f"disp_right/{prefix}_disparity_right_{number}.tiff"
+            names["status_right"] = f"status_right/{prefix}_status_right_{number}.tiff"
+    return names
+
+
+def _write_images(
+    paths: Mapping[str, Path], source: _Source, window: Window, crop: _Crop, cut: _Cut
+) -> None:
+    """Write a tile's TIFF files."""
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_tiff(paths["left"], crop.left, nodata=0)
+    write_tiff(paths["right"], crop.right, nodata=0)
+    if not window.labelled:
+        return
+    meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
+    options = {"nodata": cut.nodata, "half": cut.dtype == "float16"}
+    known = np.isfinite(crop.disparity)
+    _write_labels(paths["disp"], np.where(known, crop.stored, np.nan), **options)
+    write_tiff(paths["status"], crop.status, description=meanings)
+    if crop.of_right is not None and crop.status_of_right is not None:
+        _write_labels(paths["disp_right"], crop.of_right, **options)
+        write_tiff(paths["status_right"], crop.status_of_right, description=meanings)
+
+
+def _finished(
+    source: _Source, window: Window, names: Mapping[str, str], crop: _Crop, cut: _Cut
+) -> tuple[dict[str, str], _Checks | None]:
+    """Write a tile's TIFF files and check it, or take it over; their checksums, and the checks.
+
+    A tile is taken over if its pixels, what its checks need, names, settings and code are the same.
+    """
+    here = (
+        slice(window.row0, window.row0 + cut.size),
+        slice(window.col0, window.col0 + cut.size),
+    )
+    surface_class = np.zeros(crop.left.shape, np.uint8)
+    if source.surface_class is not None:
+        surface_class = np.asarray(source.surface_class[here])
+    kind = ""
+    if window.labelled:
+        kind = tile_class(surface_class, source.height, here, cut.building_share)
+    pixels = hashlib.sha256()
+    for array in (*crop.arrays(), surface_class):
+        pixels.update(array)
+    files = {name: path for name, path in names.items() if name != "orientation"}
+    paths = {name: cut.work / path for name, path in files.items()}
+    made_of = {
+        "pixels": pixels.hexdigest(),
+        "files": files,
+        "flags": [[int(value), meaning] for value, meaning in source.flags.items()],
+        "settings": [cut.dtype, cut.nodata, kind],
+        "code": cut.code,
+    }
+    key, tile = digest(made_of), f"{cut.prefix}_{names['left'].rpartition('_')[2][:-5]}"
+    piece = cut.ledger.find(tile, key, paths)
+    if piece is None:
+        _write_images(paths, source, window, crop, cut)
+        checks = None
+        if window.labelled:
+            checks = _check(crop, surface_class, kind)
+        piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
+    found = piece.result
+    return dict(piece.sha256), None if found is None else _Checks.from_dict(found)
+
+
+def _write_tile(
+    folder: Path, source: _Source, window: Window, number: int, cut: _Cut
+) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
+    """Put a tile into ``folder``: manifest row (without split), ring on the ground, checks."""
+    name = f"{cut.prefix}_{number}"
+    crop = _Crop.of(source, window, cut)
+    known, disparity = np.isfinite(crop.disparity), crop.disparity
+    if any((v == cut.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
+        raise InputError(
+            f"tile {name} has a true disparity of {cut.nodata:g} px, the value for nodata",
+            remedy="set tiles.nodata to a value that no disparity takes",
+        )
+    files = _names(source, window, number, cut.prefix)
+    sums, checks = _finished(source, window, files, crop, cut)
+    for kind in sums:
+        link(cut.work / files[kind], folder / files[kind])
+    height = source.height[
+        window.row0 : window.row0 + cut.size, window.col0 : window.col0 + cut.size
+    ]
     record = orientation(
         source.model,
         source.sensors,
         row0=window.row0,
         col0=window.col0,
-        size=size,
+        size=cut.size,
         offset=window.offset,
         height=height,
-        disparity=np.where(known, stored, np.nan),
+        disparity=np.where(known, crop.stored, np.nan),
     )
-    head = {"tile": name, "city": city, "scene": source.scene, "files": files}
-    save(folder / files["orientation"], head | record | {"provenance": provenance})
+    head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
+    sums["orientation"] = file_sha256(folder / files["orientation"])
 
     ring = np.array(record["footprint"]["coordinates"][0][:-1])
-    match = np.arange(size) - np.where(known, disparity, np.nan)
-    inside = (match >= -0.5) & (match <= size - 0.5)
-    values = stored[known].astype(np.float64)
+    match = np.arange(cut.size) - disparity
+    inside = (match >= -0.5) & (match <= cut.size - 0.5)
+    values = crop.stored[known].astype(np.float64)
     lon, lat = ring.mean(axis=0)
     row = {
         "tile": name,
         "number": number,
-        "city": city,
+        "city": cut.city,
         "scene": source.scene,
         "row0": window.row0,
         "col0": window.col0,
-        "size": size,
+        "size": cut.size,
         "right_offset_px": window.offset,
         "complete": "yes" if window.labelled else "no",
         "split": NONE,
@@ -513,56 +636,37 @@ def _write_tile(
         "disparity_rounding_px": (
             f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
         ),
-        "disparity_nodata": f"{nodata:g}",
+        "disparity_nodata": f"{cut.nodata:g}",
         "lon": f"{lon:.7f}",
         "lat": f"{lat:.7f}",
-        **_check_cells(checks, limits),
+        **_check_cells(checks, cut.limits),
     }
     for value, meaning in source.flags.items():
-        row[f"count_{meaning}"] = int((status == value).sum())
+        row[f"count_{meaning}"] = int((crop.status == value).sum())
     for kind in (*FILES, *(RIGHT_FILES if source.of_right is not None else ())):
         row[kind] = files.get(kind, "")
-        row[f"{kind}_sha256"] = file_sha256(folder / files[kind]) if kind in files else ""
+        row[f"{kind}_sha256"] = sums.get(kind, "")
     return row, ring, checks
 
 
-def _write_labels(
-    path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool, tile: str
-) -> None:
+def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:
     """Disparities (px, NaN where there is none) as a TIFF."""
-    known = np.isfinite(disparity)
-    if (disparity[known] == nodata).any():
-        raise InputError(
-            f"tile {tile} has a true disparity of {nodata:g} px, the value for nodata",
-            remedy="set tiles.nodata to a value that no disparity takes",
-        )
     write_tiff(
         path,
-        np.where(known, disparity, np.float32(nodata)),
+        np.where(np.isfinite(disparity), disparity, np.float32(nodata)),
         nodata=nodata,
         half=half,
         description="disparity in px, x_left - x_right of this pair",
     )
 
 
-def _check(
-    source: _Source,
-    here: tuple[slice, slice],
-    left: NDArray[np.uint16],
-    right: NDArray[np.uint16],
-    known: NDArray[np.bool_],
-    stored: NDArray[np.float32],
-    building_share: float,
-) -> _Checks:
+def _check(crop: _Crop, surface_class: NDArray[np.uint8], kind: str) -> _Checks:
     """Hold the labels of a tile, as stored, against its images."""
-    disparity = np.where(known, stored.astype(np.float64), np.nan)
-    if source.surface_class is None:
-        surface_class = np.zeros(left.shape, np.uint8)
-    else:
-        surface_class = np.asarray(source.surface_class[here])
+    left, right = crop.left, crop.right
+    disparity = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
     x = np.arange(left.shape[1])[None, :] - disparity
     return _Checks(
-        kind=tile_class(surface_class, source.height, here, building_share),
+        kind=kind,
         matches=match_tile(left, right, disparity, surface_class),
         warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
     )
@@ -617,6 +721,7 @@ def export_city(
     coverage: str | Path | None = None,
     contact_sheet: str | Path | None = None,
     matches: str | Path | None = None,
+    work: str | Path | None = None,
 ) -> dict[str, Any]:
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
@@ -626,7 +731,8 @@ def export_city(
     scaled to the tiles there are. ``quality``: the limits beyond which tiles and scenes are
     flagged. ``building_share``: share of building pixels from which on a tile is of that class.
     ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
-    matches. Returns a summary, see :func:`summary_lines`.
+    matches. ``work``: folder in which finished tiles wait for a later call that would make the
+    same, by default a hidden one beside ``out_dir``. Returns a summary, see :func:`summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
@@ -666,9 +772,23 @@ def export_city(
     inputs = {name: value for source in sources for name, value in source.inputs.items()}
     provenance = describe(inputs, parameters, code)
 
+    cut = _Cut(
+        city=city,
+        prefix=prefix,
+        size=size,
+        dtype=disparity_dtype,
+        nodata=nodata,
+        building_share=building_share,
+        limits=quality,
+        code=code or source_digest("tiles"),
+        work=out.with_name(f".{out.name}.work") if work is None else Path(work),
+        provenance=provenance,
+    )
     scratch = out.with_name(out.name + ".partial")
-    shutil.rmtree(scratch, ignore_errors=True)
-    try:
+    with ExitStack() as stack:
+        stack.enter_context(exclusive(out))
+        shutil.rmtree(scratch, ignore_errors=True)
+        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
         kinds = {"left", "right", "disp", "status", "orientation"}
         if any(source.of_right is not None for source in sources):
             kinds |= set(RIGHT_FILES)
@@ -677,20 +797,8 @@ def export_city(
         for kind in kinds:
             (scratch / kind).mkdir(parents=True)
 
-        def work(k: int) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
-            return _write_tile(
-                scratch,
-                *chosen[k],
-                k,
-                city=city,
-                prefix=prefix,
-                size=size,
-                dtype=disparity_dtype,
-                nodata=nodata,
-                building_share=building_share,
-                limits=quality,
-                provenance=provenance,
-            )
+        def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], _Checks | None]:
+            return _write_tile(scratch, *chosen[k], k, cut)
 
         written, scene_checks = [], {s.scene: _SceneChecks(s.gcp_rms) for s in sources}
         sink = nullcontext(Path(os.devnull)) if matches is None else replacing(matches)
@@ -704,7 +812,7 @@ def export_city(
             writer = csv.DictWriter(stream, MATCH_COLUMNS, lineterminator="\n")
             writer.writeheader()
             numbers = range(len(chosen))
-            done = progress(pool.map(work, numbers), len(chosen), f"{city}: tiles")
+            done = progress(pool.map(write, numbers), len(chosen), f"{city}: tiles")
             for row, ring, checks in done:
                 written.append((row, ring))
                 if checks is not None:
@@ -728,10 +836,19 @@ def export_city(
             _draw_contact_sheet(Path(contact_sheet), city, rows, scratch, nodata)
         shutil.rmtree(out, ignore_errors=True)
         scratch.rename(out)
-    except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise
+        _forget_others(cut, rows)
     return summary
+
+
+def _forget_others(cut: _Cut, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Remove what earlier calls have left for tiles that are no more."""
+    cut.ledger.keep_only({row["tile"] for row in rows})
+    kept = {
+        cut.work / row[kind] for row in rows for kind in (*FILES, *RIGHT_FILES) if row.get(kind)
+    }
+    for file in cut.work.rglob("*.tiff"):
+        if file not in kept:
+            file.unlink()
 
 
 def _split(

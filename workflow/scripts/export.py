@@ -35,6 +35,7 @@ if __name__ == "__main__":
             coverage=snakemake.output.coverage,
             contact_sheet=snakemake.output.contact_sheet,
             matches=snakemake.output.matches,
+            work=Path(snakemake.output.summary).with_name(".tiles.work"),
         )
         summary["lines"] = summary_lines(summary, snakemake.output.tiles)
         Path(snakemake.output.summary).write_text(json.dumps(summary, indent=2) + "\n")

@@ -1,0 +1,153 @@
+"""Runs of the workflow that are killed at random moments and carried on.
+
+    python -m tests.workflow.killing --kills 20 data/synthetic config/config.yaml tiles/Qichun
+
+makes the target twice in scratch folders, once undisturbed and once with 20 kills, and holds the
+products against each other. A kill takes the worker, snakemake alone, or all processes of the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+VICTIMS = ("worker", "snakemake", "tree")
+PRODUCTS = ("results/rectify", "results/project", "results/export", "tiles")
+
+
+def family(pid: int) -> tuple[list[int], list[int]]:
+    """All processes below one, and those of them that have none below themselves (Linux)."""
+    parents: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            parents.setdefault(parent, []).append(int(entry.name))
+    found, todo = [], [pid]
+    while todo:
+        below = parents.get(todo.pop(), [])
+        found += below
+        todo += below
+    return found, [process for process in found if process not in parents]
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen:
+    """Snakemake in a session of its own; what it says goes to run.log."""
+    with (folder / "run.log").open("a") as stream:
+        return subprocess.Popen(
+            [sys.executable, "-m", "snakemake", "--cores", "2", *arguments],
+            cwd=folder,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def kill(run: subprocess.Popen, victim: str) -> None:
+    """SIGKILL to one of VICTIMS; of a killed worker's run, wait for the end."""
+    below, workers = family(run.pid)
+    chosen = {"worker": workers[-1:], "snakemake": [run.pid], "tree": [run.pid, *below]}[victim]
+    for pid in chosen:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    run.wait()
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Checksum of each product's files, without what Snakemake and the blocks' records add."""
+    found = {}
+    for product in PRODUCTS:
+        for file in sorted((folder / product).rglob("*")):
+            name = str(file.relative_to(folder))
+            hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+            if file.is_file() and not hidden:
+                found[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return found
+
+
+def records(folder: Path) -> dict[Path, tuple[str, int]]:
+    """Content and time of writing of the records of all finished blocks."""
+    found = {}
+    for file in (folder / "results").rglob(".*.work/done/*.json"):
+        try:
+            found[file] = file.read_text(), file.stat().st_mtime_ns
+        except FileNotFoundError:
+            continue
+    return found
+
+
+def disturb(
+    folder: Path, arguments: list[str], kills: int, seed: int, longest: float
+) -> Iterator[str]:
+    """Kill runs after random times up to ``longest`` s, then let one end; tells each step.
+
+    Raises AssertionError if a block that was done is made again, or the last run fails.
+    """
+    rng = random.Random(seed)
+    done: dict[Path, tuple[str, int]] = {}
+    for number in range(kills):
+        run = start(folder, *arguments)
+        wait = rng.uniform(0.5, longest)
+        victim = rng.choice(VICTIMS)
+        try:
+            run.wait(wait)
+            yield f"kill {number + 1}: the run had ended before"
+        except subprocess.TimeoutExpired:
+            kill(run, victim)
+            yield f"kill {number + 1}: {victim} after {wait:.1f} s, {len(records(folder))} blocks"
+        now = records(folder)
+        for file, (text, written) in done.items():
+            if file in now and now[file][0] == text:
+                assert now[file][1] == written, f"{file} was made again"
+        done = now
+    run = start(folder, *arguments)
+    assert run.wait() == 0, (folder / "run.log").read_text()[-4000:]
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--longest", type=float, default=25.0, help="s until a kill, at most")
+    parser.add_argument("data", type=Path, help="folder of the input, as data/synthetic")
+    parser.add_argument("config", type=Path)
+    parser.add_argument("target")
+    given = parser.parse_args()
+    found = []
+    with tempfile.TemporaryDirectory(dir=given.data.parent) as scratch:
+        for kills in (0, given.kills):
+            folder = Path(scratch) / f"{kills}-kills"
+            for name in ("Snakefile", "workflow", "profiles", "envs", "config"):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).symlink_to(ROOT / name)
+            (folder / given.data).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copytree(given.data, folder / given.data, symlinks=True)
+            begin = time.monotonic()
+            config = str(given.config.absolute())
+            arguments = [given.target, "--configfile", config]
+            for line in disturb(folder, arguments, kills, given.seed, given.longest):
+                print(line, flush=True)
+            print(f"{kills} kills: {time.monotonic() - begin:.0f} s", flush=True)
+            found.append(hashes(folder))
+    different = [name for name in found[0] | found[1] if found[0].get(name) != found[1].get(name)]
+    print(f"{len(found[0])} files, {len(different)} differ", *different[:10], sep="\n")
+    sys.exit(bool(different))
+
+
+if __name__ == "__main__":
+    main()
