@@ -5,7 +5,10 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import os
+import sys
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -61,17 +64,67 @@ def _imported_modules(tree: ast.Module, package: str) -> set[str]:
     return {name for name in found if _module_file(name) is not None}
 
 
-@cache
-def _parsed(module: str) -> tuple[str, frozenset[str]]:
-    file = _module_file(module)
-    if file is None:
-        raise ModuleNotFoundError(f"stereotruth.{module}")
+@dataclass
+class _Sources:
+    """What is known of the package's modules: digest of the code, and modules imported.
+
+    Parsing all takes two seconds, and each job of the workflow asks. As Python does with its
+    byte code, results are kept in ``__pycache__``, for files of the same size and time.
+    """
+
+    file: Path
+    known: dict[str, list[Any]] = field(default_factory=dict)
+    fresh: bool = False
+
+    def load(self) -> _Sources:
+        try:
+            self.known = json.loads(self.file.read_text())
+        except (OSError, ValueError):
+            self.known = {}
+        return self
+
+    def save(self) -> None:
+        """Write what is new, if the folder can be written to."""
+        if not self.fresh:
+            return
+        scratch = self.file.with_suffix(f".{os.getpid()}")
+        try:
+            self.file.parent.mkdir(exist_ok=True)
+            scratch.write_text(json.dumps(self.known))
+            scratch.replace(self.file)
+        except OSError:
+            scratch.unlink(missing_ok=True)
+        self.fresh = False
+
+    def of(self, module: str) -> tuple[str, list[str]]:
+        file = _module_file(module)
+        if file is None:
+            raise ModuleNotFoundError(f"stereotruth.{module}")
+        state = file.stat()
+        stamp = [state.st_mtime_ns, state.st_size]
+        found = self.known.get(module)
+        if found is None or found[0] != stamp:
+            found = self.known[module] = [stamp, *_parsed(module, file)]
+            self.fresh = True
+        return found[1], found[2]
+
+
+def _parsed(module: str, file: Path) -> tuple[str, list[str]]:
     tree = ast.parse(file.read_text(encoding="utf-8"))
     package = module if file.name == "__init__.py" else module.rpartition(".")[0]
     imports = _imported_modules(tree, package)
     parts = module.split(".")
     imports |= {".".join(parts[:n]) for n in range(1, len(parts))}  # parents run on import
-    return ast.dump(_without_docstrings(tree)), frozenset(imports)
+    code = ast.dump(_without_docstrings(tree))
+    return hashlib.sha256(code.encode()).hexdigest(), sorted(imports)
+
+
+_CACHE = f"sources-{sys.implementation.cache_tag}.json"  # Pythons differ in their trees
+
+
+@cache
+def _sources() -> _Sources:
+    return _Sources(PACKAGE / "__pycache__" / _CACHE).load()
 
 
 def source_modules(*modules: str) -> list[str]:
@@ -82,7 +135,7 @@ def source_modules(*modules: str) -> list[str]:
         module = todo.pop()
         if module not in seen:
             seen.add(module)
-            todo.extend(_parsed(module)[1])
+            todo.extend(_sources().of(module)[1])
     return sorted(seen)
 
 
@@ -93,7 +146,8 @@ def source_digest(*modules: str) -> str:
     """
     digest = hashlib.sha256()
     for module in source_modules(*modules):
-        digest.update(f"{module}\0{_parsed(module)[0]}\0".encode())
+        digest.update(f"{module}\0{_sources().of(module)[0]}\0".encode())
+    _sources().save()
     return digest.hexdigest()[:16]
 
 

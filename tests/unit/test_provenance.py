@@ -14,16 +14,15 @@ def package(tmp_path, monkeypatch):
     copy = tmp_path / "stereotruth"
     shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(provenance, "PACKAGE", copy)
-    provenance._parsed.cache_clear()
+    provenance._sources.cache_clear()
     yield copy
-    provenance._parsed.cache_clear()
+    provenance._sources.cache_clear()
 
 
 def edit(file: Path, old: str, new: str) -> None:
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new, 1))
-    provenance._parsed.cache_clear()
 
 
 def test_digest_follows_imports_within_the_package():
@@ -38,6 +37,21 @@ def test_a_change_of_an_imported_module_changes_the_digest(package):
     after = provenance.source_digest("grid_store"), provenance.source_digest("sheets")
     assert before[0] != after[0]
     assert before[1] == after[1]
+
+
+def test_digests_are_remembered_but_never_in_place_of_an_edit(package):
+    first = provenance.source_digest("grid_store")
+    (remembered,) = (package / "__pycache__").glob("sources-*.json")
+    provenance._sources.cache_clear()
+    assert provenance.source_digest("grid_store") == first
+    edit(package / "grid_store.py", "clevel=3", "clevel=5")
+    assert provenance.source_digest("grid_store") != first
+    edit(package / "grid_store.py", "clevel=5", "clevel=3")
+    provenance._sources.cache_clear()
+    assert provenance.source_digest("grid_store") == first
+    remembered.write_text("{")
+    provenance._sources.cache_clear()
+    assert provenance.source_digest("grid_store") == first
 
 
 def test_comments_and_docstrings_do_not_change_the_digest(package):
