@@ -1,0 +1,151 @@
+"""Runs that are killed, run out of disk, or meet another run: the result is as if nothing was."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from .conftest import Project
+from .killing import disturb, hashes, kill, start
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+ARGUMENTS = ["tiles/Tiny", "--configfile", "tiny.yaml"]
+RESULTS = ("results", "tiles", "logs", "benchmarks", ".snakemake")
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+
+
+@pytest.fixture
+def fresh(made, tmp_path) -> Project:
+    """The city's input and workflow, nothing made yet."""
+    folder = tmp_path / "fresh"
+    shutil.copytree(made.folder, folder, ignore=shutil.ignore_patterns(*RESULTS))
+    return Project(folder)
+
+
+def wait_for(condition, seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+@linux
+def test_a_run_that_is_killed_again_and_again_gives_the_same_bytes(made, fresh):
+    for _ in disturb(fresh.folder, ARGUMENTS, kills=5, seed=4, longest=14.0):
+        pass
+    assert hashes(fresh.folder) == hashes(made.folder)
+
+
+@linux
+def test_control_points_edited_between_kill_and_restart(made, fresh):
+    """What was made with the old ones counts for nothing; what does not follow from them stays."""
+    run = start(fresh.folder, *ARGUMENTS)
+    work = fresh.folder / "results/project/Tiny/.Tiny-1.zarr.work"
+    wait_for(lambda: work.exists() or run.poll() is not None)
+    kill(run, "tree")
+    gcps = fresh.folder / "in/gcps.csv"
+    lines = gcps.read_text().splitlines()
+    cells = lines[1].split(",")
+    cells[4] = str(float(cells[4]) + 1.5)
+    lines[1] = ",".join(cells)
+    gcps.write_text("\n".join(lines) + "\n")
+    plan = fresh.plan(*ARGUMENTS)
+    assert "ingest" not in plan and {"align", "rectify", "project"} <= set(plan)
+    assert fresh.snakemake(*ARGUMENTS).status == 0
+    other = Project(fresh.folder.with_name("other"))
+    shutil.copytree(fresh.folder, other.folder, ignore=shutil.ignore_patterns(*RESULTS))
+    assert other.snakemake(*ARGUMENTS).status == 0
+    assert hashes(fresh.folder) == hashes(other.folder)
+    assert hashes(fresh.folder) != hashes(made.folder)
+
+
+@linux
+def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh):
+    run = start(fresh.folder, *ARGUMENTS)
+    lock = fresh.folder / ".snakemake/run.lock"
+    wait_for(lambda: (lock.exists() and lock.read_text()) or run.poll() is not None)
+    second = fresh.snakemake(*ARGUMENTS)
+    assert second.status != 0
+    assert f"another run is at work here (process {run.pid} on" in second.text
+    assert "Remedy: wait until it ends, or stop it" in second.text
+    assert fresh.snakemake("--dry-run", *ARGUMENTS).status == 0  # plans are free
+    kill(run, "snakemake")  # its jobs go on
+    third = fresh.snakemake(*ARGUMENTS)
+    assert third.status == 0, third.text[-3000:]
+    assert hashes(fresh.folder) == hashes(made.folder)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder on a file system of 96 MiB of its own."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=96m", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("no right to mount a tmpfs")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("stage", ["ingest", "rectify", "export"])
+def test_a_full_disk_is_told_and_space_is_all_it_needs(made, data, small_disk, stage):
+    """Products on the small disk, filled up when the stage begins."""
+    project = Project(small_disk.parent / "full")
+    shutil.copytree(made.folder, project.folder, ignore=shutil.ignore_patterns(*RESULTS))
+    for name in ("results", "tiles"):
+        (small_disk / name).mkdir()
+        (project.folder / name).symlink_to(small_disk / name)
+    until = {
+        "ingest": [],
+        "rectify": ["results/refine/Tiny/Tiny-1/alignment.json"],
+        "export": ["results/project/Tiny/Tiny-1.zarr"],
+    }[stage]
+    if until:
+        assert project.snakemake(*until, *ARGUMENTS[1:]).status == 0
+    ballast = small_disk / "ballast"
+    free = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_frsize
+    ballast.write_bytes(b"\1" * (free - (1 << 18)))
+    run = project.snakemake(*ARGUMENTS)
+    assert run.status != 0
+    assert "no space left on the disk. Remedy: make space there, and run again" in run.text
+    assert "Traceback" not in run.text
+    ballast.unlink()
+    run = project.snakemake(*ARGUMENTS)
+    assert run.status == 0, run.text[-3000:]
+    assert hashes(project.folder.resolve()) == hashes(made.folder)
+
+
+def test_strips_by_jobs_of_their_own_give_the_same_bytes(made, fresh):
+    config = fresh.folder / "tiny.yaml"
+    config.write_text(config.read_text() + "strips: {Tiny-1: 2}\n")
+    plan = fresh.plan(*ARGUMENTS)
+    assert plan["rectify_strip"] == plan["project_strip"] == 2
+    run = fresh.snakemake(*ARGUMENTS)
+    assert run.status == 0, run.text[-3000:]
+    assert hashes(fresh.folder) == hashes(made.folder)
+    assert fresh.plan(*ARGUMENTS) == {}
+
+
+def test_a_fixed_alignment_keeps_what_one_more_file_does_not_touch(made, tmp_path):
+    """With it neither align nor refine run, and a LiDAR file has no say in the images."""
+    other = Project(tmp_path / "other")
+    shutil.copytree(made.folder, other.folder)
+    fixed = Path("Tiny-1.json")
+    shutil.copy(other.folder / "results/refine/Tiny/Tiny-1/alignment.json", other.folder / fixed)
+    config = other.folder / "tiny.yaml"
+    config.write_text(config.read_text() + f"alignment: {{fixed: {{Tiny-1: {fixed}}}}}\n")
+    assert other.snakemake(*ARGUMENTS).status == 0
+    grid = "results/project/Tiny/Tiny-1.zarr/disparity"
+    assert hashes(other.folder / grid) == hashes(made.folder / grid)
+    first = sorted((other.folder / "in/lidar").iterdir())[0]
+    shutil.copy(first, first.with_name("one-more.laz"))
+    plan = other.plan(*ARGUMENTS)
+    assert plan == {"ingest": 1, "project": 1, "export": 1}
+    config.write_text(config.read_text().replace("Tiny-1: Tiny", "Tiny-1: Tony"))
+    assert "Tony-1.json: no such file" in other.snakemake("--dry-run", *ARGUMENTS).text
