@@ -662,15 +662,13 @@ class _Scene:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
         if self.view == "right":
             cols = mirrored(cols, self.model.shape[1])
-        boxes = self.boxes(rows, cols)
-        touched = []
-        if boxes is not None:
-            box = boxes[self.settings.uses_geometry]
-            touched = sorted(
-                _identity(store.attrs)
-                for store in self.stores
-                if store.height_range(*box) is not None
-            )
+        reach = self.reach(rows, cols)
+        strips = [] if reach is None else self.strips(rows, cols, reach)
+        touched = sorted(
+            _identity(store.attrs)
+            for store in self.stores
+            if any(store.height_range(*strip) is not None for strip in strips)
+        )
         return digest({"content": content, "points": touched})
 
     def block(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:

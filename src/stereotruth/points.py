@@ -877,6 +877,9 @@ class PointStore:
 
         None where there is no cell.
         """
+        west, south, east, north = self.bounds[:4]
+        if lon_max < west or lon_min > east or lat_max < south or lat_min > north:
+            return None
         box = _lattice_box(lon_min, lat_min, lon_max, lat_max)
         heights = [self.cell_heights[a:b] for a, b in self._cells(box)]
         if not heights:
