@@ -56,7 +56,7 @@ NEAREST_CELLS = 0.5
 # Rounds of filling cells without points: radius in cells within which three known ones are needed.
 FILL_RADII = (1, 2, 4)
 _FINE = 4  # parts of a pixel along each axis
-_TILE = 32  # cells, of the coarse grid of maxima that bounds the search
+_TILE = 8  # cells, of the coarse grid of maxima that bounds the search
 _PER_M = round(1 / LATTICE_M)
 
 
@@ -143,13 +143,24 @@ def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _possible(across: int, down: int) -> int:
+    """Octants that a pixel so many px off can lie in."""
+    octants = 255
+    if across:
+        octants &= 195 if across > 0 else 60
+    if down:
+        octants &= 15 if down > 0 else 240
+    return octants
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _uncovered(
     points: Records,
     start: Ints,
     shape: tuple[int, int],
     near: NDArray[np.int32],
     top: Steps,
-    ceiling: Steps,
+    ceilings: Steps,
     surrounded: NDArray[np.bool_],
     flags: NDArray[np.uint8],
     low: Steps,
@@ -158,28 +169,38 @@ def _uncovered(
 ) -> None:
     """Takes _UNCOVERED from the points that parts of higher disparity surround.
 
-    ``near``: points in 3 x 3 pixels; ``top`` of each pixel, ``ceiling``: the greatest ``top``
-    within reach. ``low``, ``high``, ``count`` (see _range) are brought up to date.
+    ``near``: points in 3 x 3 pixels; ``top`` of each pixel; ``ceilings`` [k]: the greatest ``top``
+    no more than k + 1 px off. ``low``, ``high``, ``count`` (see _range) are brought up to date.
     """
     tops = np.empty(top.size * _FINE * _FINE, np.int32)  # only what is needed is written
     known = np.zeros(top.size, np.bool_)
     rows, cols = shape
     for p in range(top.size):
-        if ceiling[p] <= low[p] + _SURFACE:
+        if ceilings[-1, p] <= low[p] + _SURFACE:
             continue
         distance = 3.0 / np.sqrt(max(near[p], 1))
         reach = min(max(1.7 * distance, COVER_PX), MAX_COVER_PX)
         n = int(reach + 0.875)  # the parts' centres reach to 3 / 8 px, places to 1 / 2 px
         far = (reach * PX) ** 2
         row, col = p // cols, p % cols
+        first_row, end_row = max(row - n, 0), min(row + n + 1, rows)
+        first_col, end_col = max(col - n, 0), min(col + n + 1, cols)
         covered = False
         for k in range(start[p], start[p + 1]):
             limit = points[k].disparity + _SURFACE
-            if ceiling[p] <= limit:
+            if ceilings[n - 1, p] <= limit:
+                continue
+            # Beside a wall, what is higher lies to one side: no need to look closer.
+            octants = 0
+            for b in range(first_row, end_row):
+                for a in range(first_col, end_col):
+                    if top[b * cols + a] > limit:
+                        octants |= _possible(a - col, b - row)
+            if not surrounded[octants]:
                 continue
             octants = 0
-            for b in range(max(row - n, 0), min(row + n + 1, rows)):
-                for a in range(max(col - n, 0), min(col + n + 1, cols)):
+            for b in range(first_row, end_row):
+                for a in range(first_col, end_col):
                     q = b * cols + a
                     if top[q] <= limit:
                         continue
@@ -229,6 +250,7 @@ def _on_edge(
     flags: NDArray[np.uint8],
     distance: int,
     disparity: int,
+    many: bool,
     margin: float,
     surrounded: NDArray[np.bool_],
 ) -> bool:
@@ -237,19 +259,19 @@ def _on_edge(
     row, col = p // cols, p % cols
     other = np.inf
     octants = 0
-    n = 0
     for b in range(max(row - 1, 0), min(row + 2, rows)):
         for a in range(max(col - 1, 0), min(col + 2, cols)):
             q = b * cols + a
             for k in range(start[q], start[q + 1]):
                 if flags[k] & _UNCOVERED:
-                    n += 1
                     u, v = (a - col) * PX + points[k].u, (b - row) * PX + points[k].v
                     if abs(points[k].disparity - disparity) <= _SURFACE:
                         octants |= 1 << _octant(u, v)
                     else:
                         other = min(other, float(u * u + v * v))
-    if n >= MANY and not surrounded[octants]:
+            if margin == 0.0 and surrounded[octants]:  # no other point is nearer than the nearest
+                return False
+    if many and not surrounded[octants]:
         return True
     return np.sqrt(other) < np.sqrt(float(distance)) + 2.0 * margin * PX
 
@@ -262,50 +284,69 @@ def _seen(
     low: Steps,
     high: Steps,
     count: NDArray[np.int32],
+    around: NDArray[np.int32],
+    lowest: Steps,
+    highest: Steps,
     margin: float,
     surrounded: NDArray[np.bool_],
     flags: NDArray[np.uint8],
     seen: NDArray[np.int32],
     edge: NDArray[np.bool_],
 ) -> None:
+    """``around``, ``lowest``, ``highest``: of ``count``, ``low``, ``high`` in 3 x 3 pixels."""
     rows, cols = shape
     quarter = PX * PX // 4  # squared; points of other pixels are no nearer
+    none = (np.int64(1 << 62), np.int64(_NOTHING))
     for p in range(count.size):
         seen[p] = 0
         edge[p] = False
         if count[p] == 0:
             continue
         row, col = p // cols, p % cols
-        none = (np.int64(1 << 62), np.int64(_NOTHING))
         distance, disparity = _nearest(points, start, p, 0, 0, flags, none)
-        around = 0
-        sides = 0
-        corners = 0
-        flat = True
-        for b in range(max(row - 1, 0), min(row + 2, rows)):
-            for a in range(max(col - 1, 0), min(col + 2, cols)):
-                q = b * cols + a
-                if count[q] == 0:
-                    continue
-                if distance >= quarter and q != p:
-                    distance, disparity = _nearest(
-                        points, start, q, a - col, b - row, flags, (distance, disparity)
-                    )
-                around += count[q]
-                sides += (b == row) != (a == col)
-                corners += b != row and a != col
-        for b in range(max(row - 1, 0), min(row + 2, rows)):
-            for a in range(max(col - 1, 0), min(col + 2, cols)):
-                q = b * cols + a
-                if count[q] > 0:
-                    flat &= high[q] <= disparity + _SURFACE and low[q] >= disparity - _SURFACE
-        # One surface, with points on four sides or corners, leaves no gap of three octants.
-        if not (flat and (around < MANY or sides == 4 or corners == 4)):
-            edge[p] = _on_edge(
-                points, start, shape, p, flags, distance, disparity, margin, surrounded
-            )
+        if distance >= quarter:
+            for b in range(max(row - 1, 0), min(row + 2, rows)):
+                for a in range(max(col - 1, 0), min(col + 2, cols)):
+                    if a != col or b != row:
+                        distance, disparity = _nearest(
+                            points,
+                            start,
+                            b * cols + a,
+                            a - col,
+                            b - row,
+                            flags,
+                            (distance, disparity),
+                        )
+        least, greatest = disparity - _SURFACE, disparity + _SURFACE
+        flat = lowest[p] >= least and highest[p] <= greatest
+        many = around[p] >= MANY
+        if (many or not flat) and (many or margin > 0.0):
+            # Four sides or corners with nothing but this surface leave no gap of three octants.
+            sides = corners = 0
+            if (flat or margin == 0.0) and 0 < row < rows - 1 and 0 < col < cols - 1:
+                for b in range(-1, 2):
+                    for a in range(-1, 2):
+                        q = p + b * cols + a
+                        if count[q] > 0 and low[q] >= least and high[q] <= greatest:
+                            sides += (a == 0) != (b == 0)
+                            corners += a != 0 and b != 0
+            if sides < 4 and corners < 4:
+                edge[p] = _on_edge(
+                    points,
+                    start,
+                    shape,
+                    p,
+                    flags,
+                    distance,
+                    disparity,
+                    many,
+                    margin,
+                    surrounded,
+                )
+        one = low[p] >= least and high[p] <= greatest
         for k in range(start[p], start[p + 1]):
-            if flags[k] & _UNCOVERED and abs(points[k].disparity - disparity) <= _SURFACE:
+            on_surface = one or abs(points[k].disparity - disparity) <= _SURFACE
+            if flags[k] & _UNCOVERED and on_surface:
                 flags[k] |= _ON_SURFACE
                 seen[p] += 1
 
@@ -355,11 +396,27 @@ def seen_surface(
     flags = np.full(points.size, _UNCOVERED)
     _ranges(points, start, flags, low, high, count)
     top = high.copy()
-    ceiling = _box_max(top.reshape(shape), int(np.ceil(MAX_COVER_PX))).reshape(-1)
+    reach = range(1, int(np.ceil(MAX_COVER_PX)) + 1)
+    ceilings = np.stack([_box_max(top.reshape(shape), px).reshape(-1) for px in reach])
     near = box_sum(count.reshape(shape)).reshape(-1)
-    _uncovered(points, start, shape, near, top, ceiling, _SURROUNDED, flags, low, high, count)
+    _uncovered(points, start, shape, near, top, ceilings, _SURROUNDED, flags, low, high, count)
     edge = np.empty(size, dtype=np.bool_)
-    _seen(points, start, shape, low, high, count, edge_margin_px, _SURROUNDED, flags, seen, edge)
+    _seen(
+        points,
+        start,
+        shape,
+        low,
+        high,
+        count,
+        box_sum(count.reshape(shape)).reshape(-1),
+        -_box_max(-low.reshape(shape), 1).reshape(-1),
+        _box_max(high.reshape(shape), 1).reshape(-1),
+        edge_margin_px,
+        _SURROUNDED,
+        flags,
+        seen,
+        edge,
+    )
     edge &= seen > 0
     return (flags & _ON_SURFACE) != 0, edge.reshape(shape)
 
@@ -516,23 +573,27 @@ def _tile_tops(height: NDArray[np.float32], out: NDArray[np.float32]) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _holes(height: NDArray[np.float32], tops: NDArray[np.float32], out: Ints) -> int:
+def _holes(height: NDArray[np.float32], reach: int, out: Ints) -> int:
     """Fills ``out`` with the flat indices of unknown cells near known ones; returns their number.
 
-    Near: in a tile beside one with known cells; no hole is filled from further away.
+    Near: in squares of ``reach`` cells beside one with known cells; others are out of reach.
     """
     rows, cols = height.shape
-    n = 0
+    known = np.zeros(((rows - 1) // reach + 3, (cols - 1) // reach + 3), np.bool_)
     for j in range(rows):
-        for q in range(tops.shape[1]):
-            p = j // _TILE
-            near = tops[max(p - 1, 0) : p + 2, max(q - 1, 0) : q + 2]
-            if near.max() == -np.inf:
+        for i in range(cols):
+            if height[j, i] > -np.inf:
+                known[j // reach + 1, i // reach + 1] = True
+    n = 0
+    for q in range(known.shape[0] - 2):
+        for p in range(known.shape[1] - 2):
+            if not known[q : q + 3, p : p + 3].any():
                 continue
-            for i in range(q * _TILE, min((q + 1) * _TILE, cols)):
-                if height[j, i] == -np.inf:
-                    out[n] = j * cols + i
-                    n += 1
+            for j in range(q * reach, min((q + 1) * reach, rows)):
+                for i in range(p * reach, min((p + 1) * reach, cols)):
+                    if height[j, i] == -np.inf:
+                        out[n] = j * cols + i
+                        n += 1
     return n
 
 
@@ -601,12 +662,11 @@ class SurfaceBuilder:
         self.parts = []
         height = np.empty(self.top.shape, dtype=np.float32)
         _means_of_tops(top, count, below, _PER_M, height.reshape(-1))
-        ceiling = np.empty([-(-n // _TILE) for n in height.shape], dtype=np.float32)
-        _tile_tops(height, ceiling)
         holes = np.empty(height.size, dtype=np.int64)  # only what is needed is written
-        n = _holes(height, ceiling, holes)
+        n = _holes(height, sum(FILL_RADII), holes)
         for radius in FILL_RADII:
             n = _fill_holes(height, holes[:n], radius)
+        ceiling = np.empty([-(-n // _TILE) for n in height.shape], dtype=np.float32)
         _tile_tops(height, ceiling)
         return Surface(height, ceiling, self.first[1], self.first[0])
 
@@ -625,17 +685,11 @@ def build_surface(points: Points, rays: Rays) -> Surface | None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _highest_on_track(ceiling: NDArray[np.float32], i: int, j: int, di: float, dj: float) -> float:
-    """The highest tile in the box around the track from cell (i, j) over (di, dj) cells."""
-    i0, i1 = min(i, i + int(np.floor(di)) - 1), max(i, i + int(np.ceil(di)) + 1)
-    j0, j1 = min(j, j + int(np.floor(dj)) - 1), max(j, j + int(np.ceil(dj)) + 1)
-    i0, i1 = max(i0 // _TILE, 0), min(i1 // _TILE, ceiling.shape[1] - 1)
-    j0, j1 = max(j0 // _TILE, 0), min(j1 // _TILE, ceiling.shape[0] - 1)
-    highest = -np.inf
-    for q in range(j0, j1 + 1):
-        for p in range(i0, i1 + 1):
-            highest = max(highest, ceiling[q, p])
-    return highest
+def _to_border(place: float, size: float, speed: float) -> tuple[float, float]:
+    """Way to the next border of cells of a ``size``, and between borders, along one axis."""
+    if speed == 0.0:
+        return np.inf, np.inf
+    return (size - place if speed > 0.0 else place) / abs(speed), size / abs(speed)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -660,23 +714,38 @@ def _is_hidden(
     (du, dv): cells per metre of rise; ``top``: no cell is higher (m). The cell of the start does
     not count: what lies above the start there is the business of :func:`seen_surface`.
     """
-    speed = np.hypot(du, dv)
+    speed = np.sqrt(du * du + dv * dv)
     if speed < 1e-6:  # the camera stands in the zenith
         return False
     if start + tolerance >= top:
         return False
-    # Only tiles on the way can stop the ray; the way ends where it rises above all of them.
-    top = min(top, _highest_on_track(ceiling, i, j, du * (top - start), dv * (top - start)))
     rise = 1.0 / speed  # m per cell of way
     du *= rise
     dv *= rise
     step_i, step_j = (1 if du > 0.0 else -1), (1 if dv > 0.0 else -1)
-    # Way to the next border of cells along each axis, and between borders.
-    between_u = 1.0 / abs(du) if du != 0.0 else np.inf
-    between_v = 1.0 / abs(dv) if dv != 0.0 else np.inf
-    next_u = (1.0 - a if du > 0.0 else a) * between_u if du != 0.0 else np.inf
-    next_v = (1.0 - b if dv > 0.0 else b) * between_v if dv != 0.0 else np.inf
     rows, cols = height.shape
+    # From tile to tile: the way to the end of the last one that reaches up to the ray.
+    p, q = i // _TILE, j // _TILE
+    next_u, between_u = _to_border(i - p * _TILE + a, _TILE, du)
+    next_v, between_v = _to_border(j - q * _TILE + b, _TILE, dv)
+    way = 0.0
+    end = -1.0
+    while 0 <= p < ceiling.shape[1] and 0 <= q < ceiling.shape[0]:
+        ray = start + max(way - ahead, nearest) * rise + tolerance
+        if ray >= top:
+            break
+        if ceiling[q, p] > ray:
+            end = min(next_u, next_v) + 1e-6
+        if next_u < next_v:
+            way = next_u
+            next_u += between_u
+            p += step_i
+        else:
+            way = next_v
+            next_v += between_v
+            q += step_j
+    next_u, between_u = _to_border(a, 1.0, du)
+    next_v, between_v = _to_border(b, 1.0, dv)
     before = height[j, i]
     while True:
         if next_u < next_v:
@@ -687,11 +756,9 @@ def _is_hidden(
             way = next_v
             next_v += between_v
             j += step_j
-        if i < 0 or j < 0 or i >= cols or j >= rows:
+        if way > end or i < 0 or j < 0 or i >= cols or j >= rows:
             return False
         here = height[j, i]
-        if start + max(way - ahead, nearest) * rise + tolerance >= top:
-            return False
         if here - before > step:
             way -= ahead
         if here > start + max(way, nearest) * rise + tolerance:

@@ -20,7 +20,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 
-PX = 1 << 16  # steps per px
+_BITS = 16
+PX = 1 << _BITS  # steps per px
+_PART = 1 << 20  # points that are collected in one piece
 POINT = np.dtype(
     [
         ("disparity", np.int32),  # steps
@@ -100,13 +102,6 @@ def places(window: PixelPoints, chosen: NDArray[np.bool_]) -> Floats:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _usable(usable: NDArray[np.uint8], origin: tuple[int, int], x: float, y: float) -> bool:
-    c = int(np.floor(x)) - origin[1]
-    r = int(np.floor(y)) - origin[0]
-    return 0 <= r < usable.shape[0] and 0 <= c < usable.shape[1] and usable[r, c] != 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _take(
     lon_q: Ints,
     lat_q: Ints,
@@ -122,30 +117,35 @@ def _take(
     right_origin: tuple[int, int],
     points: Records,
     pixel: NDArray[np.int32],
-    count: Ints,
+    count: NDArray[np.int32],
     outside: NDArray[np.int32],
 ) -> int:
     """Fills ``points`` and ``pixel`` with those in both frames; returns how many these are."""
     n = 0
     half = PX // 2
+    low_x, low_y = first[1] - 1.0, first[0] - 1.0
+    high_x, high_y = float(first[1] + shape[1]), float(first[0] + shape[0])
     for k in range(lon_q.size):
-        x, y = xy[0, k] - first[1], xy[1, k] - first[0]
-        if not (-1.0 < x < shape[1] and -1.0 < y < shape[0] and np.isfinite(xy[2, k])):
+        x, y, x_right, y_right = xy[0, k], xy[1, k], xy[2, k], xy[3, k]
+        if not (low_x < x < high_x and low_y < y < high_y and np.isfinite(x_right)):
             continue
-        u, v = np.int64(np.rint(xy[0, k] * PX)), np.int64(np.rint(xy[1, k] * PX))
-        col, row = (u + half) // PX, (v + half) // PX
+        u, v = np.int64(np.rint(x * PX)), np.int64(np.rint(y * PX))
+        col, row = (u + half) >> _BITS, (v + half) >> _BITS
         i, j = col - first[1], row - first[0]
         if i < 0 or j < 0 or i >= shape[1] or j >= shape[0]:
             continue
         p = j * shape[1] + i
         # The test is of the places as rounded: what is read later lies in the frame.
-        u_right = np.int64(np.rint(xy[2, k] * PX))
-        shift = np.int64(np.rint(xy[3, k] * PX)) - v
-        shift = min(max(shift, -half), half - 1)
-        if not (
-            _usable(left, left_origin, u / PX, v / PX)
-            and _usable(right, right_origin, u_right / PX, (v + shift) / PX)
-        ):
+        u_right = np.int64(np.rint(x_right * PX))
+        shift = min(max(np.int64(np.rint(y_right * PX)) - v, -half), half - 1)
+        # In line: as a function that takes arrays, it took 20 of 29 ns.
+        c, r = (u >> _BITS) - left_origin[1], (v >> _BITS) - left_origin[0]
+        d, q = (u_right >> _BITS) - right_origin[1], (v + shift >> _BITS) - right_origin[0]
+        framed = 0 <= r < left.shape[0] and 0 <= c < left.shape[1]
+        framed = framed and 0 <= q < right.shape[0] and 0 <= d < right.shape[1]
+        if framed:
+            framed = left[np.uint64(r), np.uint64(c)] & right[np.uint64(q), np.uint64(d)] != 0
+        if not framed:
             outside[p] += 1
             continue
         point = points[n]
@@ -153,8 +153,8 @@ def _take(
         point.lon = lon_q[k] - origin[0]
         point.lat = lat_q[k] - origin[1]
         point.height = h_q[k]
-        point.u = u - col * PX
-        point.v = v - row * PX
+        point.u = u - (col << _BITS)
+        point.v = v - (row << _BITS)
         point.parallax = shift
         point.surface_class = surface_class[k]
         pixel[n] = p
@@ -180,24 +180,23 @@ class Collection:
     left: Patch
     right: Patch
     parts: list[tuple[Records, NDArray[np.int32]]] = field(default_factory=list)
+    taken: int = 0  # of the last part
 
     def __post_init__(self) -> None:
         size = self.shape[0] * self.shape[1]
-        self.count = np.zeros(size + 1, dtype=np.int64)
+        self.count = np.zeros(size + 1, dtype=np.int32)
         self.outside = np.zeros(size, dtype=np.int32)
 
     def add(
-        self,
-        lon_q: Ints,
-        lat_q: Ints,
-        h_q: Ints,
-        surface_class: NDArray[np.uint8],
-        xy: Floats,
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8], xy: Floats
     ) -> None:
         """Points by lattice coordinates and class, and where they are seen: ``xy`` [4, n], px."""
-        points = np.empty(lon_q.size, dtype=POINT)
-        pixel = np.empty(lon_q.size, dtype=np.int32)
-        n = _take(
+        if not self.parts or self.taken + lon_q.size > self.parts[-1][1].size:
+            self._close()
+            size = max(_PART, lon_q.size)
+            self.parts.append((np.empty(size, dtype=POINT), np.empty(size, dtype=np.int32)))
+        points, pixel = (array[self.taken :] for array in self.parts[-1])
+        self.taken += _take(
             lon_q,
             lat_q,
             h_q,
@@ -215,12 +214,16 @@ class Collection:
             self.count,
             self.outside,
         )
-        if n:
-            self.parts.append((points[:n].copy(), pixel[:n].copy()))
+
+    def _close(self) -> None:
+        if self.parts:
+            self.parts[-1] = tuple(array[: self.taken] for array in self.parts[-1])
+        self.taken = 0
 
     def sorted(self) -> PixelPoints:
         """All that was taken; empties the collection."""
-        start = np.cumsum(self.count)
+        self._close()
+        start = np.cumsum(self.count, dtype=np.int64)
         points = np.empty(int(start[-1]), dtype=POINT)
         place = start[:-1].copy()
         for part in range(len(self.parts)):
