@@ -13,8 +13,8 @@ log = logging.getLogger("stereotruth")
 
 
 @contextmanager
-def dask_scheduler(address: str | None) -> Iterator[Any]:
-    """What Dask's compute takes as its scheduler.
+def dask_scheduler(address: str | None, seconds: float = 30.0) -> Iterator[Any]:
+    """What Dask's compute takes as its scheduler; it is waited for so many ``seconds``.
 
     ``address`` of a running Dask scheduler (``tcp://host:8786``), or None for threads. Its workers
     need this package and must see the files under the same paths.
@@ -32,10 +32,11 @@ def dask_scheduler(address: str | None) -> Iterator[Any]:
             remedy="pip install 'stereotruth[cluster]', or set it to null",
         ) from error
     try:
-        client = Client(address, timeout=30)
+        client = Client(address, timeout=seconds)
     except OSError as error:
         raise InputError(
-            f"no Dask scheduler answers at {address} ({error})",
+            f"no Dask scheduler answers ({error})",
+            file=address,
             remedy="start it, correct dask.scheduler_address, or set it to null",
         ) from error
     with client:

@@ -11,7 +11,9 @@ import pytest
 import zarr
 
 from stereotruth.disparity import project_scene
+from stereotruth.errors import InputError
 from stereotruth.grid_store import Strip
+from stereotruth.workers import dask_scheduler
 
 from .test_block_store import tree
 from .test_disparity import Scene, write_image, write_points
@@ -95,3 +97,26 @@ def test_a_store_that_does_not_say_what_it_is_made_of_is_never_taken_over(scene,
     record = json.loads((tmp_path / ".out.zarr.work/done/0-0.json").read_text())
     assert {"key", "sha256", "result", "format"} == set(record)
     assert project(scene, [scene.store], out) >= everything - {"0-0.json"}
+
+
+def test_workers_of_a_dask_cluster_write_the_same_bytes(scene, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    project(scene, [scene.store], tmp_path / "out.zarr")
+    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
+        dask_scheduler(cluster.scheduler_address) as client,
+    ):
+        project(scene, [scene.store], tmp_path / "other.zarr", scheduler=client)
+    assert tree(tmp_path / "out.zarr") == tree(tmp_path / "other.zarr")
+
+
+def test_a_scheduler_that_is_not_there_is_named():
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with (
+        pytest.raises(InputError, match=r"tcp://127.0.0.1:9: no Dask scheduler answers.*start it"),
+        dask_scheduler("tcp://127.0.0.1:9", seconds=1),
+    ):
+        pass
+    with dask_scheduler(None) as scheduler:
+        assert scheduler == "threads"
