@@ -144,7 +144,7 @@ def point_stores(wildcards):
     )
 
 
-RUN_LOCK = FileLock(".snakemake/run.lock")
+LOCKS = []  # held until this process ends
 
 
 def refuse_second_run():
@@ -153,11 +153,13 @@ def refuse_second_run():
     Snakemake's own lock stays when it is killed; this one does not (profiles/default turns the
     other off).
     """
-    if not RUN_LOCK.take(Path.cwd(), wait=False):
+    lock = FileLock(".snakemake/run.lock")
+    if not lock.take(Path.cwd(), wait=False):
         raise WorkflowError(
-            f"{Path.cwd()}: another run is at work here ({RUN_LOCK.holder}). "
+            f"{Path.cwd()}: another run is at work here ({lock.holder}). "
             "Remedy: wait until it ends, or stop it"
         )
+    LOCKS.append(lock)
 
 
 onstart:
