@@ -23,8 +23,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .correlation import Patch
 from .occlusion import SURFACE_PX
+from .patches import Patch
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

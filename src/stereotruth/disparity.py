@@ -42,7 +42,7 @@ from scipy.spatial import ConvexHull
 
 from .agreement import VOTE_PX, outvoted, supported, surface_correlation, warp_to_left
 from .block_store import BlockStore, making
-from .correlation import Array2D, Patch, correlate, read_patch
+from .correlation import correlate
 from .epipolar import EpipolarModel
 from .errors import InputError
 from .grid_store import Layer, Strip, blocks, require_complete
@@ -57,7 +57,8 @@ from .occlusion import (
     hidden_pixels,
     seen_surface,
 )
-from .pixel_points import Collection, PixelPoints, places
+from .patches import Array2D, Patch, read_patch
+from .pixel_points import Collection, PixelPoints
 from .points import CELL_BITS, LATTICE_DEG, LATTICE_M, PointStore
 from .provenance import describe, digest, source_digest
 from .representative import REPRESENTATIVES, Labels, Pixels, at_centres, at_points, condense
@@ -476,8 +477,7 @@ class _Scene:
             use, edge = seen_surface(points, settings.edge_margin_px)
         seen, correlation = use, None
         if settings.method == "correlation":
-            correlation = np.full(use.size, np.nan, dtype=np.float32)
-            correlation[use] = correlate(left, right, places(points, use), settings.window)
+            correlation = correlate(points, use, left, right, settings.window)
             use = use & (correlation >= settings.correlation_threshold)
         pixels = condense(self.model, local, points, use, correlation, settings.representative)
         status = self.test_points(points, seen, pixels)

@@ -14,14 +14,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .correlation import Patch
+from .patches import Patch
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 
-_BITS = 16
-PX = 1 << _BITS  # steps per px
+BITS = 16
+PX = 1 << BITS  # steps per px
 _PART = 1 << 20  # points that are collected in one piece
 POINT = np.dtype(
     [
@@ -74,34 +74,6 @@ def _any(start: Ints, chosen: NDArray[np.bool_], out: NDArray[np.bool_]) -> None
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _places(
-    points: Records,
-    start: Ints,
-    chosen: NDArray[np.bool_],
-    first: tuple[int, int],
-    cols: int,
-    out: Floats,
-) -> None:
-    n = 0
-    for p in range(start.size - 1):
-        for k in range(start[p], start[p + 1]):
-            if chosen[k]:
-                u = (first[1] + p % cols) * PX + points[k].u
-                v = (first[0] + p // cols) * PX + points[k].v
-                out[0, n], out[1, n] = u / PX, v / PX
-                out[2, n] = (u - points[k].disparity) / PX
-                out[3, n] = (v + points[k].parallax) / PX
-                n += 1
-
-
-def places(window: PixelPoints, chosen: NDArray[np.bool_]) -> Floats:
-    """float64[4, m] = x_left, y_left, x_right, y_right (px) of the ``chosen`` points [n]."""
-    out = np.empty((4, int(chosen.sum())))
-    _places(window.points, window.start, chosen, window.first, window.shape[1], out)
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _take(
     lon_q: Ints,
     lat_q: Ints,
@@ -130,7 +102,7 @@ def _take(
         if not (low_x < x < high_x and low_y < y < high_y and np.isfinite(x_right)):
             continue
         u, v = np.int64(np.rint(x * PX)), np.int64(np.rint(y * PX))
-        col, row = (u + half) >> _BITS, (v + half) >> _BITS
+        col, row = (u + half) >> BITS, (v + half) >> BITS
         i, j = col - first[1], row - first[0]
         if i < 0 or j < 0 or i >= shape[1] or j >= shape[0]:
             continue
@@ -139,8 +111,8 @@ def _take(
         u_right = np.int64(np.rint(x_right * PX))
         shift = min(max(np.int64(np.rint(y_right * PX)) - v, -half), half - 1)
         # In line: as a function that takes arrays, it took 20 of 29 ns.
-        c, r = (u >> _BITS) - left_origin[1], (v >> _BITS) - left_origin[0]
-        d, q = (u_right >> _BITS) - right_origin[1], (v + shift >> _BITS) - right_origin[0]
+        c, r = (u >> BITS) - left_origin[1], (v >> BITS) - left_origin[0]
+        d, q = (u_right >> BITS) - right_origin[1], (v + shift >> BITS) - right_origin[0]
         framed = 0 <= r < left.shape[0] and 0 <= c < left.shape[1]
         framed = framed and 0 <= q < right.shape[0] and 0 <= d < right.shape[1]
         if framed:
@@ -153,8 +125,8 @@ def _take(
         point.lon = lon_q[k] - origin[0]
         point.lat = lat_q[k] - origin[1]
         point.height = h_q[k]
-        point.u = u - (col << _BITS)
-        point.v = v - (row << _BITS)
+        point.u = u - (col << BITS)
+        point.v = v - (row << BITS)
         point.parallax = shift
         point.surface_class = surface_class[k]
         pixel[n] = p

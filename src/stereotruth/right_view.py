@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .correlation import Array2D
 from .epipolar import EpipolarModel
+from .patches import Array2D
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.agreement import outvoted, supported, surface_correlation, warp_to_left
-from stereotruth.correlation import read_patch
+from stereotruth.patches import read_patch
 
 LEVEL = np.zeros((2, 80, 80))
 

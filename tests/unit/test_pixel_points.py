@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereotruth.correlation import read_patch
-from stereotruth.pixel_points import PX, Collection, PixelPoints, places
+from stereotruth.patches import read_patch
+from stereotruth.pixel_points import PX, Collection, PixelPoints
 
 ROWS, COLS = slice(10, 50), slice(30, 90)
 ORIGIN = (1000, 2000)
@@ -37,7 +37,11 @@ def test_each_pixel_has_its_points() -> None:
     shuffled = collected(lattice, xy, rng.permutation(n))
     assert np.array_equal(window.start, shuffled.start)
     assert np.array_equal(window.outside, shuffled.outside)
-    found = places(window, np.ones(window.points.size, bool))
+    pixel = np.repeat(np.arange(window.start.size - 1), np.diff(window.start))
+    points = window.points
+    x_left, y_left = pixel % 60 + 30 + points["u"] / PX, pixel // 60 + 10 + points["v"] / PX
+    x_right, y_right = x_left - points["disparity"] / PX, y_left + points["parallax"] / PX
+    found = np.stack([x_left, y_left, x_right, y_right])
     col, row = np.floor(x + 0.5), np.floor(y + 0.5)
     inside = (col >= 30) & (col < 90) & (row >= 10) & (row < 50)
     inside[0] = False
