@@ -28,7 +28,21 @@ def fresh(made, tmp_path) -> Project:
     return Project(folder)
 
 
-def wait_for(condition, seconds: float = 120.0) -> None:
+@pytest.fixture
+def begin(fresh):
+    """Starts a run in ``fresh``; none is left behind."""
+    runs = []
+
+    def begun():
+        runs.append(start(fresh.folder, *ARGUMENTS))
+        return runs[-1]
+
+    yield begun
+    for run in runs:
+        kill(run, "tree")
+
+
+def wait_for(condition, seconds: float = 600.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
@@ -43,9 +57,9 @@ def test_a_run_that_is_killed_again_and_again_gives_the_same_bytes(made, fresh):
 
 
 @linux
-def test_control_points_edited_between_kill_and_restart(made, fresh):
+def test_control_points_edited_between_kill_and_restart(made, fresh, begin):
     """What was made with the old ones counts for nothing; what does not follow from them stays."""
-    run = start(fresh.folder, *ARGUMENTS)
+    run = begin()
     work = fresh.folder / "results/project/Tiny/.Tiny-1.zarr.work"
     wait_for(lambda: work.exists() or run.poll() is not None)
     kill(run, "tree")
@@ -66,8 +80,8 @@ def test_control_points_edited_between_kill_and_restart(made, fresh):
 
 
 @linux
-def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh):
-    run = start(fresh.folder, *ARGUMENTS)
+def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh, begin):
+    run = begin()
     lock = fresh.folder / ".snakemake/run.lock"
     wait_for(lambda: (lock.exists() and lock.read_text()) or run.poll() is not None)
     second = fresh.snakemake(*ARGUMENTS)
