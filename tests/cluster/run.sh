@@ -4,4 +4,5 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 tests/cluster/start.sh
 trap tests/cluster/stop.sh EXIT
-TEST_CLUSTER=1 timeout --kill-after=30 900 pytest tests/cluster
+# KILL, since a Snakemake that is asked to end waits for the answers of a cluster
+TEST_CLUSTER=1 timeout --signal=KILL 2400 pytest tests/cluster
