@@ -32,6 +32,7 @@ import laspy
 import numpy as np
 import pyproj
 import rasterio
+from numba import njit
 from pyproj import CRS
 from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
@@ -342,6 +343,57 @@ def resolve(
 # ------------------------------------------------------------------ geoid grids
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bilinear(
+    rows: np.ndarray,
+    grid: tuple[float, float, float, float],
+    first_row: int,
+    height: int,
+    around: int,
+    lon: np.ndarray,
+    lat: np.ndarray,
+    out: np.ndarray,
+    inside: np.ndarray,
+) -> None:
+    """Fill ``out`` [n] from a grid's rows [k, width], and ``inside`` [n]: whether a point is in it.
+
+    ``grid``: longitude of the first node and step, latitude likewise (southwards). ``first_row`` of
+    ``height`` is rows[0]; ``around``: columns once around the Earth, 0 if the grid covers less.
+    """
+    slack = 1e-6  # of a node's step, against rounding at the outermost nodes
+    width = rows.shape[1]
+    lon_first, step_lon, lat_first, step_lat = grid
+    turn = 360.0 / step_lon
+    for i in range(lon.size):
+        col = (lon[i] - lon_first) / step_lon + slack
+        col = col - np.floor(col / turn) * turn - slack
+        row = (lat_first - lat[i]) / step_lat
+        good = row > -slack and row < height - 1 + slack
+        good = good and (around > 0 or col < width - 1 + slack)
+        inside[i] = good
+        if not good:
+            out[i] = np.nan
+            continue
+        row = min(max(row, 0.0), height - 1.0)
+        top = min(int(row), max(height - 2, 0))
+        down = row - top
+        below = min(top + 1, height - 1)
+        if around > 0:
+            left = int(np.floor(col))
+            part = col - left
+            left %= around
+            right = (left + 1) % around
+        else:
+            col = min(max(col, 0.0), width - 1.0)
+            left = min(int(col), max(width - 2, 0))
+            part = col - left
+            right = min(left + 1, width - 1)
+        top, below = top - first_row, below - first_row
+        out[i] = (1 - down) * ((1 - part) * rows[top, left] + part * rows[top, right]) + down * (
+            (1 - part) * rows[below, left] + part * rows[below, right]
+        )
+
+
 @dataclass
 class GeoidGrid:
     """Undulations N (m above the GRS 80 or WGS 84 ellipsoid) of a GTX or GeoTIFF grid.
@@ -417,12 +469,14 @@ class GeoidGrid:
         """
         if lon.size == 0:
             return np.empty(0)
-        slack = 1e-6  # of a node's step, against rounding at the outermost nodes
-        col = np.mod((lon - self.lon_first) / self.step_lon + slack, 360 / self.step_lon) - slack
-        row = (self.lat_first - lat) / self.step_lat
-        inside = (row > -slack) & (row < self.height - 1 + slack)
-        if not self.around:
-            inside &= col < self.width - 1 + slack
+        ends = (self.lat_first - np.array([lat.max(), lat.min()])) / self.step_lat
+        top, bottom = np.clip(np.floor(ends), 0, max(self.height - 2, 0)).astype(int)
+        rows = self._window(int(top), int(min(bottom + 1, self.height - 1)))
+        undulation, inside = np.empty(lon.size), np.empty(lon.size, np.bool_)
+        grid = (self.lon_first, self.step_lon, self.lat_first, self.step_lat)
+        _bilinear(
+            rows, grid, self._first_row, self.height, self.around, lon, lat, undulation, inside
+        )
         if not inside.all():
             west, south = self.lon_first, self.lat_first - (self.height - 1) * self.step_lat
             east = west + (self.width - 1) * self.step_lon
@@ -432,25 +486,6 @@ class GeoidGrid:
                 f"{self.lat_first:.4f}), the first at {lon[~inside][0]:.5f}, {lat[~inside][0]:.5f}",
                 remedy="give a geoid grid that covers the LiDAR",
             )
-        row = np.clip(row, 0, self.height - 1)
-        top = np.clip(np.floor(row).astype(np.intp), 0, max(self.height - 2, 0))
-        down = row - top
-        below = np.minimum(top + 1, self.height - 1)
-        if self.around:
-            left = np.floor(col).astype(np.intp)
-            right_part = col - left
-            left %= self.around
-            right = (left + 1) % self.around
-        else:
-            col = np.clip(col, 0, self.width - 1)
-            left = np.clip(np.floor(col).astype(np.intp), 0, max(self.width - 2, 0))
-            right_part = col - left
-            right = np.minimum(left + 1, self.width - 1)
-        rows = self._window(int(top.min()), int(below.max()))
-        top, below = top - self._first_row, below - self._first_row
-        undulation = (1 - down) * (
-            (1 - right_part) * rows[top, left] + right_part * rows[top, right]
-        ) + down * ((1 - right_part) * rows[below, left] + right_part * rows[below, right])
         if not np.isfinite(undulation).all():
             bad = ~np.isfinite(undulation)
             raise InputError(
