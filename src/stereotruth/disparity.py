@@ -539,7 +539,9 @@ class _Scene:
         local = LocalProjection.of(self.model, (*low, low_h), (*high, high_h))
         first = wide[0].start, wide[1].start
         collection = Collection(shape, first, (low[0], low[1]), left, right)
-        builder = SurfaceBuilder(self.rays, (low[0], low[1]), (high[0], high[1]))
+        builder = None
+        if self.settings.uses_geometry:
+            builder = SurfaceBuilder(self.rays, (low[0], low[1]), (high[0], high[1]))
         for strip in strips:
             for store in self.stores:
                 points = store.query(*strip)
@@ -549,12 +551,13 @@ class _Scene:
                     collection.add(
                         *lattice, points.classification[where], local.at_points(*lattice)
                     )
-                    if self.settings.uses_geometry:
+                    if builder is not None:
                         builder.add(*lattice)
+        surface = None if builder is None else builder.built()
         points = collection.sorted()
         if points.points.size == 0 and not points.outside.any():
             return None
-        return points, local, builder.built() if self.settings.uses_geometry else None
+        return points, local, surface
 
     def test_points(
         self, points: PixelPoints, seen: NDArray[np.bool_], pixels: Pixels

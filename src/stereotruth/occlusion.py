@@ -544,7 +544,7 @@ def _raise_tops(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_tops(
-    index: Steps, height: Steps, top: Steps, tolerance: int, count: Steps, below: Steps
+    index: Steps, height: Steps, top: Steps, tolerance: int, count: Steps, below: Ints
 ) -> None:
     """Per cell, of the points at most ``tolerance`` below its top: number, sum of the depths."""
     for k in range(index.size):
@@ -556,7 +556,7 @@ def _sum_tops(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _means_of_tops(
-    top: Steps, count: Steps, below: Steps, per_m: int, out: NDArray[np.float32]
+    top: Steps, count: Steps, below: Ints, per_m: int, out: NDArray[np.float32]
 ) -> None:
     for k in range(top.size):
         n = np.int64(count[k])
@@ -655,7 +655,7 @@ class SurfaceBuilder:
         their neighbours, if three are known, in rounds of growing radius (roofs do not grow).
         """
         top = self.top.reshape(-1)
-        count, below = np.zeros(top.size, np.int32), np.zeros(top.size, np.int32)
+        count, below = np.zeros(top.size, np.int32), np.zeros(top.size, np.int64)
         tolerance = int(SURFACE_PX / self.rays.px_per_m * _PER_M)
         for index, depth in self.parts:
             _sum_tops(index, depth, top, tolerance, count, below)

@@ -9,6 +9,7 @@ on (rounded by 8e-6 px at most): sums are exact and comparisons the same in ever
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -54,7 +55,7 @@ class PixelPoints:
     first: tuple[int, int]
     origin: tuple[int, int]
 
-    @property
+    @cached_property
     def count(self) -> NDArray[np.int32]:
         """Number of points in both frames by pixel, [rows, cols]."""
         return np.diff(self.start).astype(np.int32).reshape(self.shape)

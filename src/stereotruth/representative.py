@@ -252,20 +252,15 @@ def at_centres(pixels: Pixels, valid: Bools, first: tuple[int, int], px_per_m: f
     label = np.empty(disparity.shape)
     slope, spread = np.zeros((2, *disparity.shape)), np.zeros(disparity.shape)
     _plane(disparity, pixels.x, pixels.y, *first, label, slope, spread)
-    variance = _noise(pixels, valid, slope, px_per_m)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.where(valid, variance / pixels.count + spread, np.nan)
+    variance = _noise(pixels, valid, slope, px_per_m) / np.maximum(pixels.count, 1) + spread
     return Labels(label, slope, variance)
 
 
 def at_points(pixels: Pixels, valid: Bools, px_per_m: float) -> Labels:
     """As :func:`at_centres`, with the disparity of each pixel's representative point."""
     level = np.zeros((2, *valid.shape))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = _noise(pixels, valid, level, px_per_m) / pixels.count
-    return Labels(
-        np.where(valid, pixels.disparity, np.nan), level, np.where(valid, variance, np.nan)
-    )
+    variance = _noise(pixels, valid, level, px_per_m) / np.maximum(pixels.count, 1)
+    return Labels(np.where(valid, pixels.disparity, np.nan), level, variance)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
