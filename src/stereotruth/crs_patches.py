@@ -1,6 +1,6 @@
 """A map projection's way to longitude and latitude as polynomials on patches of ground.
 
-PROJ takes some 200 ns for a point, these polynomials 10 ns. In a patch of 500 m by 500 m and 1000 m
+PROJ takes 130 to 900 ns for a point, these polynomials 6. In a patch of 500 m by 500 m and 1000 m
 of height, longitude, latitude and what the datum changes of the height are quadratic in the
 plane, and change linearly with height by an amount that is linear in the plane. A patch is fitted
 to PROJ where a point first needs it, and checked against PROJ on a grid of other points up to its
