@@ -1,7 +1,7 @@
 """Ground to epipolar pixels by polynomials, one for each cube of the points' lattice.
 
 RPCs and epipolar splines are smooth: over 105 m (117 m along a meridian) a cubic polynomial of
-longitude, latitude and height is off by less than 1e-6 px (2e-7 px at most on six scenes), and
+longitude, latitude and height is off by 1e-6 px at most (on six scenes), and
 takes a tenth of the time. Cubes are those of the global lattice and a polynomial depends on nothing
 but the model, so that a point has the same place in whatever window it is worked on. Where a
 polynomial is off by more than TOLERANCE_PX, the model itself is taken.
