@@ -13,15 +13,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from .errors import InputError
 from .locking import exclusive
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CONVENTIONS = (
     "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
@@ -187,5 +189,7 @@ def require_complete(path: str | Path) -> zarr.Group:
 
 def open_grid(path: str | Path) -> xr.Dataset:
     """A finished grid store as a lazy xarray Dataset (Dask chunks = shards)."""
+    import xarray as xr  # a quarter of a job's start-up, and most jobs need none
+
     require_complete(path)
     return xr.open_zarr(path, consolidated=True, mask_and_scale=False)

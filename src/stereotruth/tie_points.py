@@ -23,7 +23,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .points import PointStore, query_points
-from .rectification import ANTIALIAS, RADIUS, Source, sample, tap_weights
+from .rectification import Source
+from .resampling import ANTIALIAS, RADIUS, sample, tap_weights
 from .rpc import SensorModel
 
 Floats = NDArray[np.float64]

@@ -14,7 +14,8 @@ from rasterio.errors import NotGeoreferencedWarning
 from stereotruth.epipolar import fit_epipolar
 from stereotruth.errors import InputError
 from stereotruth.grid_store import open_grid
-from stereotruth.rectification import Source, rectify, resample
+from stereotruth.rectification import Source, rectify
+from stereotruth.resampling import resample
 from stereotruth.rpc import SensorModel
 
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
