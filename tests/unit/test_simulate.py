@@ -336,7 +336,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "simulate.render", "simulate.lidar", "simulate.truth", "simulate.points"
     )
     others = {m for m in modules if not m.startswith("simulate")}
-    assert others <= {"", "errors", "grid_store", "runlog", "provenance"}
+    assert others <= {"", "errors", "grid_store", "locking", "runlog", "provenance"}
 
 
 def test_lidar_tiles_part_the_scene() -> None:

@@ -7,6 +7,7 @@ from stereotruth.runlog import job
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
+    files = [*snakemake.input.left, *snakemake.input.right, snakemake.input.alignment]
     with job(snakemake.log[0], f"rectify {scene}"):
         alignment = Alignment.load(snakemake.input.alignment)
         rectify(
@@ -20,5 +21,5 @@ if __name__ == "__main__":
             snakemake.output.right,
             workers=snakemake.threads,
             label_sigma=alignment.label_sigma,
-            provenance=describe(snakemake.input, {}, snakemake.params.code),
+            provenance=describe(files, {}, snakemake.params.code),
         )
