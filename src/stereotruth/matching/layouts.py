@@ -76,6 +76,7 @@ class StereoDataset:
 
     ``disparity_range``: px, first inclusive, second exclusive; labels outside count nowhere.
     ``nodata``: value of unlabelled pixels (NaN and the file's own nodata are such too).
+    ``grows_with_height``: whether, of two disparities, the larger is the higher place.
     """
 
     name: str
@@ -83,6 +84,7 @@ class StereoDataset:
     layout: str
     disparity_range: tuple[int, int]
     nodata: float = -999.0
+    grows_with_height: bool = True
 
     @classmethod
     def of(cls, name: str, settings: Mapping[str, Any]) -> StereoDataset:
@@ -94,7 +96,14 @@ class StereoDataset:
                 remedy="give the smallest disparity first",
             )
         nodata = float(settings.get("nodata", -999))
-        return cls(name, Path(settings["root"]), settings["layout"], (low, high), nodata)
+        return cls(
+            name,
+            Path(settings["root"]),
+            settings["layout"],
+            (low, high),
+            nodata,
+            settings.get("grows_with_height", True),
+        )
 
     def pairs(self, split: str | None = None, *, labelled: bool = False) -> list[Pair]:
         """The pairs of a split (None: all), only those with labels if ``labelled``.

@@ -32,12 +32,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .sgm import SemiGlobalMatcher
 
 NETWORKS = ("stereonet", "psmnet", "hmsmnet")
 FOLDER = "folder"
 KINDS = ("sgm", *NETWORKS, "function", FOLDER)
+MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks")}
 ENTRY_POINTS = "stereotruth.methods"
+SHOWN = ("kind", "label", "fine_tuned_of")  # keys of an entry that are no settings
 MARGIN_PX = 128  # of a user's function that states none
 
 DisparityRange = tuple[int, int]
@@ -107,16 +108,18 @@ class FunctionMethod:
 def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Matcher:
     """The method of a configuration entry; ``workers`` are the threads that it may use.
 
+    ``label`` (how tables call the method) and ``fine_tuned_of`` (the method whose training was
+    carried on) are no settings.
+
     Raises InputError for an unknown kind, a function that cannot be found, and settings that the
     method does not take.
     """
-    kind, options = settings.get("kind"), {k: v for k, v in settings.items() if k != "kind"}
+    kind, options = settings.get("kind"), {k: v for k, v in settings.items() if k not in SHOWN}
     if kind in NETWORKS:
-        from .networks import network_method
-
-        return network_method(kind, options)
+        return _module_of(kind).network_method(kind, options)
     if kind == "sgm":
-        return _called(name, SemiGlobalMatcher, {**options, "workers": workers})
+        make = _module_of(kind).SemiGlobalMatcher
+        return _called(name, make, {**options, "workers": workers})
     if kind == "function":
         return _called(name, _function_method, {**options, "name": name})
     if kind == FOLDER:
@@ -124,6 +127,11 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
     raise InputError(
         f"method {name!r} is of unknown kind {kind!r}", remedy=f"take one of {', '.join(KINDS)}"
     )
+
+
+def _module_of(kind: str) -> Any:
+    """Imported by its name, so that code digests of one method do not hold the others' code."""
+    return importlib.import_module(f"stereotruth.{MODULES[kind]}")
 
 
 def _called(name: str, make: Callable[..., Matcher], settings: Mapping[str, Any]) -> Matcher:

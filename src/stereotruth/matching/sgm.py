@@ -34,6 +34,7 @@ STEP = 16  # OpenCV's disparities come in units of 1/16 px, and in ranges of mul
 TAIL = 0.005
 TAIL_LEVELS = 16.0  # of the 8 bits, for each tail
 SAMPLES = 1 << 22  # pixels of each image that the grey range is taken from
+NO_CHECK = 1 << 14  # px; to OpenCV, what is not positive means 1 px
 MARGIN_PX = 64
 
 
@@ -64,7 +65,7 @@ class SemiGlobalMatcher:
     ``mode``: sgbm (five paths) | hh (eight) | 3way | hh4 (four). ``block_size``: px, odd. ``p1``,
     ``p2``: penalties of disparities that change by one and by more; null: 8 and 32 times the
     pixels of the block. ``uniqueness_percent``: by which the best cost must beat the next.
-    ``left_right_px``: largest difference of the two directions; negative: no check.
+    ``left_right_px``: largest difference of the two directions; null: no check.
     ``speckle_px``: smaller patches of disparities within ``speckle_range_px`` are invalid; 0: none.
     ``prefilter_cap``: bound of the horizontal gradients that are compared. ``workers``: threads, in
     modes that have any.
@@ -80,7 +81,7 @@ class SemiGlobalMatcher:
         p1: int | None = None,
         p2: int | None = None,
         uniqueness_percent: int = 5,
-        left_right_px: int = 1,
+        left_right_px: int | None = 1,
         speckle_px: int = 100,
         speckle_range_px: int = 1,
         prefilter_cap: int = 63,
@@ -105,7 +106,7 @@ class SemiGlobalMatcher:
             "P1": p1,
             "P2": p2,
             "uniquenessRatio": uniqueness_percent,
-            "disp12MaxDiff": left_right_px,
+            "disp12MaxDiff": NO_CHECK if left_right_px is None else max(left_right_px, 1),
             "speckleWindowSize": speckle_px,
             "speckleRange": speckle_range_px,
             "preFilterCap": prefilter_cap,
