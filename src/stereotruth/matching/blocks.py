@@ -1,0 +1,311 @@
+"""A stereo method over images of any size: overlapping tiles, put together without seams.
+
+The left grid is cut into square blocks. A *tile* is what the method says of a block and of
+``overlap`` px around it; for that it sees the images with the margins that it needs: ``margin_px``
+to all sides and, along the row, the disparity range. The right part is moved by a whole number of
+pixels, the tile's *offset*, so that a scene may have more relief than the method has range:
+``d = offset + d_method``.
+
+Where tiles overlap, their disparities are averaged with weights that fall smoothly from one to the
+other, unless they differ by more than ``AGREE_PX``: then they say different things (roof and
+ground), nothing in between is true, and the block's own tile has the word, as it has on whether a
+pixel is valid. Pixels that one of the images does not show are invalid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .methods import DisparityRange, Matcher
+
+Disparities = NDArray[np.float32]
+Window = tuple[slice, slice]
+Place = tuple[int, int]
+
+BLOCK_PX = 1024
+OVERLAP_PX = 64
+AGREE_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Blocks of ``block`` px over a grid of ``shape``; tiles reach ``overlap`` px further.
+
+    Places (i, j) count blocks along rows and columns. Raises ValueError if the overlap is more
+    than half a block: no more than two tiles may meet along an axis.
+    """
+
+    shape: tuple[int, int]
+    block: int = BLOCK_PX
+    overlap: int = OVERLAP_PX
+
+    def __post_init__(self) -> None:
+        if not 0 <= 2 * self.overlap <= self.block:
+            raise ValueError(f"overlap of {self.overlap} px for blocks of {self.block} px")
+
+    @property
+    def count(self) -> tuple[int, int]:
+        """Number of blocks along rows and columns."""
+        return -(-self.shape[0] // self.block), -(-self.shape[1] // self.block)
+
+    @property
+    def side(self) -> int:
+        """Of a tile, px."""
+        return self.block + 2 * self.overlap
+
+    def places(self) -> Iterator[Place]:
+        """All (i, j) in row-major order."""
+        return ((i, j) for i in range(self.count[0]) for j in range(self.count[1]))
+
+    def around(self, place: Place) -> list[Place]:
+        """The places whose tiles reach into a block, its own among them."""
+        ranges = (range(max(k - 1, 0), min(k + 2, n)) for k, n in zip(place, self.count))
+        rows, cols = ranges
+        return [(i, j) for i in rows for j in cols]
+
+    def block_window(self, place: Place) -> Window:
+        """[row, col] of a block."""
+        starts = [k * self.block for k in place]
+        return tuple(slice(s, min(s + self.block, n)) for s, n in zip(starts, self.shape))
+
+    def tile_window(self, place: Place) -> Window:
+        """[row, col] of a tile; it may reach beyond the grid."""
+        starts = [k * self.block - self.overlap for k in place]
+        return tuple(slice(s, s + self.side) for s in starts)
+
+
+# --------------------------------------------------------------------------------------- one tile
+
+
+@dataclass(frozen=True)
+class View:
+    """What a method needs to see of both images, [row, col] of each; the same shape.
+
+    ``left`` may reach beyond the left image and ``right`` beyond the right one. ``inner`` is the
+    wanted window within it.
+    """
+
+    left: Window
+    right: Window
+    inner: Window
+
+
+def view_of(
+    shape: tuple[int, int],
+    window: Window,
+    margin: int,
+    disparity_range: DisparityRange,
+    offset: int,
+) -> View:
+    """The view for a window of the left grid, cut to where one of the images has pixels."""
+    rows, cols = window
+    low, high = disparity_range
+    top, bottom = max(rows.start - margin, 0), min(rows.stop + margin, shape[0])
+    first = max(cols.start - margin - max(high, 0), min(0, offset))
+    last = min(cols.stop + margin + max(-low, 0), shape[1] + max(0, offset))
+    return View(
+        left=(slice(top, bottom), slice(first, last)),
+        right=(slice(top, bottom), slice(first - offset, last - offset)),
+        inner=(
+            slice(max(rows.start, 0) - top, min(rows.stop, shape[0]) - top),
+            slice(max(cols.start, 0) - first, min(cols.stop, shape[1]) - first),
+        ),
+    )
+
+
+def inside(image: Any, window: Window) -> Any:
+    """The part of an image [h, w] or [h, w, bands] (NumPy, Dask, Zarr) that a window meets."""
+    rows, cols = window
+    return image[
+        max(rows.start, 0) : max(min(rows.stop, image.shape[0]), 0),
+        max(cols.start, 0) : max(min(cols.stop, image.shape[1]), 0),
+    ]
+
+
+def _padded(part: Any, window: Window, shape: tuple[int, int]) -> NDArray[Any]:
+    """A part that :func:`inside` gave as the whole window, 0 beyond the image of ``shape``."""
+    part = np.asarray(part)
+    sizes = tuple(w.stop - w.start for w in window)
+    if part.shape[:2] == sizes:
+        return np.ascontiguousarray(part)
+    whole = np.zeros((*sizes, *part.shape[2:]), dtype=part.dtype)
+    at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, part.shape))
+    whole[at] = part
+    return whole
+
+
+def _shown(image: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels that are not nodata."""
+    return (image != 0).any(axis=2) if image.ndim == 3 else image != 0
+
+
+def predict_tile(
+    matcher: Matcher,
+    left: Any,
+    right: Any,
+    view: View,
+    tiling: Tiling,
+    place: Place,
+    disparity_range: DisparityRange,
+    offset: int,
+    scaling: Any = None,
+) -> Disparities:
+    """The tile at a place, float32[side, side], NaN where invalid or beyond the grid.
+
+    ``left``, ``right``: the parts of the images that the ``view`` meets (:func:`inside`).
+    """
+    left = _padded(left, view.left, tiling.shape)
+    right = _padded(right, view.right, tiling.shape)
+    tile = np.full((tiling.side, tiling.side), np.nan, dtype=np.float32)
+    shown = _shown(left)[view.inner]
+    in_right = _shown(right)
+    if not (shown.any() and in_right.any()):
+        return tile
+    found = matcher(left, right, disparity_range, scaling)[view.inner]
+    cols = np.arange(view.inner[1].start, view.inner[1].stop)
+    with np.errstate(invalid="ignore"):
+        there = np.floor(cols - found + 0.5)
+        shown &= (there >= 0) & (there < right.shape[1])
+    there = np.where(shown, there, 0).astype(np.intp)
+    shown &= np.take_along_axis(in_right[view.inner[0]], there, axis=1)
+    window = tiling.tile_window(place)
+    at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, found.shape))
+    tile[at] = np.where(shown, found + np.float32(offset), np.float32(np.nan))
+    return tile
+
+
+# --------------------------------------------------------------------------------------- blending
+
+
+def _ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 (t = -1) to 1 (t = 1), level at both ends."""
+    t = np.clip(t, -1.0, 1.0)
+    return 0.5 + 0.75 * t - 0.25 * t**3
+
+
+def _weights(tiling: Tiling, axis: int, k: int) -> dict[int, NDArray[np.float64]]:
+    """Weights of the tiles k - 1, k and k + 1 at the pixels of block k of an axis; sum 1."""
+    window = tiling.block_window((k, k))[axis]
+    at = np.arange(window.start, window.stop) + 0.5
+    found = {k: np.ones(at.size)}
+    if tiling.overlap and k > 0:
+        found[k - 1] = 1.0 - _ramp((at - window.start) / tiling.overlap)
+    if tiling.overlap and k + 1 < tiling.count[axis]:
+        found[k + 1] = _ramp((at - window.stop) / tiling.overlap)
+    for other in set(found) - {k}:
+        found[k] = found[k] - found[other]
+    return found
+
+
+def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Disparities:
+    """The block at a place from the tiles that reach into it, float32[h, w].
+
+    ``tiles``: arrays [side, side] (NumPy or Zarr) of all places of :meth:`Tiling.around`.
+    """
+    rows, cols = tiling.block_window(place)
+
+    def part(other: Place, window: Window) -> NDArray[np.float64]:
+        of = tiling.tile_window(other)
+        moved = tuple(slice(w.start - o.start, w.stop - o.start) for w, o in zip(window, of))
+        return np.asarray(tiles[other][moved], dtype=np.float64)
+
+    own = part(place, (rows, cols))
+    change = np.zeros_like(own)
+    for i, in_rows in _weights(tiling, 0, place[0]).items():
+        for j, in_cols in _weights(tiling, 1, place[1]).items():
+            if (i, j) == place:
+                continue
+            r, c = (_extent(w) for w in (in_rows, in_cols))
+            if r is None or c is None:
+                continue
+            window = tuple(
+                slice(o.start + w.start, o.start + w.stop) for o, w in zip((rows, cols), (r, c))
+            )
+            with np.errstate(invalid="ignore"):
+                difference = part((i, j), window) - own[r, c]
+                agree = np.abs(difference) <= AGREE_PX
+            weight = in_rows[r, None] * in_cols[None, c]
+            change[r, c] += np.where(agree, weight * difference, 0.0)
+    return (own + change).astype(np.float32)
+
+
+def _extent(weights: NDArray[np.float64]) -> slice | None:
+    """Where the weights are not 0."""
+    found = np.flatnonzero(weights > 0.0)
+    return slice(int(found[0]), int(found[-1]) + 1) if found.size else None
+
+
+# ------------------------------------------------------------------------------------ whole images
+
+
+def match(
+    matcher: Matcher,
+    left: Any,
+    right: Any,
+    disparity_range: DisparityRange,
+    *,
+    block: int = BLOCK_PX,
+    overlap: int = OVERLAP_PX,
+    offset: str | int | NDArray[np.int64] = 0,
+    search: DisparityRange | None = None,
+) -> Any:
+    """Disparity of whole images [h, w] or [h, w, 3] of one shape, NumPy or Dask; 0 is nodata.
+
+    Of NumPy arrays the disparity itself, float32[h, w] px (NaN: invalid); of Dask arrays a lazy
+    array in chunks of ``block``, whose memory is that of some tiles. ``offset``: of the right
+    image, px; one for all, one for each block [n, m], or "auto": found from the images within the
+    ``search`` range, see :mod:`offsets`.
+    """
+    import dask
+    import dask.array as da
+
+    from .offsets import find_offsets
+
+    lazy = isinstance(left, da.Array)
+    tiling = Tiling(tuple(left.shape[:2]), block, overlap)
+    scaling = matcher.scaling(left, right)
+    if isinstance(offset, str):
+        offset = find_offsets(left, right, tiling, disparity_range, search).offsets
+    offsets = np.broadcast_to(offset, tiling.count)
+    tiles = {}
+    for place in tiling.places():
+        moved = int(offsets[place])
+        view = view_of(
+            tiling.shape, tiling.tile_window(place), matcher.margin_px, disparity_range, moved
+        )
+        tiles[place] = dask.delayed(predict_tile, pure=False)(
+            matcher,
+            inside(left, view.left),
+            inside(right, view.right),
+            view,
+            tiling,
+            place,
+            disparity_range,
+            moved,
+            scaling,
+        )
+    rows = []
+    for i in range(tiling.count[0]):
+        row = []
+        for j in range(tiling.count[1]):
+            around = {place: tiles[place] for place in tiling.around((i, j))}
+            found = dask.delayed(_blend_lists, pure=False)(
+                tiling, (i, j), list(around), list(around.values())
+            )
+            shape = tuple(w.stop - w.start for w in tiling.block_window((i, j)))
+            row.append(da.from_delayed(found, shape, np.float32))
+        rows.append(row)
+    whole = da.block(rows)
+    return whole if lazy else whole.compute(scheduler="synchronous")
+
+
+def _blend_lists(
+    tiling: Tiling, place: Place, places: list[Place], tiles: list[Disparities]
+) -> Disparities:
+    """:func:`blend` for Dask, which looks for its tasks in lists, not in keys of mappings."""
+    return blend(tiling, place, dict(zip((tuple(p) for p in places), tiles)))
