@@ -1,0 +1,269 @@
+"""The stereo networks as methods of the benchmark: scaling of images, weight files, inference.
+
+A weight file (``.pt``) holds a network's weights and what is needed to use them: kind, disparity
+range, channels, scaling of the images, and where they come from.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ..errors import InputError
+from ..grid_store import replacing
+from .hmsmnet import HMSMNet
+from .layers import channels_last
+from .psmnet import PSMNet
+from .stereonet import StereoNet
+
+log = logging.getLogger("stereotruth")
+
+KINDS: dict[str, type[nn.Module]] = {"stereonet": StereoNet, "psmnet": PSMNet, "hmsmnet": HMSMNet}
+SCALINGS = ("standardise", "us3d")
+GREY = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a network is made of besides its weights.
+
+    ``kind`` of :data:`KINDS`; ``disparity_range`` in px, max exclusive; ``channels`` of its images
+    (1 or 3); ``scaling``: ``standardise`` (each image by its mean and standard deviation, as for
+    WHU-Stereo) or ``us3d`` (8-bit values to -1 ... 1, blue first, as for US3D).
+    """
+
+    kind: str
+    disparity_range: tuple[int, int]
+    channels: int = 1
+    scaling: str = "standardise"
+
+    def build(self) -> nn.Module:
+        """The network with fresh weights, from torch's random numbers.
+
+        Raises InputError if its planes cannot cover the range.
+        """
+        try:
+            return KINDS[self.kind](self.disparity_range, self.channels)
+        except ValueError as error:
+            raise InputError(
+                f"{self.kind}: {error}", remedy="widen disparity_range to such multiples"
+            ) from error
+
+
+def save_model(
+    path: str | Path, model: Model, network: nn.Module, provenance: Mapping[str, Any]
+) -> None:
+    """Write a weight file in one step."""
+    record = {
+        "model": asdict(model),
+        "weights": {name: value.cpu() for name, value in network.state_dict().items()},
+        "provenance": dict(provenance),
+    }
+    with replacing(path) as scratch:
+        torch.save(record, scratch)
+
+
+def load_model(path: str | Path) -> tuple[Model, nn.Module, dict[str, Any]]:
+    """The network of a weight file, and the file's provenance.
+
+    Raises InputError if there is no such file, or it is another kind of file.
+    """
+    try:
+        record = torch.load(path, map_location="cpu", weights_only=True)
+        model = Model(
+            **{**record["model"], "disparity_range": tuple(record["model"]["disparity_range"])}
+        )
+        network = model.build()
+        network.load_state_dict(record["weights"])
+    except FileNotFoundError as error:
+        raise InputError(
+            "no such weight file", file=path, remedy="train the network, or name its weights"
+        ) from error
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"not a weight file of this version ({type(error).__name__})",
+            file=path,
+            remedy="train the network again; Keras weights (.h5) are converted by "
+            "python -m stereotruth.matching.keras_weights",
+        ) from error
+    return model, network, record["provenance"]
+
+
+class Scaling(NamedTuple):
+    """Mean and standard deviation of both whole images: what their blocks must share."""
+
+    left: tuple[float, float]
+    right: tuple[float, float]
+
+
+def image_scaling(image: Any) -> tuple[float, float]:
+    """Mean and standard deviation over the pixels of an image that are not nodata (0).
+
+    NumPy or Dask array of any size; exact sums, so the same whatever the blocks.
+    """
+    import dask.array as da
+
+    lazy = image if isinstance(image, da.Array) else da.from_array(np.asarray(image))
+    if np.issubdtype(lazy.dtype, np.integer):
+        wide = lazy.astype(np.uint64)
+        n, s, q = da.compute((lazy != 0).sum(), wide.sum(), (wide * wide).sum())
+    else:
+        wide = lazy.astype(np.float64)
+        n, s, q = da.compute((lazy != 0).sum(), wide.sum(), (wide * wide).sum())
+    if not n:
+        return 0.0, 1.0
+    mean = int(s) / int(n) if np.issubdtype(lazy.dtype, np.integer) else float(s) / int(n)
+    variance = float(q) / int(n) - mean * mean
+    return mean, max(variance, 0.0) ** 0.5 or 1.0
+
+
+def scaled(
+    image: NDArray[Any], model: Model, statistics: tuple[float, float] | None
+) -> NDArray[np.float32]:
+    """[H, W] or [H, W, 3] pixels -> [C, H, W] as the network takes them; nodata becomes 0."""
+    grey = image.ndim == 2
+    if model.scaling == "us3d":
+        bands = np.repeat(image[..., None], 3, axis=2) if grey else image[..., ::-1]
+        bands = _eight_bit(bands) / np.float32(127.5) - 1
+        if model.channels == 1:
+            bands = bands[..., ::-1] @ np.array(GREY, np.float32)[:, None]
+        return np.ascontiguousarray(bands.transpose(2, 0, 1), dtype=np.float32)
+    if not grey and model.channels == 1:
+        image = image @ np.array(GREY, np.float32)
+    mean, deviation = statistics if statistics is not None else image_scaling(image)
+    out = (image.astype(np.float32) - np.float32(mean)) / np.float32(deviation)
+    out[image == 0] = 0
+    if out.ndim == 2:
+        return np.repeat(out[None], model.channels, axis=0)
+    return np.ascontiguousarray(out.transpose(2, 0, 1))
+
+
+def _eight_bit(bands: NDArray[Any]) -> NDArray[np.float32]:
+    """Pixels as 0 ... 255: wider ones are brought there by their 99.9 % quantile."""
+    if bands.dtype == np.uint8:
+        return bands.astype(np.float32)
+    top = float(np.quantile(bands, 0.999)) or 1.0
+    return np.minimum(bands.astype(np.float32) * np.float32(255 / top), 255)
+
+
+def padding(height: int, width: int, divisor: int) -> tuple[int, int]:
+    """Rows and columns to add so that both sides are multiples of ``divisor``."""
+    return -height % divisor, -width % divisor
+
+
+def choose_device(wanted: str | None) -> torch.device:
+    """The device of that name; None: a GPU if there is one.
+
+    Raises InputError if it is not to be had.
+    """
+    name = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.zeros(1, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"device {name}: {str(error).splitlines()[0]}", remedy="set device to null, or cpu"
+        ) from error
+
+
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+def precision_of(wanted: str | None, device: torch.device) -> str:
+    """The name of a precision; None: float32 on a CPU, mixed with bfloat16 on a GPU."""
+    return wanted or ("bfloat16" if device.type == "cuda" else "float32")
+
+
+def mixed(precision: str, device: torch.device) -> Any:
+    """The context in which a network computes at that precision."""
+    kind = PRECISIONS[precision]
+    return nullcontext() if kind is None else torch.autocast(device.type, kind)
+
+
+class NetworkMethod:
+    """A network with its weights as a method; see :class:`methods.Matcher`."""
+
+    def __init__(
+        self, model: Model, network: nn.Module, device: torch.device, precision: str
+    ) -> None:
+        self.model, self.device, self.precision = model, device, precision
+        self.network = channels_last(network.eval().to(device))
+        self.margin_px = network.margin_px
+
+    def scaling(self, left: Any, right: Any) -> Scaling | None:
+        """Statistics of whole images (NumPy or Dask); None if the network needs none."""
+        if self.model.scaling == "us3d":
+            return None
+        return Scaling(image_scaling(left), image_scaling(right))
+
+    def __call__(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: tuple[int, int],
+        scaling: Scaling | None = None,
+    ) -> NDArray[np.float32]:
+        """Disparity [H, W] of the left image, px; NaN where the left pixel is nodata.
+
+        Raises InputError if ``disparity_range`` is not within the network's own.
+        """
+        low, high = self.model.disparity_range
+        if disparity_range[0] < low or disparity_range[1] > high:
+            raise InputError(
+                f"{self.model.kind} covers disparities of {low} to {high} px, "
+                f"{disparity_range[0]} to {disparity_range[1]} px are asked for",
+                remedy="train it for that range, or narrow the range of the dataset",
+            )
+        height, width = left.shape[:2]
+        rows, cols = padding(height, width, self.network.divisor)
+        both = []
+        for image, statistics in zip((left, right), scaling or (None, None)):
+            tensor = torch.from_numpy(scaled(image, self.model, statistics))[None]
+            both.append(F.pad(tensor, (0, cols, 0, rows)).to(self.device))
+        with torch.inference_mode(), mixed(self.precision, self.device):
+            found: Tensor = self.network(*both)[-1]
+        disparity = found[0, :height, :width].float().cpu().numpy()
+        seen = (left if left.ndim == 2 else left.any(axis=2)) != 0
+        return np.where(seen, disparity, np.float32(np.nan))
+
+
+def network_method(kind: str, settings: Mapping[str, Any]) -> NetworkMethod:
+    """The method of a configuration entry: ``weights`` (a .pt or Keras' .h5), ``device``,
+    ``precision``; for .h5 also ``disparity_range``, ``channels`` and ``scaling``.
+
+    Raises InputError if the weights are missing or those of another network.
+    """
+    path = settings.get("weights")
+    if path is None:
+        raise InputError(
+            f"{kind}: no weights", remedy="train it, or name a file in benchmark.methods"
+        )
+    if Path(path).suffix in (".h5", ".hdf5"):
+        from .keras_weights import load_keras
+
+        channels = settings.get("channels", 1)
+        model = Model(
+            kind,
+            tuple(settings.get("disparity_range") or (-128, 64)),
+            channels,
+            settings.get("scaling") or ("us3d" if channels == 3 else "standardise"),
+        )
+        network = model.build()
+        load_keras(network, path)
+    else:
+        model, network, _ = load_model(path)
+        if model.kind != kind:
+            raise InputError(
+                f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
+            )
+    device = choose_device(settings.get("device"))
+    return NetworkMethod(model, network, device, precision_of(settings.get("precision"), device))
