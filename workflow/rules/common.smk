@@ -9,6 +9,7 @@ from snakemake.exceptions import WorkflowError
 from stereotruth import sheets
 from stereotruth.errors import InputError
 from stereotruth.locking import FileLock
+from stereotruth.matching.kinds import LABELS as METHOD_LABELS, MODULES as METHOD_MODULES
 from stereotruth.provenance import PACKAGE, file_sha256, source_digest
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
@@ -186,3 +187,84 @@ def made():
         for line in json.loads(file.read_text())["lines"]
     ]
     return "\n".join(["", *lines]) if lines else "done"
+
+
+def dataset_settings(name):
+    """The entry of a dataset in the configuration's section benchmark."""
+    known = {n: of for n, of in config["benchmark"]["datasets"].items() if of}
+    if name not in known:
+        raise WorkflowError(
+            f"benchmark.datasets: no dataset {name!r}. "
+            f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
+        )
+    return known[name]
+
+
+def dataset_folder(name):
+    """The root of a dataset; the workflow makes its own."""
+    root = str(Path(dataset_settings(name)["root"]))
+    if root != "dataset" and not Path(root).is_dir():
+        raise WorkflowError(
+            f"benchmark.datasets.{name}.root: {root}: no such folder. "
+            "Remedy: name the dataset's folder"
+        )
+    return root
+
+
+def is_own_dataset(name):
+    """Whether the workflow makes the dataset."""
+    return dataset_folder(name) == "dataset"
+
+
+def method_settings(name):
+    """The entry of a method in the configuration's section benchmark."""
+    known = {n: of for n, of in config["benchmark"]["methods"].items() if of}
+    if name not in known:
+        raise WorkflowError(
+            f"benchmark.methods: no method {name!r}. "
+            f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
+        )
+    return known[name]
+
+
+def methods_of(dataset):
+    """Names of the methods that are compared on a dataset."""
+    known = [n for n, of in config["benchmark"]["methods"].items() if of]
+    return dataset_settings(dataset).get("methods") or known
+
+
+def method_files(wildcards):
+    """Files that a method is made of: weights, the user's code, results to be scored."""
+    settings = method_settings(wildcards.method)
+    match settings["kind"]:
+        case "sgm":
+            return []
+        case "function":
+            file = settings.get("function", "").rpartition(":")[0]
+            return [file] if file.endswith(".py") else []
+        case "folder":
+            folder = Path(settings.get("folder", ""))
+            return sorted(str(file) for file in folder.glob("*") if file.is_file())
+    weights = settings.get("weights")
+    return [weights or f"results/train/{wildcards.dataset}/{wildcards.method}/best.pt"]
+
+
+def method_modules(name):
+    """Modules of the package that hold a method's own code."""
+    own = METHOD_MODULES.get(method_settings(name)["kind"])
+    return [] if own is None else [own]
+
+
+def method_label(name):
+    """How tables call a method."""
+    return method_settings(name).get("label") or METHOD_LABELS.get(name, name)
+
+
+def products_of_own_dataset():
+    """What tells the strata of the workflow's own dataset: status, classes, exact truth."""
+    scenes = SCENES.values()
+    return [
+        *(f"tiles/{city}" for city in CITIES),
+        *(f"results/project/{s.city}/{s.scene}.zarr" for s in scenes),
+        *(f"results/truth/{s.city}/{s.scene}.zarr" for s in scenes if is_synthetic(s)),
+    ]

@@ -32,11 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .kinds import FOLDER, KINDS, MODULES, NETWORKS
 
-NETWORKS = ("stereonet", "psmnet", "hmsmnet")
-FOLDER = "folder"
-KINDS = ("sgm", *NETWORKS, "function", FOLDER)
-MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks")}
 ENTRY_POINTS = "stereotruth.methods"
 SHOWN = ("kind", "label", "fine_tuned_of")  # keys of an entry that are no settings
 MARGIN_PX = 128  # of a user's function that states none
@@ -131,7 +128,15 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
 
 def _module_of(kind: str) -> Any:
     """Imported by its name, so that code digests of one method do not hold the others' code."""
-    return importlib.import_module(f"stereotruth.{MODULES[kind]}")
+    try:
+        return importlib.import_module(f"stereotruth.{MODULES[kind]}")
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == "stereotruth":
+            raise
+        raise InputError(
+            f"{kind} needs {error.name}, which is not installed",
+            remedy="pip install '.[networks]'",
+        ) from error
 
 
 def _called(name: str, make: Callable[..., Matcher], settings: Mapping[str, Any]) -> Matcher:

@@ -35,8 +35,9 @@ from ..grid_store import replacing
 from ..ledger import Ledger, link
 from ..provenance import digest, file_sha256
 from ..runlog import progress
+from .kinds import FOLDER
 from .layouts import Pair, StereoDataset, read_disparity, read_image
-from .methods import FOLDER, Matcher, make_method
+from .methods import Matcher, make_method
 
 log = logging.getLogger("stereotruth")
 

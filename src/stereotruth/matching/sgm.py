@@ -9,6 +9,11 @@ OpenCV computes no pixel whose range of matches leaves the right image. Here the
 so that every pixel has a disparity; it is invalid (NaN) where its match lies outside the right
 image, where either image has no data, outside the disparity range, and where OpenCV says so
 (uniqueness, left-right check, speckles).
+
+The defaults are those that did best, holes filled, on eight training and validation tiles of four
+synthetic cities (EPE 0.94 px, D1 6.4 %); OpenCV's sample (block 5, p2 32 times its pixels,
+gradients up to 63) has 1.26 px and 9.1 % there. On two pairs of US3D all settings tried were much
+alike (D1 25-29 %).
 """
 
 from __future__ import annotations
@@ -63,7 +68,7 @@ class SemiGlobalMatcher:
     """OpenCV's semi-global matching as a Matcher.
 
     ``mode``: sgbm (five paths) | hh (eight) | 3way | hh4 (four). ``block_size``: px, odd. ``p1``,
-    ``p2``: penalties of disparities that change by one and by more; null: 8 and 32 times the
+    ``p2``: penalties of disparities that change by one and by more; null: 8 and 64 times the
     pixels of the block. ``uniqueness_percent``: by which the best cost must beat the next.
     ``left_right_px``: largest difference of the two directions; null: no check.
     ``speckle_px``: smaller patches of disparities within ``speckle_range_px`` are invalid; 0: none.
@@ -76,15 +81,15 @@ class SemiGlobalMatcher:
     def __init__(
         self,
         *,
-        mode: str = "hh",
-        block_size: int = 5,
+        mode: str = "hh4",
+        block_size: int = 3,
         p1: int | None = None,
         p2: int | None = None,
         uniqueness_percent: int = 5,
         left_right_px: int | None = 1,
         speckle_px: int = 100,
         speckle_range_px: int = 1,
-        prefilter_cap: int = 63,
+        prefilter_cap: int = 31,
         workers: int = 1,
     ) -> None:
         if mode not in MODES:
@@ -94,7 +99,7 @@ class SemiGlobalMatcher:
                 f"SGM's block_size of {block_size} px is not odd", remedy="take 1, 3, 5, …"
             )
         area = block_size**2
-        p1, p2 = 8 * area if p1 is None else p1, 32 * area if p2 is None else p2
+        p1, p2 = 8 * area if p1 is None else p1, 64 * area if p2 is None else p2
         if not 0 < p1 < p2:
             raise InputError(
                 f"SGM's penalties p1 = {p1} and p2 = {p2} are not 0 < p1 < p2",

@@ -1,0 +1,119 @@
+rule match:
+    input:
+        dataset=lambda w: dataset_folder(w.dataset),
+        files=method_files,
+    output:
+        directory("results/match/{dataset}/{method}"),
+    log:
+        "logs/match/{dataset}/{method}.log",
+    benchmark:
+        "benchmarks/match/{dataset}/{method}.tsv"
+    wildcard_constraints:
+        dataset="[^/]+",
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=6000,
+        runtime=480,
+    params:
+        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
+        method=lambda w: method_settings(w.method),
+        split=config["benchmark"]["split"],
+        code=lambda w: source_digest("matching.predictions", *method_modules(w.method)),
+    message:
+        "Matching dataset {wildcards.dataset} by {wildcards.method}"
+    script:
+        "../scripts/match.py"
+
+
+rule score:
+    input:
+        dataset=lambda w: dataset_folder(w.dataset),
+        predictions=rules.match.output[0],
+        strata=lambda w: products_of_own_dataset() if is_own_dataset(w.dataset) else [],
+    output:
+        directory("benchmark/{dataset}/{method}"),
+    log:
+        "logs/score/{dataset}/{method}.log",
+    benchmark:
+        "benchmarks/score/{dataset}/{method}.tsv"
+    wildcard_constraints:
+        dataset="[^/]+",
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=120,
+    params:
+        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
+        split=config["benchmark"]["split"],
+        label=lambda w: method_label(w.method),
+        thresholds_px=config["benchmark"]["thresholds_px"],
+        bootstrap=config["benchmark"]["bootstrap"],
+        panels=config["benchmark"]["panels"],
+        seed=config["seed"],
+        code=source_digest("matching.benchmark"),
+    message:
+        "Scoring {wildcards.method} on dataset {wildcards.dataset}"
+    script:
+        "../scripts/score.py"
+
+
+rule benchmark_tables:
+    input:
+        dataset=lambda w: dataset_folder(w.dataset),
+        scores=lambda w: expand(rules.score.output[0], **w, method=methods_of(w.dataset)),
+        predictions=lambda w: expand(rules.match.output[0], **w, method=methods_of(w.dataset)),
+    output:
+        tables=expand(
+            "results/benchmark/{{dataset}}/{table}.{kind}",
+            table=("table5", "table6", "table7", "strata"),
+            kind=("csv", "md"),
+        ),
+        figure=report(
+            "results/benchmark/{dataset}/figure10.png",
+            caption="../report/figure10.rst",
+            category="Stereo methods",
+            labels={"dataset": "{dataset}", "kind": "figure 10"},
+        ),
+        page=report(
+            "results/benchmark/{dataset}/index.html",
+            caption="../report/benchmark.rst",
+            category="Stereo methods",
+            labels={"dataset": "{dataset}", "kind": "page"},
+        ),
+    log:
+        "logs/benchmark_tables/{dataset}.log",
+    benchmark:
+        "benchmarks/benchmark_tables/{dataset}.tsv"
+    wildcard_constraints:
+        dataset="[^/]+",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=30,
+    params:
+        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
+        split=config["benchmark"]["split"],
+        code=source_digest("matching.comparison"),
+        template=file_sha256(PACKAGE / "matching" / "benchmark.html.jinja"),
+    message:
+        "Comparing the methods on dataset {wildcards.dataset}"
+    script:
+        "../scripts/benchmark_tables.py"
+
+
+rule benchmark:
+    input:
+        lambda w: expand(
+            "results/benchmark/{dataset}/index.html",
+            dataset=[name for name, of in config["benchmark"]["datasets"].items() if of],
+        ),
+    message:
+        "All stereo methods on all datasets"

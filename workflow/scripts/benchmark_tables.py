@@ -1,0 +1,18 @@
+"""The stereo methods of a dataset side by side."""
+
+from pathlib import Path
+
+from stereotruth.matching.comparison import compare
+from stereotruth.matching.layouts import StereoDataset
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    of, params = snakemake.wildcards, snakemake.params
+    with job(snakemake.log[0], f"benchmark {of.dataset}"):
+        compare(
+            StereoDataset.of(of.dataset, params.dataset),
+            params.split,
+            snakemake.input.scores,
+            snakemake.input.predictions,
+            Path(snakemake.output.page).parent,
+        )

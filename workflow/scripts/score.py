@@ -1,0 +1,25 @@
+"""The predictions of a stereo method against the labels of a dataset."""
+
+from pathlib import Path
+
+from stereotruth.matching.benchmark import score
+from stereotruth.matching.layouts import StereoDataset
+from stereotruth.matching.strata import Products
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    of, params = snakemake.wildcards, snakemake.params
+    own = (Path("tiles"), Path("results/project"), Path("results/truth"))
+    with job(snakemake.log[0], f"score {of.dataset} {of.method}"):
+        score(
+            StereoDataset.of(of.dataset, params.dataset),
+            params.split,
+            params.label,
+            snakemake.input.predictions,
+            snakemake.output[0],
+            thresholds_px=params.thresholds_px,
+            bootstrap=params.bootstrap,
+            seed=params.seed,
+            panels=params.panels,
+            products=Products(*own) if snakemake.input.strata else None,
+        )
