@@ -183,6 +183,12 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
 
 
+def image_shape(path: str | Path) -> tuple[int, int]:
+    """Rows and columns of an image. Raises InputError if it cannot be read."""
+    with _opened(path) as source:
+        return source.shape
+
+
 def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float32]:
     """A disparity map, float32[h, w] px; NaN where it is nodata (given or tagged) or not finite.
 

@@ -36,7 +36,7 @@ from ..ledger import Ledger, link
 from ..provenance import digest, file_sha256
 from ..runlog import progress
 from .kinds import FOLDER
-from .layouts import Pair, StereoDataset, read_disparity, read_image
+from .layouts import Pair, StereoDataset, image_shape, read_disparity, read_image
 from .methods import Matcher, make_method
 
 log = logging.getLogger("stereotruth")
@@ -225,8 +225,7 @@ class _Results:
 
 
 def _check(disparity: NDArray[np.float32], pair: Pair, name: str) -> None:
-    with rasterio.open(pair.left) as source:
-        shape = source.shape
+    shape = image_shape(pair.left)
     if disparity.shape != shape:
         raise InputError(
             f"method {name!r}: disparity of pair {pair.name} is {disparity.shape}, "

@@ -23,6 +23,7 @@ from .holes import fill_holes
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 ALL = "all"
+MIN_TILES = 5
 CONFIDENCE = (2.5, 97.5)  # percent
 
 
@@ -76,13 +77,13 @@ class Scores:
     ) -> dict[str, tuple[float, float] | None]:
         """95 % confidence intervals of the figures of :meth:`row`, by resampling its tiles.
 
-        None of a figure that a single tile, or too few, cannot give.
+        None of fewer than ``MIN_TILES`` tiles, which would not show how much tiles differ.
         """
         sums = self.sums[:, self.strata.index(stratum)]
         sums = sums if where is None else sums[where]
         sums = sums[sums[:, 0] > 0]
         count = len(sums)
-        if count < 2 or not times:
+        if count < MIN_TILES or not times:
             return dict.fromkeys(
                 name for name in self._figures(self.sums[0, 0]) if name != "labelled"
             )

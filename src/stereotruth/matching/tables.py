@@ -37,7 +37,7 @@ class Table:
     def csv(self) -> str:
         """All figures; columns in order of appearance."""
         stream = io.StringIO()
-        columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        columns = list(dict.fromkeys(key for row in self.rows for key in row)) or ["method"]
         writer = csv.DictWriter(stream, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(self.rows)
@@ -236,7 +236,7 @@ def _by_city(
     for city in cities:
         values = [published.get(city, {}).get(_kind(of)) for of in methods]
         if any(values):
-            pairs = (("–", "–") if of is None else map("{:g}".format, of) for of in values)
+            pairs = (_paper(of) for of in values)
             known.append([city, *(text for pair in pairs for text in pair)])
     shown += _published(_heading("City", methods), known)
     return Table(name, title, rows, shown)
@@ -246,6 +246,11 @@ def _published(
     heading: Sequence[str], lines: Sequence[Sequence[str]]
 ) -> list[tuple[str, Sequence[str], Sequence[Sequence[str]]]]:
     return [(f"{PAPERS}.", heading, lines)] if lines else []
+
+
+def _paper(values: Sequence[float] | None) -> tuple[str, str]:
+    """EPE and D1 as the paper prints them."""
+    return ("–", "–") if values is None else (f"{values[0]:.3f}", f"{values[1]:.2f}")
 
 
 def _heading(first: str, methods: Sequence[Row]) -> list[str]:
