@@ -1,12 +1,13 @@
 # make tiles/<City>   set up, then make the tiles of a city of config/cities.tsv
 # make test           set up, then pass the tests
+# make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup test test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup networks test test-networks test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -26,6 +27,12 @@ dataset verify: %: $(READY) FORCE
 
 test: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup
+
+networks: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
+
+test-networks: networks
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/networks
 
 test-cluster: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" tests/cluster/run.sh

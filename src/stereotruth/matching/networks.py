@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,7 @@ def load_model(path: str | Path) -> tuple[Model, nn.Module, dict[str, Any]]:
         raise InputError(
             "no such weight file", file=path, remedy="train the network, or name its weights"
         ) from error
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, UnpicklingError) as error:
         raise InputError(
             f"not a weight file of this version ({type(error).__name__})",
             file=path,
