@@ -23,7 +23,6 @@ import numpy as np
 import zarr
 
 from ..block_store import BlockStore, making
-from ..epipolar import EpipolarModel
 from ..errors import InputError
 from ..grid_store import Layer, require_complete
 from ..provenance import describe, digest, file_sha256
@@ -141,8 +140,8 @@ def _fixed(offset: Any, tiling: Tiling) -> Offsets:
 def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
     """The disparities of the heights for which the scene's RPCs are made, with some reserve."""
     try:
-        low, high = EpipolarModel.from_dict(attrs["epipolar"]).report["disparity_range_px"]
-    except KeyError:
+        low, high = attrs["epipolar"]["report"]["disparity_range_px"]
+    except (KeyError, TypeError):
         return None
     reserve = 0.1 * (high - low) + 64.0
     return int(np.floor(low - reserve)), int(np.ceil(high + reserve))

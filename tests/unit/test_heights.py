@@ -1,0 +1,248 @@
+"""Disparities to surface models: intersections and rasters against scenes known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from scipy.optimize import least_squares
+
+from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.errors import InputError
+from stereotruth.grid_store import Layer, building, create_grid
+from stereotruth.matching import heights
+from stereotruth.matching.heights import (
+    Raster,
+    default_resolution,
+    gsd,
+    intersect,
+    raster_of,
+    utm_epsg,
+    write_dsm,
+)
+
+from .test_block_store import Killed
+from .test_epipolar import HEIGHT, LAT, LON, camera
+
+SIZE = (420, 380)
+EPSG = 32650
+UTM = pyproj.Transformer.from_crs(4326, EPSG, always_xy=True)
+
+
+@pytest.fixture(scope="module")
+def model() -> EpipolarModel:
+    left, right = (
+        camera(tilt, size=SIZE, angle=angle, gsd=gsd_m)
+        for tilt, angle, gsd_m in (((0.03, -0.1), 12.0, 0.65), ((-0.05, 0.5), 10.0, 0.8))
+    )
+    return fit_epipolar(left, right, SIZE, SIZE, HEIGHT)
+
+
+def disparity_of(model: EpipolarModel, surface) -> np.ndarray:
+    """The grid's disparities of a surface, height (m) of (lon, lat), along the rays."""
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    h = np.full(x.shape, HEIGHT)
+    for _ in range(30):
+        lon, lat = model.epipolar_to_ground(x, y, h)
+        h = surface(lon, lat)
+    x_right = model.ground_to_epipolar(lon, lat, h)[2].reshape(x.shape)
+    return (x - x_right).astype(np.float32)
+
+
+def metres(lon, lat):
+    """East and north of the middle of the scene, m."""
+    east, north = UTM.transform(np.ravel(lon), np.ravel(lat))
+    middle = UTM.transform(LON, LAT)
+    return (np.reshape(v - m, np.shape(lon)) for v, m in zip((east, north), middle))
+
+
+def plane(lon, lat):
+    east, north = metres(lon, lat)
+    return HEIGHT + 0.3 * east - 0.15 * north
+
+
+@pytest.fixture(scope="module")
+def of_plane(model) -> np.ndarray:
+    return disparity_of(model, plane)
+
+
+def write_grid(path: Path, model: EpipolarModel | None, disparity: np.ndarray) -> Path:
+    layer = Layer("float32", np.nan, {"units": "px", "long_name": "disparity"})
+    attrs = {"epipolar": model and model.to_dict(), "content": str(float(np.nansum(disparity)))}
+    with building(path) as scratch:
+        grids = {"disparity": layer}
+        arrays = create_grid(scratch, disparity.shape, grids, chunk=64, shard=128, attrs=attrs)
+        arrays["disparity"][:] = disparity
+    return path
+
+
+def read(path: Path) -> tuple[np.ndarray, Raster, dict]:
+    with rasterio.open(path) as dataset:
+        values = dataset.read(1)
+        values[values == dataset.nodata] = np.nan
+        t = dataset.transform
+        raster = Raster(dataset.crs.to_epsg(), t.c, t.f, t.a, dataset.shape)
+        return values, raster, dataset.tags() | {"profile": dataset.profile}
+
+
+def test_intersections_project_back_and_lie_on_the_surface(model, of_plane):
+    d = of_plane.copy()
+    d[10:14, 20:30] = np.nan
+    d[200:, 300:] += 40.0  # a jump
+    lon, lat, h = intersect(model, d[5:], row=5)
+    assert np.array_equal(np.isfinite(h), np.isfinite(d[5:]))
+    y, x = np.mgrid[5 : model.shape[0], : model.shape[1]]
+    xl, yl, xr, yr = model.ground_to_epipolar(lon, lat, h).reshape(4, *h.shape)
+    known = np.isfinite(h)
+    for found, wanted in ((xl, x), (xr, x - d[5:].astype(float)), (yl, y), (yr, y)):
+        assert np.abs(found - wanted)[known].max() < 1e-4
+    flat = known.copy()
+    flat[195:, 300:] = False
+    assert np.abs(h - plane(lon, lat))[flat].max() < 1e-4
+
+
+def test_rays_that_miss_are_brought_together_by_least_squares(model):
+    """Against a general solver, at places where the epipolar rows were moved apart."""
+    moved = model.right_image.shifted(0.0, -0.7)
+    apart = EpipolarModel(**{**vars_of(model), "right_image": moved})
+    for row, col, d in ((40, 50, 3.0), (200, 200, -20.0), (300, 120, 60.0)):
+        found = intersect(apart, np.full((1, 1), d, np.float32), row, col)[:, 0, 0]
+        places = np.array(
+            [*model.left_image.inverse(col, row), *moved.inverse(col - d, row)]
+        ).ravel()
+
+        def residuals(p, places=places):
+            lon, lat = LON + p[0] * 1e-5, LAT + p[1] * 1e-5
+            both = [*model.left.project(lon, lat, p[2]), *model.right.project(lon, lat, p[2])]
+            return np.array(both).ravel() - places
+
+        best = least_squares(residuals, [0.0, 0.0, HEIGHT], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        wanted = np.array([LON + best.x[0] * 1e-5, LAT + best.x[1] * 1e-5, best.x[2]])
+        assert np.abs(best.fun).max() > 0.1
+        assert np.abs((found - wanted) * (1e5, 1e5, 1.0)).max() < 2e-3
+
+
+def vars_of(model: EpipolarModel) -> dict:
+    return {name: getattr(model, name) for name in EpipolarModel.__dataclass_fields__}
+
+
+def test_the_model_of_a_plane_is_the_plane(model, of_plane, tmp_path):
+    store = write_grid(tmp_path / "d.zarr", model, of_plane)
+    summary = write_dsm(store, tmp_path / "dsm.tif", resolution_m=0.7)
+    found, raster, tags = read(tmp_path / "dsm.tif")
+    assert raster.epsg == EPSG == summary["epsg"]
+    assert raster.resolution == 0.7
+    assert raster.west / 0.7 == pytest.approx(round(raster.west / 0.7), abs=1e-6)
+    row, col = np.mgrid[: raster.shape[0], : raster.shape[1]]
+    lon, lat = raster.ground(col.astype(float), row.astype(float))
+    wanted = plane(lon, lat)
+    known = np.isfinite(found)
+    assert np.abs(found - wanted)[known].max() < 2e-3
+    # every cell whose centre the left grid shows has its height: no gaps
+    x, y = model.ground_to_epipolar(lon, lat, wanted)[:2].reshape(2, *wanted.shape)
+    shown = (x >= 0) & (y >= 0) & (x <= model.shape[1] - 1) & (y <= model.shape[0] - 1)
+    near = 0.01
+    inner = (x > near) & (y > near) & (x < model.shape[1] - 1 - near)
+    inner &= y < model.shape[0] - 1 - near
+    assert known[inner].all()
+    assert not known[~shown & ((x < -near) | (y < -near))].any()
+    assert tags["vertical_datum"] == "WGS 84 ellipsoid"
+    assert tags["profile"]["nodata"] == -9999.0
+
+
+def test_a_block_of_buildings_has_its_roofs_and_open_edges(model, tmp_path):
+    """A flat roof of 40 m: heights of roof and ground right, nothing in between."""
+
+    def town(lon, lat):
+        east, north = metres(lon, lat)
+        return np.where((np.abs(east) < 30) & (np.abs(north) < 20), HEIGHT + 40.0, HEIGHT)
+
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    lon, lat = model.epipolar_to_ground(x, y, HEIGHT + 40.0)  # the roof hides what is behind it
+    on_roof = town(lon, lat) > HEIGHT
+    d = np.where(
+        on_roof,
+        disparity_of(model, lambda lon, lat: np.full(np.shape(lon), HEIGHT + 40.0)),
+        disparity_of(model, lambda lon, lat: np.full(np.shape(lon), HEIGHT)),
+    )
+    store = write_grid(tmp_path / "d.zarr", model, d)
+    write_dsm(store, tmp_path / "dsm.tif", resolution_m=0.5)
+    found, raster, _ = read(tmp_path / "dsm.tif")
+    known = np.isfinite(found)
+    roof, ground = (np.abs(found - h) < 0.01 for h in (HEIGHT + 40.0, HEIGHT))
+    assert (roof | ground)[known].all()
+    row, col = np.mgrid[: raster.shape[0], : raster.shape[1]].astype(float)
+    east, north = metres(*raster.ground(col, row))
+    inside = (np.abs(east) < 29) & (np.abs(north) < 19)
+    assert roof[inside].all()
+    assert not roof[(np.abs(east) > 30.1) | (np.abs(north) > 20.1)].any()
+
+
+def test_of_two_surfaces_over_a_cell_the_higher_one_counts():
+    out = np.full((6, 6), np.nan, np.float32)
+    heights._triangle((0.0, 0.0, 5.0), (5.0, 0.0, 5.0), (0.0, 5.0, 5.0), out)
+    heights._triangle((0.0, 0.0, 9.0), (2.0, 0.0, 9.0), (0.0, 2.0, 9.0), out)
+    heights._triangle((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (0.0, 5.0, 1.0), out)
+    wanted = np.full((6, 6), np.nan)
+    row, col = np.mgrid[:6, :6]
+    wanted[row + col <= 5] = 5.0
+    wanted[row + col <= 2] = 9.0
+    assert np.array_equal(out, wanted, equal_nan=True)
+
+
+def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch):
+    store = write_grid(tmp_path / "d.zarr", model, of_plane)
+    monkeypatch.setattr(heights, "SHARD", 256)
+    write_dsm(store, tmp_path / "fresh.tif", workers=2)
+    out, made, block = tmp_path / "dsm.tif", [], heights._Model.block
+
+    def counted(self, store, key, rows, cols):
+        if len(made) == 2:
+            raise Killed
+        block(self, store, key, rows, cols)
+        made.append((rows.start, cols.start))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(heights._Model, "block", counted)
+        with pytest.raises(Killed):
+            write_dsm(store, out, scheduler="synchronous")
+    assert not out.exists()
+    before = made[:]
+    made = ["from here on"]  # two of them would be a kill
+    monkeypatch.setattr(heights._Model, "block", lambda *a: (block(*a), made.append(a[3].start)))
+    write_dsm(store, out, scheduler="synchronous")
+    assert len(before) == 2
+    assert out.read_bytes() == (tmp_path / "fresh.tif").read_bytes()
+    assert {p.name for p in tmp_path.iterdir()} == {"d.zarr", "fresh.tif", "dsm.tif"}
+    whole = read(out)[0]
+    monkeypatch.setattr(heights, "SHARD", 1024)
+    write_dsm(store, tmp_path / "one.tif")
+    at_once = read(tmp_path / "one.tif")[0]
+    assert np.array_equal(np.isfinite(whole), np.isfinite(at_once))
+    assert np.nanmax(np.abs(whole - at_once)) < 1e-4
+
+
+def test_the_cell_is_the_coarser_pixel(model):
+    assert gsd(model.left, SIZE, HEIGHT) == pytest.approx(0.65, rel=2e-3)
+    assert default_resolution(model) == pytest.approx(0.9)  # 0.8 m is 0.802 in this camera's UTM
+    raster = raster_of(model, (HEIGHT, HEIGHT + 10), None)
+    assert raster.resolution == default_resolution(model)
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "epsg"),
+    [(114.3, 30.6, 32650), (-70.0, -33.0, 32719), (179.99, 10.0, 32660), (-180.0, -1.0, 32701)],
+)
+def test_zones_of_utm(lon, lat, epsg):
+    assert utm_epsg(lon, lat) == epsg
+
+
+def test_grids_that_say_too_little_are_refused(model, tmp_path):
+    nothing = np.full((20, 20), np.nan, np.float32)
+    with pytest.raises(InputError, match="no epipolar model"):
+        write_dsm(write_grid(tmp_path / "a.zarr", None, nothing), tmp_path / "a.tif")
+    with pytest.raises(InputError, match="no pixel has a disparity"):
+        write_dsm(write_grid(tmp_path / "b.zarr", model, nothing), tmp_path / "b.tif")
