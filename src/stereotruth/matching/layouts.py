@@ -48,7 +48,7 @@ CITY_OF_PREFIX = {
 }
 TEST = "test"
 _TIFF = re.compile(r"\.tiff?$", re.IGNORECASE)
-_WHU_LEFT = re.compile(r"(?P<prefix>.+)_left_(?P<number>\w+)", re.IGNORECASE)
+_WHU_LEFT = re.compile(r"(?P<prefix>.+)_left_(?P<number>\d+)")
 _US3D_LEFT = re.compile(r"(?P<pair>.+)_LEFT_RGB")
 _SPLIT = re.compile("|".join(SPLITS), re.IGNORECASE)
 

@@ -19,6 +19,7 @@ from typing import Any
 from ..errors import InputError
 from ..grid_store import replacing
 from . import paper
+from .kinds import LABELS
 
 Row = dict[str, Any]
 PAPERS = "The paper's, on the real WHU-Stereo"
@@ -144,10 +145,14 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
         )
     ]
     if beside_paper:
-        known = [of for of in _plain(methods) if _kind(of) in paper.TABLE5]
+        kinds = dict.fromkeys(_kind(of) for of in _plain(methods))
         shown += _published(
             ["Method", "EPE (px)", "D1 (%)", "Time (ms)"],
-            [[of["label"], *(f"{value:g}" for value in paper.TABLE5[_kind(of)])] for of in known],
+            [
+                [LABELS[kind], *_paper(paper.TABLE5[kind][:2]), f"{paper.TABLE5[kind][2]}"]
+                for kind in kinds
+                if kind in paper.TABLE5
+            ],
         )
     return Table("table5", "Table 5: accuracy, time and memory", rows, shown)
 

@@ -1,0 +1,117 @@
+"""Strata of a tile's labels: steps of the labels, status, classes, exact truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rasterio
+import zarr
+
+from stereotruth.disparity import Status
+from stereotruth.matching.layouts import Pair
+from stereotruth.matching.strata import Products, exact_truth, label_strata, near_step
+
+SIZE = 40
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_pixels_near_a_step_of_the_labels():
+    labels = np.zeros((SIZE, SIZE), np.float32)
+    labels[:, 20:] = 3.5
+    labels[:, 18:20] = np.nan
+    found = near_step(labels)
+    expected = np.zeros((SIZE, SIZE), bool)
+    expected[:, 15:18] = True  # the step's other side is at most 5 px away
+    expected[:, 20:23] = True
+    assert np.array_equal(found, expected)
+    labels[labels > 0] = 3.0
+    assert not near_step(labels).any()
+    slope = np.tile(0.29 * np.arange(SIZE, dtype=np.float32), (SIZE, 1))
+    assert not near_step(slope).any() and near_step(slope * 1.1)[20, 20]
+    assert not near_step(np.full((5, 5), np.nan, np.float32)).any()
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A pair cut out of a scene at row 10, column 20, with status, classes and exact truth."""
+    row = {"tile": "T_3", "scene": "T-1", "row0": "10", "col0": "20", "size": str(SIZE)}
+    row["right_offset_px"] = "-7"
+    pair = Pair("T_3", "Town", "test", tmp_path, tmp_path, tmp_path, row)
+    status = np.full((SIZE, SIZE), Status.LABELLED, np.uint8)
+    status[5, 30] = Status.HIDDEN_IN_RIGHT
+    (tmp_path / "tiles/Town/status").mkdir(parents=True)
+    with rasterio.open(
+        tmp_path / "tiles/Town/status/T_status_3.tiff",
+        "w",
+        driver="GTiff",
+        height=SIZE,
+        width=SIZE,
+        count=1,
+        dtype="uint8",
+    ) as target:
+        target.write(status, 1)
+    layers = {
+        "project": {"surface_class": np.uint8},
+        "truth": dict.fromkeys(("changed", "changed_right", "visible", "hidden"), np.uint8)
+        | {"surface": np.uint8, "disparity": np.float32},
+    }
+    stores = {}
+    for kind, names in layers.items():
+        group = zarr.open_group(tmp_path / kind / "Town/T-1.zarr", mode="w")
+        group.attrs["complete"] = True
+        for name, dtype in names.items():
+            stores[name] = group.create_array(name, data=np.zeros((60, 70), dtype))
+    return pair, Products(*(tmp_path / name for name in ("tiles", "project", "truth"))), stores
+
+
+def test_status_and_classes_are_those_of_the_window(own):
+    pair, products, stores = own
+    classes = np.zeros((60, 70), np.uint8)
+    classes[10, 20:25] = (2, 6, 5, 3, 9)
+    stores["surface_class"][:] = classes
+    found = label_strata(pair, np.zeros((SIZE, SIZE), np.float32), products)
+    assert list(found) == [
+        "near_step",
+        "near_occlusion",
+        "ground",
+        "vegetation",
+        "building",
+        "other",
+    ]
+    near = found["near_occlusion"]
+    assert near[:11, 25:36].all() and near.sum() == 11 * 11
+    first = {name: found[name][0, :5].tolist() for name in ("ground", "building", "other")}
+    assert first["ground"] == [True, False, False, False, False]
+    assert first["building"] == [False, True, False, False, False]
+    assert first["other"] == [False, False, False, False, True]
+    assert found["vegetation"][0, :5].tolist() == [False, False, True, True, False]
+    assert found["other"][1:].all()
+
+
+def test_exact_truth_is_taken_to_the_tile(own):
+    """Less the right image's offset; without change and water."""
+    pair, products, stores = own
+    rng = np.random.default_rng(0)
+    layer = {name: rng.integers(0, 2, (60, 70), dtype=np.uint8) for name in ("visible", "changed")}
+    layer["changed_right"] = rng.integers(0, 2, (60, 70), dtype=np.uint8)
+    layer["hidden"] = (1 - layer["visible"]).astype(np.uint8)
+    layer["surface"] = rng.integers(0, 6, (60, 70), dtype=np.uint8)
+    layer["disparity"] = rng.normal(0, 9, (60, 70)).astype(np.float32)
+    for name, values in layer.items():
+        stores[name][:] = values
+    found = exact_truth(pair, products)
+    here = {name: values[10:50, 20:60] for name, values in layer.items()}
+    same = (here["changed"] == 0) & (here["changed_right"] == 0) & (here["surface"] != 5)
+    for kind in ("visible", "hidden"):
+        expected = np.where(same & (here[kind] == 1), here["disparity"] + 7, np.nan)
+        assert np.array_equal(found[f"exact_{kind}"], expected, equal_nan=True)
+
+
+def test_what_is_missing_is_left_out(own, tmp_path):
+    pair, products, _ = own
+    labels = np.zeros((SIZE, SIZE), np.float32)
+    bare = Pair("T_3", "Town", "test", tmp_path, tmp_path, tmp_path)
+    assert list(label_strata(bare, labels, products)) == ["near_step"]
+    assert list(label_strata(pair, labels, Products())) == ["near_step"]
+    assert exact_truth(bare, products) == exact_truth(pair, Products()) == {}
+    assert exact_truth(pair, Products(truth=tmp_path / "none")) == {}
