@@ -82,10 +82,15 @@ def test_parts_of_an_image_share_its_scaling() -> None:
     assert np.array_equal(part, networks.scaled(image, method().model, None)[:, :10])
 
 
-def test_a_wider_range_than_the_networks_is_refused() -> None:
-    image = np.ones((8, 8), np.uint16)
-    with pytest.raises(InputError, match="-64 to 64 px, -64 to 128 px"):
-        method()(image, image, (-64, 128))
+def test_any_range_can_be_looked_for() -> None:
+    """No weight depends on the range: planes outside the training's are looked at like others."""
+    image = np.random.default_rng(0).integers(1, 900, (2, 32, 64)).astype(np.uint16)
+    trained, other = method(), method()
+    found = other(*image, (-61, 123))
+    assert other.network.planes == (-8, 16)
+    again = NetworkMethod(Model("stereonet", (-64, 128)), trained.network, CPU, "float32")
+    trained.network.set_range((-64, 128))
+    assert np.array_equal(found, again(*image, (-64, 128)))
 
 
 def test_weight_files_hold_all_that_is_needed(tmp_path: Path) -> None:

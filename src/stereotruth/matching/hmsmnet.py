@@ -97,14 +97,14 @@ class HMSMNet(nn.Module):
     """
 
     divisor = 64
+    range_step_px = 64
     loss_weights = (0.5, 0.7, 1.0, 0.6)
     regularisation = 1e-5
     margin_px = 512
 
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
-        planes(disparity_range, 64)
-        self.planes = [planes(disparity_range, scale) for scale in SCALES]
+        self.set_range(disparity_range)
         self.features = Features(channels)
         self.hourglasses = nn.ModuleList(Hourglass(2 * CHANNELS) for _ in SCALES)
         self.estimators = nn.ModuleList(Conv3d(CHANNELS, 1, bias=True) for _ in SCALES)
@@ -119,6 +119,11 @@ class HMSMNet(nn.Module):
             Conv2d(32, 1, 3, bias=True),
         )
         initialise(self)
+
+    def set_range(self, disparity_range: tuple[int, int]) -> None:
+        """Look for these disparities, px; no weight depends on them."""
+        planes(disparity_range, self.range_step_px)
+        self.planes = [planes(disparity_range, scale) for scale in SCALES]
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:
         """[N, C, H, W] images -> disparities at 1/16, 1/8, 1/4 (in their own px) and full size."""

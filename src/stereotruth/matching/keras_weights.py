@@ -6,7 +6,7 @@ of the network first the trainable ones (kernel, then bias or scale and shift), 
 of batch normalisation. Every shape must fit.
 
     python -m stereotruth.matching.keras_weights StereoNet.h5 stereonet.pt --kind stereonet \\
-        --disparity-range -128 64 --channels 1
+        --disparity-range -128 64
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ..errors import InputError
-from .networks import KINDS, Model, save_model
+from .networks import KINDS, SCALINGS, Model, save_model
 
 log = logging.getLogger("stereotruth")
 
@@ -124,6 +124,26 @@ def load_keras(network: nn.Module, path: str | Path) -> None:
                 tensor.copy_(torch.from_numpy(np.ascontiguousarray(array.transpose(axes))))
 
 
+def read_keras(
+    path: str | Path,
+    kind: str,
+    scaling: str | None = None,
+    disparity_range: tuple[int, int] = (-128, 64),
+) -> tuple[Model, nn.Module]:
+    """A network with the weights of a Keras file, whose first kernel says how many channels.
+
+    ``scaling``: None: that of US3D for three channels, else that of WHU-Stereo.
+    Raises InputError as :func:`load_keras` does.
+    """
+    first = read_weights(path)[0][0]
+    channels = first.shape[2] if first.ndim == 4 and first.shape[2] == 3 else 1
+    scaling = scaling or ("us3d" if channels == 3 else "standardise")
+    model = Model(kind, disparity_range, channels, scaling)
+    network = model.build()
+    load_keras(network, path)
+    return model, network
+
+
 def main(arguments: list[str] | None = None) -> None:
     """The command of the module's docstring."""
     parser = argparse.ArgumentParser(description="Keras weights (.h5) to a weight file (.pt)")
@@ -131,18 +151,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--kind", choices=sorted(KINDS), default="stereonet")
     parser.add_argument("--disparity-range", type=int, nargs=2, default=(-128, 64), metavar="PX")
-    parser.add_argument("--channels", type=int, default=1, choices=(1, 3))
-    parser.add_argument("--scaling", choices=("standardise", "us3d"), default=None)
+    parser.add_argument("--scaling", choices=SCALINGS, default=None)
     given = parser.parse_args(arguments)
-    scaling = given.scaling or ("us3d" if given.channels == 3 else "standardise")
-    model = Model(given.kind, tuple(given.disparity_range), given.channels, scaling)
-    network = model.build()
+    span = tuple(given.disparity_range)
     try:
-        load_keras(network, given.weights)
+        model, network = read_keras(given.weights, given.kind, given.scaling, span)
     except InputError as error:
         parser.exit(1, f"error: {error}\n")
     save_model(given.out, model, network, {"source": given.weights.name})
-    print(f"{given.out}: {given.kind}, {sum(p.numel() for p in network.parameters())} parameters")
+    print(
+        f"{given.out}: {model.kind}, {model.channels} channels, "
+        f"{sum(p.numel() for p in network.parameters())} parameters"
+    )
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
     """
     kind, options = settings.get("kind"), {k: v for k, v in settings.items() if k not in SHOWN}
     if kind in NETWORKS:
-        return _module_of(kind).network_method(kind, options)
+        return _module_of(kind).network_method(kind, options, workers)
     if kind == "sgm":
         make = _module_of(kind).SemiGlobalMatcher
         return _called(name, make, {**options, "workers": workers})

@@ -199,6 +199,22 @@ class NetworkMethod:
         self.model, self.device, self.precision = model, device, precision
         self.network = channels_last(network.eval().to(device))
         self.margin_px = network.margin_px
+        self._range = model.disparity_range
+
+    def _look_for(self, wanted: tuple[int, int]) -> None:
+        """Set the network's range."""
+        step = self.network.range_step_px
+        span = wanted[0] // step * step, -(-wanted[1] // step) * step
+        if span != self._range:
+            if span != self.model.disparity_range:
+                log.info(
+                    "%s was trained for disparities of %d to %d px, and looks for %d to %d px",
+                    self.model.kind,
+                    *self.model.disparity_range,
+                    *span,
+                )
+            self.network.set_range(span)
+            self._range = span
 
     def scaling(self, left: Any, right: Any) -> Scaling | None:
         """Statistics of whole images (NumPy or Dask); None if the network needs none."""
@@ -215,15 +231,10 @@ class NetworkMethod:
     ) -> NDArray[np.float32]:
         """Disparity [H, W] of the left image, px; NaN where the left pixel is nodata.
 
-        Raises InputError if ``disparity_range`` is not within the network's own.
+        A ``disparity_range`` other than that of the training is taken, widened to multiples of
+        the network's planes.
         """
-        low, high = self.model.disparity_range
-        if disparity_range[0] < low or disparity_range[1] > high:
-            raise InputError(
-                f"{self.model.kind} covers disparities of {low} to {high} px, "
-                f"{disparity_range[0]} to {disparity_range[1]} px are asked for",
-                remedy="train it for that range, or narrow the range of the dataset",
-            )
+        self._look_for(disparity_range)
         height, width = left.shape[:2]
         rows, cols = padding(height, width, self.network.divisor)
         both = []
@@ -237,9 +248,9 @@ class NetworkMethod:
         return np.where(seen, disparity, np.float32(np.nan))
 
 
-def network_method(kind: str, settings: Mapping[str, Any]) -> NetworkMethod:
-    """The method of a configuration entry: ``weights`` (a .pt or Keras' .h5), ``device``,
-    ``precision``; for .h5 also ``disparity_range``, ``channels`` and ``scaling``.
+def network_method(kind: str, settings: Mapping[str, Any], workers: int = 0) -> NetworkMethod:
+    """The method of a configuration entry: ``weights`` (a .pt, or Keras' .h5), ``device``,
+    ``precision``, and for .h5 ``scaling``; ``workers`` threads on a CPU (0: all cores).
 
     Raises InputError if the weights are missing or those of another network.
     """
@@ -248,18 +259,10 @@ def network_method(kind: str, settings: Mapping[str, Any]) -> NetworkMethod:
         raise InputError(
             f"{kind}: no weights", remedy="train it, or name a file in benchmark.methods"
         )
-    if Path(path).suffix in (".h5", ".hdf5"):
-        from .keras_weights import load_keras
+    if is_keras(path):
+        from .keras_weights import read_keras
 
-        channels = settings.get("channels", 1)
-        model = Model(
-            kind,
-            tuple(settings.get("disparity_range") or (-128, 64)),
-            channels,
-            settings.get("scaling") or ("us3d" if channels == 3 else "standardise"),
-        )
-        network = model.build()
-        load_keras(network, path)
+        model, network = read_keras(path, kind, settings.get("scaling"))
     else:
         model, network, _ = load_model(path)
         if model.kind != kind:
@@ -267,4 +270,11 @@ def network_method(kind: str, settings: Mapping[str, Any]) -> NetworkMethod:
                 f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
             )
     device = choose_device(settings.get("device"))
+    if device.type == "cpu" and workers:
+        torch.set_num_threads(workers)
     return NetworkMethod(model, network, device, precision_of(settings.get("precision"), device))
+
+
+def is_keras(path: str | Path) -> bool:
+    """Whether a weight file is one of Keras, by its name."""
+    return Path(path).suffix in (".h5", ".hdf5")

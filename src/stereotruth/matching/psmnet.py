@@ -81,14 +81,14 @@ class PSMNet(nn.Module):
     """
 
     divisor = 256
+    range_step_px = 16
     loss_weights = (0.5, 0.7, 1.0)
     regularisation = 1e-4
     margin_px = 512
 
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
-        planes(disparity_range, 16)
-        self.planes = planes(disparity_range, 4)
+        self.set_range(disparity_range)
         n = CHANNELS
         self.features = Features(channels)
         self.before = nn.Sequential(_conv3d(2 * n, n // 2), _conv3d(n // 2, n // 2))
@@ -98,6 +98,11 @@ class PSMNet(nn.Module):
             nn.Sequential(_conv3d(n // 2, n // 2), Conv3d(n // 2, 1, (1, 3, 3))) for _ in range(3)
         )
         initialise(self)
+
+    def set_range(self, disparity_range: tuple[int, int]) -> None:
+        """Look for these disparities, px; no weight depends on them."""
+        planes(disparity_range, self.range_step_px)
+        self.planes = planes(disparity_range, 4)
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:
         """[N, C, H, W] images -> three [N, H, W] disparities in px, of full size."""

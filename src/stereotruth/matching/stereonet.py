@@ -74,17 +74,22 @@ class StereoNet(nn.Module):
     """
 
     divisor = 8
+    range_step_px = 8
     loss_weights = (1.0, 1.0, 1.0, 1.0)
     regularisation = 1e-4
     margin_px = 384  # see tests: how far away what is seen matters at all
 
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
-        self.planes = planes(disparity_range, 8)
+        self.set_range(disparity_range)
         self.features = Features(channels)
         self.aggregation = Aggregation()
         self.refinements = nn.ModuleList(Refinement(channels) for _ in range(3))
         initialise(self)
+
+    def set_range(self, disparity_range: tuple[int, int]) -> None:
+        """Look for these disparities, px; no weight depends on them."""
+        self.planes = planes(disparity_range, self.range_step_px)
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:
         """[N, C, H, W] images -> four [N, H, W] disparities in px, coarse to fine, of full size."""

@@ -36,7 +36,16 @@ from .data import Augmentation, LabelledPairs
 from .keras_weights import load_keras
 from .layers import channels_last
 from .layouts import StereoDataset
-from .networks import Model, choose_device, load_model, mixed, padding, precision_of, save_model
+from .networks import (
+    Model,
+    choose_device,
+    is_keras,
+    load_model,
+    mixed,
+    padding,
+    precision_of,
+    save_model,
+)
 
 log = logging.getLogger("stereotruth")
 
@@ -198,7 +207,7 @@ def start(model: Model, training: Training) -> nn.Module:
     path = training.initial_weights
     if path is None:
         return network
-    if Path(path).suffix in (".h5", ".hdf5"):
+    if is_keras(path):
         load_keras(network, path)
         return network
     there, other, _ = load_model(path)
