@@ -19,6 +19,7 @@ include: "workflow/rules/export.smk"
 include: "workflow/rules/evaluate_images.smk"
 include: "workflow/rules/evaluate.smk"
 include: "workflow/rules/report.smk"
+include: "workflow/rules/train.smk"
 include: "workflow/rules/benchmark.smk"
 
 

@@ -249,6 +249,12 @@ def method_files(wildcards):
     return [weights or f"results/train/{wildcards.dataset}/{wildcards.method}/best.pt"]
 
 
+def training_of(name):
+    """How a network is trained: section training, and what the method's entry has other."""
+    own = method_settings(name).get("training") or {}
+    return {"seed": config["seed"], **config["training"], **own}
+
+
 def method_modules(name):
     """Modules of the package that hold a method's own code."""
     own = METHOD_MODULES.get(method_settings(name)["kind"])

@@ -1,7 +1,24 @@
 """The kinds of stereo methods as plain values, so that a workflow can plan with them."""
 
+from importlib.util import find_spec
+
+from ..errors import InputError
+
 NETWORKS = ("stereonet", "psmnet", "hmsmnet")
 FOLDER = "folder"
 KINDS = ("sgm", *NETWORKS, "function", FOLDER)
 MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks")}
 LABELS = {"sgm": "SGM", "stereonet": "StereoNet", "psmnet": "PSM-Net", "hmsmnet": "HMSM-Net"}
+
+
+def need_pytorch(name: str, kind: str) -> None:
+    """Raise InputError unless ``kind`` is a network's and PyTorch is installed."""
+    if kind not in NETWORKS:
+        raise InputError(
+            f"method {name!r} is of kind {kind!r}, which is not trained",
+            remedy=f"take one of kind {', '.join(NETWORKS)}, or give it weights",
+        )
+    if find_spec("torch") is None:
+        raise InputError(
+            f"{kind} needs PyTorch, which is not installed", remedy="pip install '.[networks]'"
+        )

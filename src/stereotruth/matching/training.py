@@ -16,7 +16,7 @@ import logging
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,9 @@ from ..locking import exclusive
 from ..provenance import digest, file_sha256
 from ..runlog import progress
 from .data import Augmentation, LabelledPairs
-from .keras_weights import load_keras
+from .keras_weights import load_keras, read_keras
 from .layers import channels_last
-from .layouts import StereoDataset
+from .layouts import StereoDataset, read_image
 from .networks import (
     Model,
     choose_device,
@@ -104,6 +104,10 @@ class Training:
         if not isinstance(merged.get("augmentation"), Augmentation):
             merged["augmentation"] = Augmentation(**(merged.get("augmentation") or {}))
         return cls(**merged)
+
+    def on(self, threads: int) -> Training:
+        """The same, with so many threads on a CPU where the configuration leaves that open."""
+        return replace(self, threads=self.threads or threads)
 
     def content(self) -> dict[str, Any]:
         """What the weights follow from: all but how long and where the work is done."""
@@ -198,6 +202,21 @@ def _optimiser(network: nn.Module, learning_rate: float) -> torch.optim.Optimize
         {"params": others, "weight_decay": 0.0},
     ]
     return torch.optim.Adam(groups, lr=learning_rate, betas=BETAS)
+
+
+def model_of(kind: str, dataset: StereoDataset, training: Training) -> Model:
+    """The network for a dataset: its range, its number of bands; else that of the first weights."""
+    if training.initial_weights is None:
+        image = read_image(dataset.pairs("train")[0].left)
+        colour = image.ndim == 3
+        return Model(
+            kind, dataset.disparity_range, 3 if colour else 1, "us3d" if colour else "standardise"
+        )
+    if is_keras(training.initial_weights):
+        there, _ = read_keras(training.initial_weights, kind)
+    else:
+        there, _, _ = load_model(training.initial_weights)
+    return replace(there, kind=kind, disparity_range=dataset.disparity_range)
 
 
 def start(model: Model, training: Training) -> nn.Module:

@@ -1,0 +1,25 @@
+"""Without PyTorch the networks' targets say what to install."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+import yaml
+
+from .conftest import Project
+
+
+@pytest.mark.skipif(find_spec("torch") is not None, reason="PyTorch is installed here")
+def test_a_network_says_what_to_install(project: Project) -> None:
+    root = project.folder / "pairs"
+    root.mkdir()
+    (project.folder / "weights.pt").touch()
+    of = {"root": "pairs", "layout": "whu", "disparity_range": [0, 64]}
+    methods = {"ready": {"kind": "psmnet", "weights": "weights.pt"}}
+    config = {"benchmark": {"datasets": {"mine": of}, "methods": methods}}
+    (project.folder / "my.yaml").write_text(yaml.safe_dump(config))
+    for target in ("results/train/mine/stereonet/best.pt", "results/match/mine/ready"):
+        run = project.snakemake(target, "--configfile", "my.yaml")
+        assert run.status != 0
+        assert "not installed. Remedy: pip install '.[networks]'" in run.text

@@ -1,0 +1,36 @@
+rule train:
+    input:
+        dataset=lambda w: dataset_folder(w.dataset),
+        initial=lambda w: training_of(w.method)["initial_weights"] or [],
+    output:
+        weights="results/train/{dataset}/{method}/best.pt",
+        curves="results/train/{dataset}/{method}/curves.csv",
+        summary="results/train/{dataset}/{method}/training.json",
+        figure=report(
+            "results/train/{dataset}/{method}/curves.png",
+            caption="../report/training.rst",
+            category="Stereo methods",
+            labels={"dataset": "{dataset}", "kind": "training of {method}"},
+        ),
+    log:
+        "logs/train/{dataset}/{method}.log",
+    benchmark:
+        "benchmarks/train/{dataset}/{method}.tsv"
+    wildcard_constraints:
+        dataset="[^/]+",
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=12000,
+        runtime=2880,
+    params:
+        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
+        kind=lambda w: method_settings(w.method)["kind"],
+        training=lambda w: training_of(w.method),
+        code=source_digest("matching.training"),
+    message:
+        "Training {wildcards.method} on dataset {wildcards.dataset}"
+    script:
+        "../scripts/train.py"
