@@ -2,6 +2,7 @@
 
 import json
 import re
+from argparse import Namespace
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -274,3 +275,25 @@ def products_of_own_dataset():
         *(f"results/project/{s.city}/{s.scene}.zarr" for s in scenes),
         *(f"results/truth/{s.city}/{s.scene}.zarr" for s in scenes if is_synthetic(s)),
     ]
+
+
+def scene_method(name):
+    """What the disparities of a scene by a method follow from: its entry without the names."""
+    names = ("label", "fine_tuned_of")
+    return {key: value for key, value in method_settings(name).items() if key not in names}
+
+
+def scene_method_files(wildcards):
+    """Files that a method is made of which goes over whole scenes."""
+    of = Namespace(dataset=config["predict"]["dataset"], method=wildcards.method)
+    return method_files(of)
+
+
+def scene_prediction():
+    """How methods go over whole scenes; the disparity range is that of their dataset."""
+    settings = config["predict"]
+    known = dataset_settings(settings["dataset"])["disparity_range"]
+    return {
+        "disparity_range": settings["disparity_range"] or known,
+        **{key: settings[key] for key in ("block_px", "overlap_px", "offset")},
+    }

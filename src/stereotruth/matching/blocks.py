@@ -30,6 +30,7 @@ Place = tuple[int, int]
 BLOCK_PX = 1024
 OVERLAP_PX = 64
 AGREE_PX = 1.0
+PHASE_PX = 64  # parts begin at multiples: networks, on reduced grids, see all tiles in one phase
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ def view_of(
     low, high = disparity_range
     top, bottom = max(rows.start - margin, 0), min(rows.stop + margin, shape[0])
     first = max(cols.start - margin - max(high, 0), min(0, offset))
+    top, first = (start // PHASE_PX * PHASE_PX for start in (top, first))
     last = min(cols.stop + margin + max(-low, 0), shape[1] + max(0, offset))
     return View(
         left=(slice(top, bottom), slice(first, last)),

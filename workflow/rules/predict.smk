@@ -1,0 +1,64 @@
+rule predict_scene:
+    input:
+        left=rules.rectify.output.left,
+        right=rules.rectify.output.right,
+        files=scene_method_files,
+    output:
+        disparity=directory("results/predict/{city}/{scene}/{method}.zarr"),
+    log:
+        "logs/predict_scene/{city}/{scene}/{method}.log",
+    benchmark:
+        "benchmarks/predict_scene/{city}/{scene}/{method}.tsv"
+    wildcard_constraints:
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=6000,
+        runtime=720,
+    params:
+        method=lambda w: scene_method(w.method),
+        settings=scene_prediction(),
+        code=lambda w: source_digest("matching.scenes", *method_modules(w.method)),
+    message:
+        "Disparities of scene {wildcards.scene} by {wildcards.method}"
+    script:
+        "../scripts/predict_scene.py"
+
+
+rule dsm:
+    input:
+        disparity=rules.predict_scene.output.disparity,
+    output:
+        dsm="results/predict/{city}/{scene}/{method}_dsm.tif",
+    log:
+        "logs/dsm/{city}/{scene}/{method}.log",
+    benchmark:
+        "benchmarks/dsm/{city}/{scene}/{method}.tsv"
+    wildcard_constraints:
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=240,
+    params:
+        settings=config["predict"]["dsm"],
+        code=source_digest("matching.heights"),
+    message:
+        "Surface model of scene {wildcards.scene} by {wildcards.method}"
+    script:
+        "../scripts/dsm.py"
+
+
+rule predict:
+    input:
+        [
+            f"results/predict/{s.city}/{s.scene}/{method}_dsm.tif"
+            for s in SCENES.values()
+            for method in config["predict"]["methods"]
+        ],
+    message:
+        "Disparities and surface models of all scenes"

@@ -1,0 +1,22 @@
+"""A scene's disparities to a surface model."""
+
+from stereotruth.matching.heights import write_dsm
+from stereotruth.runlog import job
+from stereotruth.workers import dask_scheduler
+
+if __name__ == "__main__":
+    scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
+    address = snakemake.config["dask"]["scheduler_address"]
+    with (
+        job(snakemake.log[0], f"dsm {scene} {method}"),
+        dask_scheduler(address) as scheduler,
+    ):
+        write_dsm(
+            snakemake.input.disparity,
+            snakemake.output.dsm,
+            **snakemake.params.settings,
+            workers=snakemake.threads,
+            scheduler=scheduler,
+            code=snakemake.params.code,
+            scene=scene,
+        )
