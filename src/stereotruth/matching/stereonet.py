@@ -77,7 +77,7 @@ class StereoNet(nn.Module):
     range_step_px = 8
     loss_weights = (1.0, 1.0, 1.0, 1.0)
     regularisation = 1e-4
-    margin_px = 384  # see tests: how far away what is seen matters at all
+    margin_px = 192  # beyond, the frame of a real tile changed it by 0.003 px at most
 
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
