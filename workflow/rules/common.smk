@@ -278,8 +278,8 @@ def products_of_own_dataset():
 
 
 def scene_method(name):
-    """What the disparities of a scene by a method follow from: its entry without the names."""
-    names = ("label", "fine_tuned_of")
+    """What the disparities of a scene by a method follow from: no names, nor its training."""
+    names = ("label", "fine_tuned_of", "training")
     return {key: value for key, value in method_settings(name).items() if key not in names}
 
 
@@ -295,5 +295,5 @@ def scene_prediction():
     known = dataset_settings(settings["dataset"])["disparity_range"]
     return {
         "disparity_range": settings["disparity_range"] or known,
-        **{key: settings[key] for key in ("block_px", "overlap_px", "offset")},
+        **{key: settings[key] for key in ("block_px", "overlap_px", "margin_px", "offset")},
     }

@@ -74,6 +74,7 @@ class _Scene:
     threads: int  # of the method
     disparity_range: DisparityRange
     tiling: Tiling
+    margin: int | None
     scaling: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -99,7 +100,8 @@ class _Scene:
         """Predict one tile and write it to its place in the grid of tiles."""
         window = self.tiling.tile_window(place)
         matcher, shape = self.matcher, self.tiling.shape
-        view = view_of(shape, window, matcher.margin_px, self.disparity_range, offset)
+        margin = matcher.margin_px if self.margin is None else self.margin
+        view = view_of(shape, window, margin, self.disparity_range, offset)
         left, right = self.images
         found = predict_tile(
             matcher,
@@ -174,6 +176,7 @@ def predict_scene(
     block_px: int = 1024,
     overlap_px: int = 64,
     offset: int | str = "auto",
+    margin_px: int | None = None,
     workers: int = 1,
     scheduler: Any = "threads",
     code: str = "",
@@ -184,9 +187,10 @@ def predict_scene(
     ``left_store``, ``right_store``: rectified images as `rectify` makes them. ``method``: a name
     for messages; ``settings``: its configuration entry (:func:`methods.make_method`).
     ``disparity_range``: px, of one tile; ``offset``: of the right image, px, or "auto"
-    (:mod:`offsets`). ``block_px``: a multiple of 256. ``workers`` tiles are worked on at once by
-    SGM, while networks and functions get that many threads. ``scheduler`` is what Dask's compute
-    takes. ``code``: digest of the source, for the provenance.
+    (:mod:`offsets`). ``block_px``: a multiple of 256. ``margin_px``: None is the method's own.
+    ``workers`` tiles are worked on at once by SGM, while networks and functions get that many
+    threads. ``scheduler`` is what Dask's compute takes. ``code``: digest of the source, for the
+    provenance.
 
     The store [y, x] on the left epipolar grid: ``disparity`` (:data:`LAYERS`); attributes
     ``epipolar`` (the model), ``block_offsets_px`` [n][m], ``summary`` (valid share, least and
@@ -215,6 +219,7 @@ def predict_scene(
         "threads": 1 if by_tiles else workers,
         "disparity_range": (low, high),
         "tiling": tiling,
+        "margin": margin_px,
     }
     start = _Scene(**given)
     left, right = start.images
@@ -231,13 +236,14 @@ def predict_scene(
         "block_px": block_px,
         "overlap_px": overlap_px,
         "offset": offset,
+        "margin_px": job.matcher.margin_px if margin_px is None else margin_px,
     }
     content = digest(
         {
             "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
             "method": identity(settings),
             "range": [low, high],
-            "margin": job.matcher.margin_px,
+            "margin": parameters["margin_px"],
             "tiling": [block_px, overlap_px],
             "code": code,
         }
