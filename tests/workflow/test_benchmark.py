@@ -1,0 +1,120 @@
+"""Stereo methods through the workflow: SGM, a user's function and a folder of results."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+
+import pytest
+import yaml
+
+from .conftest import Project
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
+FUNCTION = """
+import cv2
+import numpy as np
+
+def match(left, right, disparity_range, block):
+    low = -16  # OpenCV leaves as many columns out as the range is wide
+    matcher = cv2.StereoSGBM.create(low, 48, block)
+    eight = [cv2.convertScaleAbs(image, alpha=0.1) for image in (left, right)]
+    disparity = matcher.compute(*eight) / np.float32(16)
+    return np.where(disparity < low, np.nan, disparity)
+"""
+SETTINGS = {
+    "datasets": {"synthetic": {"disparity_range": [-64, 64], "methods": ["sgm", "mine", "theirs"]}},
+    "methods": {
+        "mine": {"kind": "function", "function": "mine.py:match", "options": {"block": 5}},
+        "theirs": {"kind": "folder", "folder": "theirs", "label": "Theirs"},
+    },
+    "split": None,
+    "bootstrap": 100,
+}
+ARGUMENTS = ["--configfile", "tiny.yaml", "methods.yaml"]
+
+
+@pytest.fixture(scope="module")
+def scored(made, tmp_path_factory):
+    """A copy of the project with the city's tiles, in which SGM has been scored."""
+    folder = tmp_path_factory.mktemp("scored") / "project"
+    shutil.copytree(made.folder, folder)
+    (folder / "methods.yaml").write_text(yaml.safe_dump({"benchmark": SETTINGS}))
+    (folder / "mine.py").write_text(FUNCTION)
+    project = Project(folder)
+    run = project.snakemake("benchmark/synthetic/sgm", *ARGUMENTS)
+    assert run.status == 0, run.text[-4000:]
+    assert run.jobs == {"dataset": 1, "match": 1, "score": 1}
+    return project
+
+
+def scores(project, method):
+    return json.loads((project.folder / f"benchmark/synthetic/{method}/scores.json").read_text())
+
+
+def test_sgm_is_scored_on_the_workflow_s_own_dataset(scored):
+    found = scores(scored, "sgm")
+    assert found["label"] == "SGM" and found["tiles"] >= 4
+    assert found["all"]["epe_px"] < 1 and found["all"]["valid_share"] > 0.7
+    assert {"all", "near_step", "near_occlusion", "ground", "building"} <= {
+        row["stratum"] for row in found["strata"]
+    }
+    with (scored.folder / "dataset/manifest.csv").open(newline="") as stream:
+        labelled = [row["tile"] for row in csv.DictReader(stream) if row["disp"]]
+    predictions = scored.folder / "results/match/synthetic/sgm"
+    assert {file.stem for file in predictions.glob("*.tiff")} >= set(labelled)
+    assert scored.plan("benchmark/synthetic/sgm", *ARGUMENTS) == {}
+
+
+def test_a_threshold_or_the_seed_scores_again_but_matches_nothing(scored):
+    for change in ("{thresholds_px: [2]}", "{bootstrap: 7}"):
+        (scored.folder / "changed.yaml").write_text(f"benchmark: {change}\n")
+        jobs = scored.plan("benchmark/synthetic/sgm", *ARGUMENTS, "changed.yaml")
+        assert jobs == {"score": 1}, change
+    (scored.folder / "changed.yaml").write_text("benchmark: {methods: {sgm: {block_size: 5}}}\n")
+    jobs = scored.plan("benchmark/synthetic/sgm", *ARGUMENTS, "changed.yaml")
+    assert jobs == {"match": 1, "score": 1}
+
+
+def test_a_user_s_function_and_results_are_compared_with_sgm(scored):
+    """The results in the folder are those of SGM, so that their scores must be the same."""
+    predictions = scored.folder / "results/match/synthetic/sgm"
+    shutil.copytree(predictions, scored.folder / "theirs", dirs_exist_ok=True)
+    run = scored.snakemake("benchmark", *ARGUMENTS)
+    assert run.status == 0, run.text[-4000:]
+    assert run.jobs == {"match": 2, "score": 2, "benchmark_tables": 1, "benchmark": 1}
+    assert scores(scored, "theirs")["all"] == scores(scored, "sgm")["all"]
+    assert scores(scored, "mine")["all"]["epe_px"] < 2
+    folder = scored.folder / "results/benchmark/synthetic"
+    with (folder / "table5.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["method"] for row in rows] == ["SGM", "mine", "Theirs"]
+    assert rows[0]["median_seconds"] and not rows[2]["median_seconds"]
+    assert (folder / "figure10.png").stat().st_size > 10_000
+    assert "Theirs" in (folder / "index.html").read_text()
+    assert scored.plan("benchmark", *ARGUMENTS) == {}
+    with (scored.folder / "mine.py").open("a") as stream:
+        stream.write("\n# another\n")
+    jobs = scored.plan("benchmark", *ARGUMENTS)
+    assert jobs == {"match": 1, "score": 1, "benchmark_tables": 1, "benchmark": 1}
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("benchmark/nothing/sgm", ["no dataset 'nothing'", "synthetic"]),
+        ("benchmark/synthetic/raft", ["no method 'raft'", "hmsmnet"]),
+        ("benchmark/far/sgm", ["benchmark.datasets.far.root", "no such folder"]),
+    ],
+)
+def test_a_wrong_name_ends_before_any_work(project, target, words):
+    far = {"root": "/nowhere", "layout": "us3d", "disparity_range": [-96, 96]}
+    (project.folder / "far.yaml").write_text(
+        yaml.safe_dump({"benchmark": {"datasets": {"far": far}}})
+    )
+    run = project.snakemake("--dry-run", target, "--configfile", "far.yaml")
+    assert run.status != 0
+    for word in words:
+        assert word in run.text
