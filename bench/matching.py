@@ -1,0 +1,106 @@
+"""What the methods cost beside the bare calls that they are made of. See README.md beside this.
+
+python bench/matching.py                              # a random texture, 1024 × 1024, 16 bit
+python bench/matching.py --dataset dataset --layout stereotruth
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stereotruth.matching.layouts import find_pairs, read_image
+from stereotruth.matching.sgm import MODES, STEP, SemiGlobalMatcher, pad, to_8_bits
+
+RANGE = (-128, 64)  # the paper's
+
+
+def texture(size: int, shift: int = 9) -> list[np.ndarray]:
+    """A pair of 16-bit images of one plane."""
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(
+        rng.normal(600, 200, (size, size + shift)).astype(np.float32), (0, 0), 1
+    )
+    wide = np.clip(wide, 1, 65535).astype(np.uint16)
+    return [np.ascontiguousarray(wide[:, start : start + size]) for start in (0, shift)]
+
+
+def compare(calls: Mapping[str, Callable[[], Any]], times: int) -> dict[str, dict[str, float]]:
+    """Median milliseconds, by clock and of the CPU, of calls taken in turns after one of each."""
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
+    for turn in range(times + 1):
+        for name, call in calls.items():
+            clock, cpu = time.perf_counter(), time.process_time()
+            call()
+            if turn:
+                taken[name].append((time.perf_counter() - clock, time.process_time() - cpu))
+    return {
+        name: {
+            kind: round(1000 * median(of[k] for of in values), 1)
+            for k, kind in enumerate(("clock_ms", "cpu_ms"))
+        }
+        for name, values in taken.items()
+    }
+
+
+def sgm(left: np.ndarray, right: np.ndarray, mode: str, times: int) -> dict[str, Any]:
+    """SGM as a method, and the bare calls: of the same pixels, and without padding."""
+    matcher = SemiGlobalMatcher(mode=mode)
+    mapping = matcher.scaling(left, right)
+    bare = matcher.opencv(RANGE)
+    eight = [to_8_bits(image, mapping) for image in (left, right)]
+    before, after = max(RANGE[1], 0), max(-RANGE[0], 0)
+    padded = [pad(image, before, after) for image in eight]
+    found = matcher(left, right, RANGE)
+    raw = bare.compute(*padded)[:, before : before + left.shape[1]] / np.float32(STEP)
+    known = np.isfinite(found)
+    assert np.array_equal(found[known], raw[known])
+    return compare(
+        {
+            "method": lambda: matcher(left, right, RANGE),
+            "bare": lambda: bare.compute(*padded),
+            "bare_unpadded": lambda: bare.compute(*eight),
+        },
+        times,
+    )
+
+
+def main() -> None:
+    """Print tables; ``--json`` keeps the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--dataset", type=Path, help="take the first pair of this folder")
+    parser.add_argument("--layout", default="whu", help="stereotruth, whu or us3d")
+    parser.add_argument("--times", type=int, default=7, help="calls of each")
+    parser.add_argument("--threads", type=int, default=1, help="OpenCV's")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    cv2.setNumThreads(given.threads)
+    if given.dataset is None:
+        left, right = texture(1024)
+    else:
+        pair = find_pairs(given.dataset, given.layout)[0]
+        left, right = read_image(pair.left), read_image(pair.right)
+    print(f"{platform.machine()}, OpenCV {cv2.__version__}, {given.threads} thread(s); ", end="")
+    print(f"{left.shape} {left.dtype}, disparities [{RANGE[0]}, {RANGE[1]}); ms, clock / CPU\n")
+    print(f"{'SGM':<6}{'method':>16}{'bare, padded':>16}{'ratio (CPU)':>13}{'bare, unpadded':>18}")
+    figures = {}
+    for mode in MODES:
+        figures[mode] = of = sgm(left, right, mode, given.times)
+        cells = [f"{of[k]['clock_ms']:.0f} / {of[k]['cpu_ms']:.0f}" for k in of]
+        ratio = of["method"]["cpu_ms"] / of["bare"]["cpu_ms"]
+        print(f"{mode:<6}{cells[0]:>16}{cells[1]:>16}{ratio:>13.3f}{cells[2]:>18}", flush=True)
+    if given.json:
+        given.json.write_text(json.dumps({"sgm": figures}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
