@@ -14,6 +14,7 @@ from stereotruth.matching import scenes
 from stereotruth.matching.blocks import match
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes import predict_scene
+from stereotruth.workers import dask_scheduler
 
 from .test_block_store import Killed, tree
 from .test_blocks import textured
@@ -100,6 +101,17 @@ def test_nothing_but_the_scene_is_left(fresh):
 
 def test_two_workers_give_the_same_bytes(images, fresh, tmp_path):
     predict_scene(*images, tmp_path / "sgm.zarr", **GIVEN, workers=2)
+    assert tree(tmp_path / "sgm.zarr") == tree(fresh)
+
+
+def test_workers_of_a_dask_cluster_write_the_same_bytes(images, fresh, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
+        dask_scheduler(cluster.scheduler_address) as client,
+    ):
+        predict_scene(*images, tmp_path / "sgm.zarr", **GIVEN, scheduler=client)
     assert tree(tmp_path / "sgm.zarr") == tree(fresh)
 
 
