@@ -22,6 +22,7 @@ include: "workflow/rules/report.smk"
 include: "workflow/rules/train.smk"
 include: "workflow/rules/benchmark.smk"
 include: "workflow/rules/predict.smk"
+include: "workflow/rules/audit.smk"
 
 
 rule all:

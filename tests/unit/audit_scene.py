@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-SIZE = 384
-BLOCK = (120, 260, 150, 250)  # left, right, top, bottom: columns and rows of the left image
+SIZE = 288
+BLOCK = (90, 200, 110, 190)  # left, right, top, bottom: columns and rows of the left image
 HEIGHT_PX = 14.0  # disparity of the block above the ground
 SLOPE = 0.02
 

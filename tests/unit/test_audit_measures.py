@@ -13,7 +13,7 @@ from stereotruth.audit.pair import estimate, measure_arrays
 
 from .audit_scene import BLOCK, HEIGHT_PX, make
 
-MANY = 600  # matches that an image of 384 px gives at least
+MANY = 300  # matches that an image of 288 px gives at least
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.25, 0.0), (0.5, 0.5), (0.0, 1.0), (-0.3, -0.7)])
@@ -59,7 +59,7 @@ def test_intervals_hold_what_they_promise():
     """Errors common to a cell: an interval that took the matches for independent would not hold."""
     rng = np.random.default_rng(5)
     covered = independent = 0
-    runs = 400
+    runs = 200
     for _ in range(runs):
         x, y = rng.uniform(0, 1024, (2, 800))
         group = cells(x, y)
@@ -71,7 +71,7 @@ def test_intervals_hold_what_they_promise():
         covered += low <= 0 <= high
         wrong = 1.96 * np.std(values[80:]) / np.sqrt(720)
         independent += abs(found.value) <= wrong
-    assert 0.92 <= covered / runs <= 0.98
+    assert 0.90 <= covered / runs <= 0.99
     assert independent / runs < 0.85
 
 
@@ -122,15 +122,15 @@ def test_right_labels_are_not_contradicted_wrong_ones_are():
     scene = make(9)
     left, right = smooth(grey(scene.left)), smooth(grey(scene.right))
     good = scan_labels(left, right, scene.labels, (-20.0, 30.0))
-    assert good.x.size > 1000
+    assert good.x.size > 500
     assert good.beaten.mean() < 0.005
     wrong = scene.labels.copy()
-    wrong[200:300, 20:120] += 7
+    wrong[200:280, 20:120] += 7
     scan = scan_labels(left, right, wrong, (-20.0, 30.0))
-    inside = (scan.x > 26) & (scan.x < 112) & (scan.y > 206) & (scan.y < 293)
+    inside = (scan.x > 26) & (scan.x < 112) & (scan.y > 206) & (scan.y < 274)
     assert scan.beaten[inside].mean() > 0.8
     assert np.all(np.abs(scan.shift[inside & scan.beaten] + 7) <= 1)
-    assert scan.beaten[~inside].mean() < 0.02
+    assert scan.beaten[~inside].mean() < 0.03
     share = scan.contradicted()
     assert share.value > 0.4 * inside.mean()
 
@@ -202,7 +202,9 @@ def test_values_of_a_label_file():
 )
 def test_figures_of_a_pair(shift, tilt, offset):
     scene = make(15, shift=shift, tilt=tilt)
-    found = measure_arrays(scene.left, scene.right, scene.labels + np.float32(offset), 48)
+    matches = match_pair(scene.left, scene.right, 48)
+    labels = scene.labels + np.float32(offset)
+    found = measure_arrays(scene.left, scene.right, labels, matches)
     for names, true in (
         (("rows", "parallax"), shift[1]),
         (("rows", "tilt_x"), tilt),

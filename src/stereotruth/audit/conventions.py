@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..agreement import BEND
 from ..occlusion import SURFACE_PX
-from .estimates import Estimate, Floats, cells, ratio
+from .estimates import Estimate, Floats, cells, ratio, share
 from .matches import Matches
 
 STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625)  # px; a finer step does no harm
@@ -18,6 +18,7 @@ STRAY_SHARE = 1e-3  # of the pixels that have one and the same value outside the
 SPIKE_SHARE = 5e-3  # of the pixels that have one and the same value inside it,
 AROUND_PX = 0.5  # more of them than all others within this
 AGREE_PX = 1.0
+WRONG_PX = 1.5
 HALF = 3  # px: labels are averaged over 7 x 7, on one surface,
 FILLED = 0.6  # where so many carry it
 AS_STATED, SIGN, SWAPPED, SWAPPED_SIGN = (
@@ -132,6 +133,16 @@ def convention(labels: NDArray[Any], matches: Matches) -> tuple[str, Estimate]:
     best = max(agree, key=lambda name: (int(agree[name].sum()), name == AS_STATED))
     more = agree[best].astype(float) - agree[AS_STATED]
     return best, ratio(more, np.ones(d.size), group)
+
+
+def wrong_at(labels: NDArray[Any], value: float, bias: float, matches: Matches) -> Estimate:
+    """Share of the matches on labels of this very value that contradict it, the bias aside."""
+    rows, cols = (np.floor(v + 0.5).astype(int) for v in (matches.y, matches.x))
+    inside = (rows >= 0) & (cols >= 0) & (rows < labels.shape[0]) & (cols < labels.shape[1])
+    on = np.zeros(inside.shape, bool)
+    on[inside] = labels[rows[inside], cols[inside]] == np.float32(value)
+    off = np.abs(value - bias - matches.disparity[on]) > WRONG_PX
+    return share(off, cells(matches.x[on], matches.y[on]))
 
 
 def swapped(matches: Matches) -> Matches:

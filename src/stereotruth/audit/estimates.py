@@ -21,7 +21,8 @@ TUNING = 4.685
 TO_SIGMA = 1.4826
 SMALLEST_SCALE = 0.02  # px: less is no noise of a match
 ITERATIONS = 50
-CELL_PX = 128
+CELLS = 8  # along the longer side of what was measured; each of
+CELL_PX = (32, 128)  # at least and at most
 MIN_CELLS = 4
 
 
@@ -53,8 +54,11 @@ class Estimate:
 NOTHING = Estimate(float("nan"), float("inf"), 1)
 
 
-def cells(x: Floats, y: Floats, size: int = CELL_PX) -> NDArray[np.int64]:
+def cells(x: Floats, y: Floats) -> NDArray[np.int64]:
     """Number of the cell of each position in px."""
+    if not x.size:
+        return np.empty(0, np.int64)
+    size = np.clip(max(np.ptp(x), np.ptp(y)) / CELLS, *CELL_PX)
     return (np.floor(y / size) * 100_000 + np.floor(x / size)).astype(np.int64)
 
 

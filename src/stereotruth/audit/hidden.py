@@ -64,13 +64,14 @@ def who_is_in_front(left: NDArray[Any], right: NDArray[Any], labels: NDArray[Any
     flat = np.zeros((2, *labels.shape), np.float32)
     correlation = surface_correlation(left, warped, disparity, flat, WINDOW)
     known = np.isfinite(correlation)
-    parts = []
-    for mask, sign in ((near, 1.0), (far, -1.0)):
-        y, x = np.nonzero(mask & known)
-        parts.append((cells(x.astype(float), y.astype(float)), sign, correlation[y, x]))
-    shared = np.intersect1d(parts[0][0], parts[1][0])
+    y, x = np.nonzero((near | far) & known)
+    group = cells(x.astype(float), y.astype(float))
+    sign, value = np.where(near[y, x], 1.0, -1.0), correlation[y, x]
+    shared = np.intersect1d(group[sign > 0], group[sign < 0])
     differences = [
-        sum(sign * float(values[group == cell].mean()) for group, sign, values in parts)
+        float(
+            value[(group == cell) & (sign > 0)].mean() - value[(group == cell) & (sign < 0)].mean()
+        )
         for cell in shared
     ]
     return location(np.array(differences), shared)

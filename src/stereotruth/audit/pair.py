@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
 
 from ..matching.layouts import Pair, StereoDataset, read_image
 from . import conventions, hidden
@@ -48,21 +50,34 @@ def measure(dataset: StereoDataset, pair: Pair) -> dict[str, Any]:
     if not found["same_shape"] or found["identical_images"]:
         return found
     reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
-    return found | measure_arrays(left, right, labels, reach)
+    spikes = [value for value, _ in found.get("labels", {}).get("spikes", [])]
+    matches = match_pair(left, right, reach, nodata=left.dtype != np.uint8)
+    return found | measure_arrays(
+        left, right, labels, matches, spikes=spikes, grows=dataset.grows_with_height
+    )
 
 
 def measure_arrays(
-    left: NDArray[Any], right: NDArray[Any], labels: NDArray[np.float32] | None, reach_px: float
+    left: NDArray[Any],
+    right: NDArray[Any],
+    labels: NDArray[np.float32] | None,
+    matches: Matches,
+    *,
+    spikes: Sequence[float] = (),
+    grows: bool = True,
 ) -> dict[str, Any]:
-    """What images [h, w] or [h, w, 3] and labels (px, NaN: none) say of each other, JSON-ready."""
-    matches = match_pair(left, right, reach_px, nodata=left.dtype != np.uint8)
+    """What images [h, w] or [h, w, 3] and labels (px, NaN: none) say of each other, JSON-ready.
+
+    ``matches`` of the two images; ``spikes``: values of labels that are suspiciously frequent;
+    ``grows``: whether disparities are said to grow with height.
+    """
     found: dict[str, Any] = {"matches": len(matches)}
     if len(matches):
         found["disparity"] = [float(v) for v in np.percentile(matches.disparity, QUANTILES)]
-    rows, trend = _rows(matches, left.shape)
-    found["rows"] = rows
+    found["rows"], trend = _rows(matches, left.shape)
     if labels is not None:
-        found |= _against_labels(grey(left), grey(right), labels, matches, trend)
+        pictures = grey(left), grey(right)
+        found |= _against_labels(*pictures, labels, matches, trend, spikes, grows)
     return found
 
 
@@ -72,6 +87,8 @@ def _against_labels(
     labels: NDArray[np.float32],
     matches: Matches,
     trend: tuple[float, float, float],
+    spikes: Sequence[float],
+    grows: bool,
 ) -> dict[str, Any]:
     meaning, more = conventions.convention(labels, matches)
     found: dict[str, Any] = {"convention": {"best": meaning, "more": _plain(more)}}
@@ -81,12 +98,15 @@ def _against_labels(
         left, right, matches = right, left, conventions.swapped(matches)
         trend = tuple(-v for v in trend)
     if taken in (conventions.SIGN, conventions.SWAPPED_SIGN):
-        labels = -labels
+        labels, spikes = -labels, [-value for value in spikes]
     found["bias"], bias = _bias(labels, matches)
+    found["spikes"] = [
+        _plain(conventions.wrong_at(labels, value, bias, matches)) for value in spikes
+    ]
     aligned = _to_rows(right, trend)
     true = labels - np.float32(bias)
     found["contradicted"] = _contradicted(left, aligned, true, matches)
-    found["hidden"] = _hidden(left, aligned, true)
+    found["hidden"] = _hidden(left, aligned, true, grows)
     return found
 
 
@@ -105,7 +125,10 @@ def _raw_labels(pair: Pair) -> tuple[NDArray[Any] | None, dict[str, Any]]:
     """The label file as it is, and what it says of itself."""
     if pair.disparity is None:
         return None, {}
-    with rasterio.open(pair.disparity) as source:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        source = rasterio.open(pair.disparity)
+    with source:
         values = source.read(1)
         return values, {"dtype": source.dtypes[0], "nodata_tag": source.nodata}
 
@@ -202,7 +225,10 @@ def _contradicted(
     }
 
 
-def _hidden(left: Picture, right: Picture, labels: NDArray[np.float32]) -> dict[str, Any]:
+def _hidden(
+    left: Picture, right: Picture, labels: NDArray[np.float32], grows: bool
+) -> dict[str, Any]:
+    """Who is in front is as the images tell, else as stated."""
     front = hidden.who_is_in_front(left, right, labels)
     low, high = front.interval(CERTAIN)
     nearer = hidden.LARGER if low > 0 else hidden.SMALLER if high < 0 else None
@@ -214,7 +240,7 @@ def _hidden(left: Picture, right: Picture, labels: NDArray[np.float32]) -> dict[
     return {
         "nearer": nearer,
         "evidence": _plain(front),
-        "share": shares[nearer] if nearer else min(shares.values()),
+        "share": shares[nearer or (hidden.LARGER if grows else hidden.SMALLER)],
         "shares": shares,
     }
 

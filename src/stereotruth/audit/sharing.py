@@ -1,9 +1,9 @@
 """Ground that two pairs share: duplicates and overlaps, found in the left images alone.
 
 Of each left image the strongest SIFT features are kept. For each, its nearest ones in other images
-are looked up (in the first principal components, exactly); two images with enough in common are
-compared feature by feature, and one similarity transformation (RANSAC) must explain
-``MIN_INLIERS`` matches. Crops, offsets, other grey values, rotations and scales up to
+are looked up (in the first principal components, exactly); two images with more of them in common
+than chance gives are compared feature by feature, and one similarity transformation (RANSAC) must
+explain ``MIN_INLIERS`` matches. Crops, offsets, other grey values, rotations and scales up to
 ``SCALE`` do no harm. How many matches unrelated images have by chance is said by
 :func:`chance_inliers`, one image against the mirror images of others: no ground is its own mirror.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 import cv2
@@ -25,25 +25,28 @@ from .matches import grey
 
 Floats = NDArray[np.float64]
 
-FEATURES = 500  # of an image, the strongest
+FEATURES = 800  # of an image, the strongest
 COMPONENTS = 14
+QUERIES = 200  # of them, evenly chosen, are looked up
 NEIGHBOURS = 6  # of a feature, in other images
-SIMILAR = 6  # features that look alike: from here on two images are compared
+AXES_FROM = 100_000  # features, evenly chosen, that the principal components are taken of
+ALL = 60  # images: so few are all compared with each other; of more those with more neighbours
+UNLIKELY = 4.0  # than by chance, by so many standard deviations
 RATIO = 0.85
 REPROJECTION_PX = 3.0
-MIN_INLIERS = 12
+MIN_INLIERS = 8
 SCALE = 1.3
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """The strongest features of an image: ``place`` (x, y) px [n, 2], ``vector`` float32[n, 128].
+    """The strongest features of an image: ``place`` (x, y) px [n, 2], ``vector`` float16[n, 128].
 
     ``shape`` of the image, rows and columns.
     """
 
     place: Floats
-    vector: NDArray[np.float32]
+    vector: NDArray[np.float16]
     shape: tuple[int, int]
 
 
@@ -62,10 +65,12 @@ def features(image: NDArray[Any]) -> Features:
     picture = stretch(grey(image), percent=(0.1, 99.9))
     found, vectors = cv2.SIFT_create(nfeatures=FEATURES).detectAndCompute(picture, None)
     if not found:
-        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32), picture.shape)
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float16), picture.shape)
     root = np.sqrt(vectors / np.maximum(vectors.sum(axis=1, keepdims=True), 1e-9))
     order = np.lexsort([[k.pt[i] for k in found] for i in (0, 1)])
-    return Features(np.array([k.pt for k in found])[order], root[order], picture.shape)
+    return Features(
+        np.array([k.pt for k in found])[order], root[order].astype(np.float16), picture.shape
+    )
 
 
 def find_shared(images: list[Features]) -> list[Shared]:
@@ -78,29 +83,29 @@ def find_shared(images: list[Features]) -> list[Shared]:
 
 
 def _candidates(images: list[Features]) -> list[tuple[int, int]]:
-    """Pairs of images of which SIMILAR features look alike."""
+    """Pairs of images of which more features look alike than by chance."""
+    if len(images) <= ALL:
+        return list(combinations(range(len(images)), 2))
     sizes = [len(image.vector) for image in images]
-    owner = np.repeat(np.arange(len(images)), sizes)
-    if owner.size <= NEIGHBOURS:
-        return []
-    vectors = np.concatenate([image.vector for image in images])
-    reduced = _principal(vectors)
-    tree = cKDTree(reduced)
-    _, near = tree.query(reduced, k=NEIGHBOURS + 1)
-    votes: Counter[tuple[int, int]] = Counter()
     ends = np.cumsum([0, *sizes])
+    owner = np.repeat(np.arange(len(images)), sizes)
+    every = max(1, -(-owner.size // AXES_FROM))
+    some = np.concatenate([image.vector[::every] for image in images]).astype(np.float64)
+    middle = some.mean(axis=0)
+    _, axes = np.linalg.eigh((some - middle).T @ (some - middle))
+    axes = axes[:, ::-1][:, :COMPONENTS]
+    reduced = np.concatenate([(image.vector - middle) @ axes for image in images])
+    tree = cKDTree(reduced)
+    votes: Counter[tuple[int, int]] = Counter()
     for number, (begin, end) in enumerate(pairwise(ends)):
-        theirs = owner[near[begin:end]]
-        for row in theirs:
-            votes.update((number, other) for other in set(row.tolist()) - {number})
-    both = {tuple(sorted(pair)) for pair in votes}
-    return sorted(p for p in both if votes[p] + votes[p[::-1]] >= SIMILAR)
-
-
-def _principal(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    centred = vectors - vectors.mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred)
-    return (centred @ axes[:, ::-1][:, :COMPONENTS]).astype(np.float32)
+        asked = np.arange(begin, end, max(1, -(-(end - begin) // QUERIES)))
+        _, near = tree.query(reduced[asked], k=min(NEIGHBOURS + 1, owner.size))
+        for row in owner[near]:
+            others = set(row.tolist()) - {number}
+            votes.update((min(number, other), max(number, other)) for other in others)
+    expected = 2 * votes.total() / (len(images) * (len(images) - 1))
+    enough = expected + UNLIKELY * np.sqrt(expected)
+    return sorted(pair for pair, count in votes.items() if count > enough)
 
 
 def _compare(a: Features, b: Features) -> tuple[int, float] | None:
@@ -120,7 +125,7 @@ def _compare(a: Features, b: Features) -> tuple[int, float] | None:
 def _align(a: Features, b: Features) -> tuple[int, Floats | None]:
     if min(len(a.vector), len(b.vector)) < 3:
         return 0, None
-    alike = a.vector @ b.vector.T  # rows have unit length
+    alike = a.vector.astype(np.float32) @ b.vector.astype(np.float32).T  # rows of unit length
     best = np.argmax(alike, axis=1)
     ordered = np.partition(alike, -2, axis=1)
     near, next_near = (np.sqrt(np.maximum(2 - 2 * ordered[:, k], 0)) for k in (-1, -2))

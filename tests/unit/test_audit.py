@@ -1,0 +1,272 @@
+"""The audit of a dataset: planted faults are found, good pairs pass, killed runs are carried on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import warnings
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from stereotruth.audit import run, sharing
+from stereotruth.audit.estimates import Estimate
+from stereotruth.audit.verdicts import FAULT, GOOD, Limits, judge
+from stereotruth.errors import InputError
+from stereotruth.matching.layouts import StereoDataset
+
+from .audit_scene import make, sample, texture
+
+LIMITS = Limits(0.3, 0.3, 0.05, 0.01, 0.01, 0.01)
+
+
+def write(path, values, nodata=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    profile = {
+        "driver": "GTiff",
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "count": 1,
+        "dtype": values.dtype,
+        "nodata": nodata,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", **profile) as file:
+            file.write(values, 1)
+
+
+def add(root, number, scene, *, split="test", labels=None, nodata=-999.0):
+    folder = root / split
+    write(folder / "left" / f"KM_left_{number}.tiff", scene.left)
+    write(folder / "right" / f"KM_right_{number}.tiff", scene.right)
+    values = scene.labels if labels is None else labels
+    stored = np.where(np.isfinite(values), values, np.float32(nodata))
+    write(folder / "disp" / f"KM_disparity_{number}.tiff", stored, -999.0)
+
+
+def dataset(root):
+    return StereoDataset("mine", root, "whu", (-64, 64))
+
+
+def read(out):
+    with (out / "pairs.csv").open(newline="") as stream:
+        rows = {row["pair"]: row for row in csv.DictReader(stream)}
+    return rows, json.loads((out / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def audited(tmp_path_factory):
+    """A good pair, and one for each of many faults."""
+    root = tmp_path_factory.mktemp("data")
+    good = make(20)
+    add(root, 0, good)
+    add(root, 1, make(21), labels=make(21).labels + 2)
+    add(root, 2, make(22, shift=(0.0, 1.0)))
+    add(root, 3, make(23), labels=-make(23).labels)
+    swapped = make(24, slope=0.15)
+    swapped.left, swapped.right = swapped.right, swapped.left
+    add(root, 4, swapped)
+    add(root, 6, good, split="train")
+    holes = make(27, offset=9.0)
+    holes.labels[:, :90] = np.nan
+    add(root, 7, holes, nodata=0.0)
+    add(root, 8, make(28), nodata=-9999.0)
+    add(root, 9, make(29), labels=make(29).exact)
+    wrong = make(30)
+    wrong.labels[195:285, 20:270] += 6
+    add(root, 10, wrong)
+    same = make(32)
+    same.right = same.left
+    add(root, 12, same)
+    out = root / "audit" / "mine"
+    summary = run.audit(dataset(root), out, LIMITS, worst=3, workers=2)
+    return root, out, summary
+
+
+@pytest.mark.parametrize(
+    "pair, check",
+    [
+        ("KM_1", "bias"),
+        ("KM_2", "rows"),
+        ("KM_3", "convention"),
+        ("KM_4", "convention"),
+        ("KM_7", "values"),
+        ("KM_8", "values"),
+        ("KM_9", "hidden"),
+        ("KM_10", "contradicted"),
+        ("KM_12", "files"),
+    ],
+)
+def test_a_planted_fault_is_found_by_its_check(audited, pair, check):
+    figures = json.loads((audited[1] / "summary.json").read_text())
+    assert figures["checks"][check]["fault"]
+    rows, _ = read(audited[1])
+    assert rows[pair]["verdict"] == FAULT
+    words = {
+        "bias": "labels less matches",
+        "rows": "vertical parallax",
+        "convention": "agree with the images as",
+        "values": "nodata?",
+        "hidden": "behind others",
+        "contradicted": "contradict",
+        "files": "same",
+    }
+    assert words[check] in rows[pair]["faults"]
+
+
+def test_a_duplicate_in_another_split_is_found(audited):
+    rows, summary = read(audited[1])
+    assert "the same image as" in rows["KM_6"]["faults"]
+    assert "the same image as" in rows["KM_0"]["faults"]
+    (shared,) = summary["shared"]
+    assert {shared["first"], shared["second"]} == {"KM_0", "KM_6"}
+    assert shared["share"] == pytest.approx(1, abs=0.01)
+
+
+def test_what_is_written(audited):
+    _, out, summary = audited
+    assert sorted(f.name for f in out.iterdir()) == [
+        "README.txt",
+        "index.html",
+        "pairs.csv",
+        "summary.json",
+    ]
+    page = (out / "index.html").read_text()
+    assert page.count("<section") == 3 and "data:image/webp" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert not list(out.parent.glob(".*"))
+    assert summary["verdicts"] == {"good": 0, "undecided": 0, "fault": 11}
+
+
+def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
+    root, out = tmp_path / "data", tmp_path / "out"
+    for seed in range(3):
+        add(root, seed, make(40 + seed), split=("train", "test")[seed % 2])
+    whole = run.measure
+    seen = []
+
+    def killed(of, pair):
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        seen.append(pair.name)
+        return whole(of, pair)
+
+    monkeypatch.setattr(run, "measure", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run.audit(dataset(root), out, LIMITS, worst=1)
+    assert not out.exists()
+    seen.clear()
+    monkeypatch.setattr(run, "measure", lambda of, p: (seen.append(p.name), whole(of, p))[1])
+    summary = run.audit(dataset(root), out, LIMITS, worst=1)
+    assert len(seen) == 1
+    assert summary["verdicts"][GOOD] == 3 and not summary["shared"]
+    again = run.audit(dataset(root), tmp_path / "again", LIMITS, worst=1, workers=2)
+    assert again == summary
+    for file in out.iterdir():
+        assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes(), file.name
+
+
+def test_pairs_without_labels(tmp_path):
+    scene = make(50, shift=(0.0, 0.6))
+    write(tmp_path / "KM_left_1.tiff", scene.left)
+    write(tmp_path / "KM_right_1.tiff", scene.right)
+    run.audit(dataset(tmp_path), tmp_path / "out", LIMITS)
+    rows, summary = read(tmp_path / "out")
+    assert rows["KM_1"]["verdict"] == FAULT and "vertical parallax" in rows["KM_1"]["faults"]
+    assert summary["labelled_pairs"] == 0
+
+
+def test_files_that_do_not_fit_and_empty_images(tmp_path):
+    scene = make(51)
+    add(tmp_path, 1, scene, labels=scene.labels[:-5])
+    scene.right[:] = 7
+    add(tmp_path, 2, scene)
+    run.audit(dataset(tmp_path), tmp_path / "out", LIMITS)
+    rows, _ = read(tmp_path / "out")
+    assert "differ in size" in rows["KM_1"]["faults"]
+    assert "the right image is empty" in rows["KM_2"]["faults"]
+
+
+def test_an_unreadable_file_is_named(tmp_path):
+    scene = make(52)
+    add(tmp_path, 1, scene)
+    (tmp_path / "test/left/KM_left_1.tiff").write_bytes(b"no image")
+    with pytest.raises(InputError, match="KM_left_1"):
+        run.audit(dataset(tmp_path), tmp_path / "out", LIMITS)
+
+
+def overlapping(shift, seed, angle=0.0):
+    """Two looks at one ground, ``shift`` px apart, and one at another."""
+    rng = np.random.default_rng(seed)
+    ground, other = texture(rng, 800), texture(rng, 800)
+    y, x = np.mgrid[:300, :300].astype(float)
+    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    looks = [
+        sample(ground, x, y),
+        0.7 * sample(ground, c * x - s * y + shift, s * x + c * y) + 90,
+        sample(other, x, y),
+    ]
+    return [np.rint(look + rng.normal(0, 4, look.shape)).astype(np.uint16) for look in looks]
+
+
+@pytest.mark.parametrize("shift, angle", [(0, 0), (140, 0), (210, 0), (110, 12)])
+def test_shared_ground(shift, angle):
+    images = [sharing.features(image) for image in overlapping(shift, 60, angle)]
+    (found,) = sharing.find_shared(images)
+    assert (found.first, found.second) == (0, 1)
+    if not angle:
+        assert found.share == pytest.approx(1 - shift / 300, abs=0.02)
+
+
+def test_of_many_images_only_likely_pairs_are_compared(monkeypatch):
+    monkeypatch.setattr(sharing, "ALL", 0)
+    rng = np.random.default_rng(63)
+    others = [texture(rng, 200).astype(np.uint16) for _ in range(20)]
+    images = [sharing.features(image) for image in overlapping(110, 64) + others]
+    assert len(sharing._candidates(images)) < 60  # of 253
+    (found,) = sharing.find_shared(images)
+    assert (found.first, found.second) == (0, 1)
+
+
+def test_unrelated_images_share_nothing():
+    rng = np.random.default_rng(61)
+    images = [texture(rng, 300).astype(np.uint16) for _ in range(4)]
+    assert sharing.find_shared([sharing.features(image) for image in images]) == []
+    assert max(sharing.chance_inliers(images)) < sharing.MIN_INLIERS
+    assert sharing.find_shared([sharing.features(np.zeros((64, 64), np.uint16))] * 2) == []
+
+
+def figures(bias, error, freedom=40):
+    plain = [0.0, 0.01, freedom]
+    return {
+        "same_shape": True,
+        "identical_images": False,
+        "images": {},
+        "dtype": ["uint16"],
+        "matches": 500,
+        "rows": {"parallax": plain, "tilt_x": plain, "tilt_y": plain},
+        "labels": {"labelled": 0.8, "strays": [], "outside": 0.0, "spikes": [], "step": None},
+        "convention": {"taken": "as stated"},
+        "bias": {"matches": 500, "bias": [bias, error, freedom], "tilt_x": plain, "tilt_y": plain},
+        "contradicted": {"share": [0.001, 0.001, freedom], "labels": 5000},
+        "hidden": {"share": 0.0},
+    }
+
+
+def test_verdicts_have_the_error_rate_that_is_stated():
+    """Biases at the very edge of what is tolerated, many datasets of 20 pairs."""
+    rng = np.random.default_rng(62)
+    limits = Limits(0.3, 0.3, 0.05, 0.02, 0.01, 0.2)
+    alarms = 0
+    for _ in range(120):
+        seen = 0.3 + 0.05 * rng.standard_normal(20)
+        spread = 0.05 * np.sqrt(rng.chisquare(40, 20) / 40)
+        alarms += any(judge(figures(b, e), limits, 20).word == FAULT for b, e in zip(seen, spread))
+    assert alarms / 120 <= 0.2
+    assert judge(figures(2.0, 0.05), limits, 20).word == FAULT
+    assert judge(figures(0.0, 0.02), limits, 20).word == GOOD
+    assert judge(figures(0.3, 0.05), limits, 20).word == "undecided"
+    assert Estimate(0.3, 0.05, 40).beyond(0.3, 0.2) is None

@@ -1,0 +1,18 @@
+"""What the images and labels of a dataset say of each other."""
+
+from stereotruth.audit.run import audit
+from stereotruth.audit.verdicts import Limits
+from stereotruth.matching.layouts import StereoDataset
+from stereotruth.runlog import job
+
+if __name__ == "__main__":
+    name, params = snakemake.wildcards.dataset, snakemake.params
+    with job(snakemake.log[0], f"audit {name}"):
+        audit(
+            StereoDataset.of(name, params.dataset),
+            snakemake.output[0],
+            Limits(**params.limits),
+            worst=params.worst,
+            workers=snakemake.threads,
+            code=params.measuring,
+        )
