@@ -19,7 +19,7 @@ rule match:
         runtime=480,
     params:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
-        method=lambda w: method_settings(w.method),
+        method=lambda w: scene_method(w.method),
         split=config["benchmark"]["split"],
         code=lambda w: source_digest("matching.predictions", *method_modules(w.method)),
     message:
@@ -52,6 +52,7 @@ rule score:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         split=config["benchmark"]["split"],
         label=lambda w: method_label(w.method),
+        fine_tuned_of=lambda w: method_settings(w.method).get("fine_tuned_of"),
         thresholds_px=config["benchmark"]["thresholds_px"],
         bootstrap=config["benchmark"]["bootstrap"],
         panels=config["benchmark"]["panels"],

@@ -21,5 +21,6 @@ if __name__ == "__main__":
             bootstrap=params.bootstrap,
             seed=params.seed,
             panels=params.panels,
+            fine_tuned_of=params.fine_tuned_of,
             products=Products(*own) if snakemake.input.strata else None,
         )

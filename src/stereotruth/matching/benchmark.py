@@ -42,12 +42,14 @@ def score(
     bootstrap: int,
     seed: int,
     panels: int,
+    fine_tuned_of: str | None = None,
     products: Products | None = None,
 ) -> dict[str, Any]:
     """Score the predictions of rule match; returns what scores.json holds.
 
-    ``label``: how the method is called in pictures and tables; ``panels``: most tiles that are
-    drawn; ``products``: where the strata of the workflow's own dataset come from.
+    ``label``: how the method is called in pictures and tables; ``fine_tuned_of``: the method whose
+    training it carried on; ``panels``: most tiles that are drawn; ``products``: where the strata of
+    the workflow's own dataset come from.
 
     Raises InputError if there are no labelled pairs, or files are missing.
     """
@@ -84,6 +86,7 @@ def score(
     ]
     summary = {
         "label": label,
+        "fine_tuned_of": fine_tuned_of,
         **{key: record[key] for key in record if key != "pairs"},
         "tiles": len(pairs),
         "thresholds_px": list(scores.thresholds_px),

@@ -4,8 +4,9 @@
 they were made, the seconds of each pair (the first pair that a process works on is matched twice,
 and only the second time counts), and the memory of the process at its peak.
 
-Pairs wait in a work folder with a record of what they were made of (image and method), so that a
-later call carries on where one was killed, and takes over what it would make the same.
+Pairs stay in a work folder (hard links) with a record of what they were made of, images and
+method, so that a later call carries on where one was killed, and takes over what it would make the
+same: labels may change without any pair being matched again.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def predict(
     """Match the pairs of a split (None: all), or take a folder's results; returns the record.
 
     ``settings``: the method's entry of the configuration; ``files``: what else the method is made
-    of (weights, the user's code). ``work``: where finished pairs wait; it is removed at the end.
+    of (weights, the user's code). ``work``: where finished pairs stay.
 
     Raises InputError if a pair, the method or one of its results cannot be used.
     """
@@ -82,6 +83,7 @@ def predict(
         "code": code,
     }
     if settings["kind"] == FOLDER:
+        made_of["nodata"] = dataset.nodata
         maker: _Results | _Runs = _Results(name, Path(settings["folder"]), dataset.nodata)
     else:
         maker = _Runs(name, settings, dataset.disparity_range, workers)
@@ -115,7 +117,10 @@ def predict(
     (scratch / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     shutil.rmtree(out, ignore_errors=True)
     scratch.rename(out)
-    shutil.rmtree(work)
+    ledger.keep_only(set(found))
+    for file in work.glob("*.tiff"):
+        if file.stem not in found:
+            file.unlink()
     return record
 
 

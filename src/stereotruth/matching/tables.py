@@ -105,7 +105,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             "threads": of["threads"],
         }
         published = paper.TABLE5.get(_kind(of)) if beside_paper else None
-        if published and not of["settings"].get("fine_tuned_of"):
+        if published and not of["fine_tuned_of"]:
             keys = ("paper_epe_px", "paper_d1_percent", "paper_ms")
             row |= dict(zip(keys, published))
         rows.append(row)
@@ -176,7 +176,7 @@ def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> 
     by_name = {of["method"]: of for of in methods}
     columns = []
     for of in methods:
-        base = of["settings"].get("fine_tuned_of")
+        base = of["fine_tuned_of"]
         if base is not None:
             columns += [(by_name[base], by_name[base]["label"])] if base in by_name else []
             columns.append((of, of["label"]))
@@ -265,7 +265,7 @@ def _heading(first: str, methods: Sequence[Row]) -> list[str]:
 
 def _plain(methods: Sequence[Row]) -> list[Row]:
     """The methods that are not fine-tuned."""
-    return [of for of in methods if not of["settings"].get("fine_tuned_of")]
+    return [of for of in methods if not of["fine_tuned_of"]]
 
 
 def _kind(of: Row) -> str:
