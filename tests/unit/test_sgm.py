@@ -39,7 +39,7 @@ def test_a_shift_is_found_in_every_column_that_both_images_show(mode, shift):
         assert np.isnan(found[:, ~seen]).mean() > 0.98
     good = found[:, seen]
     assert np.isfinite(good).mean() > 0.98
-    assert np.nanmax(np.abs(good - shift)) <= 1  # by the padding, next to it
+    assert np.nanmax(np.abs(good - shift)) <= 1.25  # by the padding, next to it
     assert np.nanmax(np.abs(good[3:-3, 3:-3] - shift)) <= 0.25
     assert abs(np.nanmean(good) - shift) < 0.02
 
@@ -72,7 +72,7 @@ def test_nodata_of_either_image_is_invalid():
     found = SemiGlobalMatcher(speckle_px=0)(left, right, (-16, 16))
     assert np.isnan(found[:20, 60:90]).all()
     rows, cols = np.nonzero(np.isfinite(found))
-    match = np.rint(cols - found[rows, cols]).astype(int)
+    match = cols - np.floor(found[rows, cols] + 0.5).astype(int)
     assert (right[rows, match] != 0).all()
     assert np.isfinite(found[30:50, 110:]).mean() > 0.9
 
@@ -105,7 +105,7 @@ def test_the_grey_mapping_is_monotone_and_clips_nothing():
     levels = mapping(np.arange(1 << 16, dtype=np.uint16)[None])[0].astype(int)
     assert (np.diff(levels) >= 0).all() and levels[0] <= 16 and levels[-1] >= 239
     low, high = int(mapping.low), int(mapping.high)
-    assert 420 < low < 470 and 730 < high < 780  # all but half a percent at either end
+    assert 470 < low < 485 and 715 < high < 730  # all but two percent at either end
     middle = levels[low : high + 1]
     assert middle[0] == 16 and middle[-1] == 239
     assert np.abs(np.diff(middle, 2)).max() <= 1  # linear, rounded
@@ -120,7 +120,7 @@ def test_both_images_have_one_mapping_whatever_the_array():
     left, right = pair(5)
     right = (right * 1.5).astype(np.uint16)
     mapping = grey_mapping(left, right)
-    assert mapping.low < np.percentile(left, 2) and mapping.high > np.percentile(right, 98)
+    assert mapping.low < np.percentile(left, 4) and mapping.high > np.percentile(right, 95)
     lazy = grey_mapping(da.from_array(left, chunks=50), da.from_array(right, chunks=50))
     assert lazy == mapping
     assert grey_mapping(left.astype(np.uint8), right.astype(np.uint8)) is None
