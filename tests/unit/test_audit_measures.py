@@ -8,10 +8,10 @@ import pytest
 from stereotruth.audit import conventions, hidden
 from stereotruth.audit.contradiction import scan_labels
 from stereotruth.audit.estimates import Estimate, cells, location, ratio, robust_fit
-from stereotruth.audit.matches import grey, match_pair, smooth
+from stereotruth.audit.matches import Matches, grey, label_offsets, match_pair, smooth
 from stereotruth.audit.pair import estimate, measure_arrays
 
-from .audit_scene import BLOCK, HEIGHT_PX, make
+from .audit_scene import BLOCK, HEIGHT_PX, make, sample, texture
 
 MANY = 300  # matches that an image of 288 px gives at least
 
@@ -85,6 +85,27 @@ def test_robust_fit_finds_a_trend_among_mismatches():
     for got, true in zip(found, (0.3, -0.5, 0.2)):
         assert abs(got.value - true) < 4 * got.error
         assert got.error < 0.01
+
+
+def test_labels_are_held_against_matches_in_their_own_shape():
+    """A match is the mean of its window: on a ridge, less than the label on its crest."""
+    rng = np.random.default_rng(16)
+    ground = texture(rng, 400)
+    y, x = np.mgrid[:256, :256].astype(float)
+    labels = 3.0 - 0.25 * np.abs((x + 8) % 16 - 8)
+    columns = np.arange(256.0)
+    inverse = np.interp(columns, columns - labels[0], columns)  # left column of each right one
+    left, right = sample(ground, x, y), sample(ground, np.tile(inverse, (256, 1)), y)
+    crest = (x[0] % 16 == 8) & (x[0] > 20) & (x[0] < 230)
+    xs, ys = (v.ravel().astype(float) for v in np.meshgrid(columns[crest], np.arange(30, 230, 12)))
+    none = np.zeros(xs.size)
+    found = Matches(xs, ys, none + 0.9, none, none, none, none, none)
+    for offset in (0.0, 0.4, -1.5):
+        got = label_offsets(
+            left.astype(np.float32), right.astype(np.float32), labels - 2.0 + offset, found
+        )
+        assert np.isfinite(got).mean() > 0.5
+        assert np.nanmedian(got) == pytest.approx(offset - 2.0, abs=0.05)
 
 
 def test_too_few_cells_say_nothing():
@@ -193,6 +214,8 @@ def test_values_of_a_label_file():
     assert conventions.label_values(holes, (-64, 64)).spikes == [(0.0, 0.25)]
     holes[:50] = -9999
     bad = conventions.label_values(holes, (-64, 64))
+    steep = np.tile(np.linspace(-90, 0, 200, dtype=np.float32).round(2), (200, 1))
+    assert conventions.label_values(steep, (-64, 64)).strays == []
     assert bad.strays == [(-9999.0, 0.25)] and bad.outside == pytest.approx(0.25)
     assert conventions.label_values(np.full((9, 9), np.nan), (-64, 64)).labelled == 0
 

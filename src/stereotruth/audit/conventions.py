@@ -14,8 +14,8 @@ from .estimates import Estimate, Floats, cells, ratio, share
 from .matches import Matches
 
 STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625)  # px; a finer step does no harm
-STRAY_SHARE = 1e-3  # of the pixels that have one and the same value outside the range
-SPIKE_SHARE = 5e-3  # of the pixels that have one and the same value inside it,
+STRAY_SHARE = 1e-3  # of the pixels that have one and the same value, outside the range,
+SPIKE_SHARE = 5e-3  # inside it;
 AROUND_PX = 0.5  # more of them than all others within this
 AGREE_PX = 1.0
 WRONG_PX = 1.5
@@ -33,8 +33,8 @@ class Values(NamedTuple):
     """Facts of a label file. Shares are of all pixels; ``outside`` of the labelled ones.
 
     ``step``: px that all labels are multiples of, or None. ``strays``: values outside the range
-    that many pixels have, with their shares: a nodata value that nobody declared. ``spikes``: such
-    values inside the range, by far more frequent than those beside them.
+    that many pixels have, more than the values beside them, with their shares: a nodata value that
+    nobody declared. ``spikes``: such values inside the range.
     """
 
     labelled: float
@@ -54,20 +54,20 @@ def label_values(labels: NDArray[Any], disparity_range: tuple[float, float]) -> 
     atoms, counts = np.unique(known, return_counts=True)
     inside = (atoms >= disparity_range[0]) & (atoms < disparity_range[1])
     step = next((s for s in STEPS if np.all(atoms % s == 0)), None)
-    stray = ~inside & (counts >= STRAY_SHARE * labels.size)
-    spikes = []
-    for k in np.flatnonzero(inside & (counts >= SPIKE_SHARE * labels.size)):
-        reach = max(AROUND_PX, 1.5 * (step or 0.0))
-        around = (np.abs(atoms - atoms[k]) <= reach) & inside
+    reach = max(AROUND_PX, 1.5 * (step or 0.0))
+    strays, spikes = [], []
+    for k in np.flatnonzero(counts >= np.where(inside, SPIKE_SHARE, STRAY_SHARE) * labels.size):
+        around = np.abs(atoms - atoms[k]) <= reach
         if counts[k] > counts[around].sum() - counts[k]:
-            spikes.append((float(atoms[k]), float(counts[k] / labels.size)))
+            found = spikes if inside[k] else strays
+            found.append((float(atoms[k]), float(counts[k] / labels.size)))
     return Values(
         known.size / labels.size,
         float(atoms[0]),
         float(atoms[-1]),
         float(counts[~inside].sum() / known.size),
         step,
-        [(float(v), float(n / labels.size)) for v, n in zip(atoms[stray], counts[stray])],
+        strays,
         spikes,
     )
 

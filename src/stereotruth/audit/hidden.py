@@ -22,6 +22,7 @@ Bools = NDArray[np.bool_]
 
 TOLERANCE_PX = 1.0  # labels that are right to some tenths of a px fold by less
 WINDOW = 9  # px
+CLEAR = 0.15  # of correlation: crowns fold, too, and what lies below them is seen as well or better
 LARGER, SMALLER = "larger", "smaller"
 
 

@@ -35,6 +35,8 @@ ITERATIONS = 15
 CONVERGED = 0.002  # px
 MOVE_PX = 1.5  # that a match may move from where SIFT has it
 STEEPEST = 0.6  # px of disparity per px
+LABELLED = 0.6  # of a window, by weight, where labels are held against a match
+LABEL_MOVE_PX = 3.0  # by which that may move the match: a window's middle may stand out
 MIN_CORRELATION = 0.7
 POOR_SIGMA = 0.25  # px, by the match's own residuals
 ROW_STEP_PX = 9.0  # of the search for rows that are far off: SIFT looks 5 px up and down
@@ -239,14 +241,131 @@ def least_squares(left: Picture, right: Picture, start: Floats) -> Matches:
 
     Those that do not converge near their start, or fit poorly, are left out.
     """
-    offset = np.arange(-HALF, HALF + 1) / WEIGHT_PX
-    weight = np.exp(-0.5 * (offset[:, None] ** 2 + offset[None, :] ** 2))
     out = np.empty((len(start), 6))
-    _match_all(spline(smooth(left)), spline(smooth(right)), weight, start, out)
+    _match_all(spline(smooth(left)), spline(smooth(right)), _weight(), start, out)
     d, along, down, parallax, sigma, correlation = out.T
     found = Matches(start[:, 0], start[:, 1], d, along, down, parallax, sigma, correlation)
     with np.errstate(invalid="ignore"):
         return found.take((correlation >= MIN_CORRELATION) & (sigma <= POOR_SIGMA))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _offset(
+    left: Picture,
+    right: Picture,
+    labels: Picture,
+    weight: Floats,
+    x0: int,
+    y0: int,
+    d: float,
+    p: float,
+    out: Floats,
+) -> None:
+    """Fill ``out`` [2] by label less disparity and correlation, or NaN; starts as :func:`_match`.
+
+    Unknowns are one offset of all labels of the window, and the parallax.
+    """
+    half = weight.shape[0] // 2
+    out[:] = np.nan
+    rows, cols = left.shape
+    if x0 - half < 2 or y0 - half < 2 or x0 + half > cols - 4 or y0 + half > rows - 4:
+        return
+    if np.isnan(labels[y0, x0]):
+        return
+    taps = np.empty((4, 4))
+    most = (2 * half + 1) ** 2
+    place, a, b = np.empty((most, 4)), np.empty((most, 3)), np.empty((most, 3))
+    n, mean_a, total, whole = 0, 0.0, 0.0, 0.0
+    for j in range(2 * half + 1):
+        for i in range(2 * half + 1):
+            w, x, y = weight[j, i], x0 + i - half, y0 + j - half
+            whole += w
+            label = labels[y, x]
+            if np.isnan(label):
+                continue
+            place[n, 0], place[n, 1], place[n, 2], place[n, 3] = x, y, label, w
+            a[n, 0], a[n, 1], a[n, 2] = _sample(left, float(x), float(y), taps)
+            mean_a += w * a[n, 0]
+            total += w
+            n += 1
+    if total < LABELLED * whole:
+        return
+    mean_a /= total
+    first = labels[y0, x0] - d
+    offset, parallax = first, p
+    for _ in range(ITERATIONS):
+        mean_b = 0.0
+        for k in range(n):
+            x, y = place[k, 0] - place[k, 2] + offset, place[k, 1] + parallax
+            if not (x >= 2.0 and y >= 2.0 and x <= cols - 4.0 and y <= rows - 4.0):
+                return
+            b[k, 0], b[k, 1], b[k, 2] = _sample(right, x, y, taps)
+            mean_b += place[k, 3] * b[k, 0]
+        mean_b /= total
+        aa, ab, bb = 0.0, 0.0, 0.0
+        for k in range(n):
+            w, s, t = place[k, 3], a[k, 0] - mean_a, b[k, 0] - mean_b
+            aa += w * s * s
+            ab += w * s * t
+            bb += w * t * t
+        if aa <= 0.0 or bb <= 0.0 or ab <= 0.0:
+            return
+        gain = np.sqrt(aa / bb)
+        sx, sy, xx, xy, yy, bx, by = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(n):
+            w = place[k, 3]
+            gx = 0.5 * (a[k, 1] + gain * b[k, 1])
+            gy = 0.5 * (a[k, 2] + gain * b[k, 2])
+            miss = a[k, 0] - mean_a - gain * (b[k, 0] - mean_b)
+            sx += w * gx
+            sy += w * gy
+            xx += w * gx * gx
+            xy += w * gx * gy
+            yy += w * gy * gy
+            bx += w * gx * miss
+            by += w * gy * miss
+        xx, xy, yy = xx - sx * sx / total, xy - sx * sy / total, yy - sy * sy / total
+        det = xx * yy - xy * xy
+        if not det > 0.0:
+            return
+        along, down = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
+        offset += along
+        parallax += down
+        if abs(offset - first) > LABEL_MOVE_PX or abs(parallax - p) > MOVE_PX:
+            return
+        if max(abs(along), abs(down)) < CONVERGED:
+            out[0], out[1] = offset, ab / np.sqrt(aa * bb)
+            return
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _offset_all(
+    left: Picture, right: Picture, labels: Picture, weight: Floats, start: Floats, out: Floats
+) -> None:
+    for k in range(start.shape[0]):
+        x0, y0 = int(start[k, 0]), int(start[k, 1])
+        _offset(left, right, labels, weight, x0, y0, start[k, 2], start[k, 3], out[k])
+
+
+def label_offsets(left: Picture, right: Picture, labels: NDArray[Any], matches: Matches) -> Floats:
+    """Labels less disparity at each match, px; NaN without labels or where the images do not fit.
+
+    A match is the mean of its window: on a crown or a ridge, where key points are, that is less
+    than the label in its middle (0.5 px in a forest, with labels that are right to 0.03 px). So the
+    window is matched once more, from where the match has it, in the shape that the labels give it.
+    """
+    start = np.column_stack([matches.x, matches.y, matches.disparity, matches.parallax])
+    out = np.empty((len(matches), 2))
+    labels = np.ascontiguousarray(labels, np.float32)
+    pictures = spline(smooth(left)), spline(smooth(right))
+    _offset_all(*pictures, labels, _weight(), start, out)
+    with np.errstate(invalid="ignore"):
+        return np.where(out[:, 1] >= MIN_CORRELATION, out[:, 0], np.nan)
+
+
+def _weight() -> Floats:
+    offset = np.arange(-HALF, HALF + 1) / WEIGHT_PX
+    return np.exp(-0.5 * (offset[:, None] ** 2 + offset[None, :] ** 2))
 
 
 def _without_nodata(picture: Picture, half: int) -> Bools:

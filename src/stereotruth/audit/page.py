@@ -15,8 +15,7 @@ from .. import figures
 from ..matching.layouts import StereoDataset, read_image
 from ..report.pictures import encode, gradient
 from ..report.tables import minus, table
-from .conventions import label_at
-from .matches import grey, match_pair
+from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX
 from .run import Audited, table_rows
 from .verdicts import CHECKS, FAULT, GOOD, UNDECIDED, Limits
@@ -166,7 +165,7 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
     ends = minus(f"-{ROW_LIMIT_PX:g} px"), "errors", f"+{ROW_LIMIT_PX:g} px"
     add("vertical parallax", _dots(grey_left, x, y, matches.parallax, ROW_LIMIT_PX), ends)
     if labels is not None:
-        error = label_at(labels, x, y) - matches.disparity
+        error = label_offsets(grey(left), grey(right), labels, matches)
         known = np.isfinite(error)
         ends = minus(f"-{LIMIT_PX:g} px"), "errors", f"+{LIMIT_PX:g} px"
         dots = _dots(grey_left, x[known], y[known], error[known], LIMIT_PX)

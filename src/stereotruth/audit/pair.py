@@ -16,8 +16,8 @@ from rasterio.errors import NotGeoreferencedWarning
 from ..matching.layouts import Pair, StereoDataset, read_image
 from . import conventions, hidden
 from .contradiction import REACH_PX, scan_labels
-from .estimates import NOTHING, Estimate, cells, robust_fit, scale_of
-from .matches import Matches, grey, match_pair, smooth
+from .estimates import NOTHING, Estimate, Floats, cells, robust_fit, scale_of
+from .matches import Matches, grey, label_offsets, match_pair, smooth
 
 Picture = NDArray[np.float32]
 OFF_ROW_PX = 1.0  # a match that is further off the rows' trend
@@ -99,7 +99,7 @@ def _against_labels(
         trend = tuple(-v for v in trend)
     if taken in (conventions.SIGN, conventions.SWAPPED_SIGN):
         labels, spikes = -labels, [-value for value in spikes]
-    found["bias"], bias = _bias(labels, matches)
+    found["bias"], bias = _bias(label_offsets(left, right, labels, matches), matches, labels.shape)
     found["spikes"] = [
         _plain(conventions.wrong_at(labels, value, bias, matches)) for value in spikes
     ]
@@ -181,15 +181,14 @@ def _to_rows(right: Picture, trend: tuple[float, float, float]) -> Picture:
     )
 
 
-def _bias(labels: NDArray[np.float32], matches: Matches) -> tuple[dict[str, Any], float]:
-    """Labels less matches on smooth labelled surfaces."""
-    errors = conventions.label_at(labels, matches.x, matches.y) - matches.disparity
+def _bias(errors: Floats, matches: Matches, shape: tuple[int, ...]) -> tuple[dict[str, Any], float]:
+    """Labels less disparities, [n] for n matches (NaN where there is none)."""
     known = np.isfinite(errors)
     errors, x, y = errors[known], matches.x[known], matches.y[known]
     if not errors.size:
         return {"matches": 0, "bias": _plain(NOTHING)}, 0.0
     group = cells(x, y)
-    height, width = labels.shape
+    height, width = shape
     u, v = (2 * x - width) / width, (2 * y - height) / height
     tilted = robust_fit(np.column_stack([np.ones(x.size), u, v]), errors, group)
     bias = tilted[0].value if np.isfinite(tilted[0].value) else float(np.median(errors))
@@ -231,7 +230,9 @@ def _hidden(
     """Who is in front is as the images tell, else as stated."""
     front = hidden.who_is_in_front(left, right, labels)
     low, high = front.interval(CERTAIN)
-    nearer = hidden.LARGER if low > 0 else hidden.SMALLER if high < 0 else None
+    nearer = None
+    if low > hidden.CLEAR or high < -hidden.CLEAR:
+        nearer = hidden.LARGER if low > 0 else hidden.SMALLER
     count = max(int(np.isfinite(labels).sum()), 1)
     shares = {
         side: float(hidden.hidden_labels(labels, side).sum() / count)

@@ -338,6 +338,12 @@ def statements(summary: Mapping[str, Any]) -> list[str]:
     for kind, count in meaning["labels_mean"].items():
         if kind not in (AS_STATED, "None"):
             found.append(f"Labels agree with the images as '{kind}' in {_pairs(count)}.")
+    outside = of.get("outside_share")
+    if outside and outside["most"] > 0:
+        low, high = summary["disparity_range"]
+        found.append(
+            f"Labels outside the range [{low}, {high}) as it is stated: {_figure(outside, True)}."
+        )
     if summary["shared"]:
         across = sum(s["first_split"] != s["second_split"] for s in summary["shared"])
         found.append(

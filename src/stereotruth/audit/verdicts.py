@@ -20,6 +20,7 @@ FAULT, UNDECIDED, NOTE = "fault", "undecided", "note"
 GOOD = "good"
 EXPLAINS = 0.05  # share of the matches that another meaning of the labels must explain more
 WRONG = 0.25  # share of wrong labels among those of one frequent value
+NEGLIGIBLE = 1e-3  # share of labels outside the range
 MIN_LEVELS = 8  # grey values of an image
 CHECKS = {  # what a pair must have, in the order of the page
     "files": "files that fit together",
@@ -41,7 +42,6 @@ class Limits:
     label_bias_px: float
     contradicted_share: float
     hidden_share: float
-    outside_share: float
     false_alarms: float
 
 
@@ -127,7 +127,7 @@ def _rows(figures: Mapping[str, Any], tolerance: float, level: float) -> list[Fi
 
 
 def _labels(figures: Mapping[str, Any], limits: Limits, level: float) -> list[Finding]:
-    found = _values(figures, limits, level)
+    found = _values(figures, level)
     if not figures["labels"]["labelled"]:
         return [*found, Finding("values", FAULT, "no labels")]
     meaning = figures["convention"]
@@ -162,18 +162,17 @@ def _labels(figures: Mapping[str, Any], limits: Limits, level: float) -> list[Fi
     return found
 
 
-def _values(figures: Mapping[str, Any], limits: Limits, level: float) -> list[Finding]:
+def _values(figures: Mapping[str, Any], level: float) -> list[Finding]:
     found = []
     labels = figures["labels"]
     for value, share in labels["strays"]:
         text = f"{100 * share:.1f} % of the pixels are {value:g}, outside the range: nodata?"
         found.append(Finding("values", FAULT, text))
-    stray = sum(share for _, share in labels["strays"]) / max(labels["labelled"], 1e-9)
-    if (outside := labels["outside"] - stray) > limits.outside_share:
+    outside = labels["outside"] - sum(s for _, s in labels["strays"]) / max(
+        labels["labelled"], 1e-9
+    )
+    if outside > NEGLIGIBLE:
         text = f"{100 * outside:.1f} % of the labels are outside the range"
-        found.append(Finding("values", FAULT, text))
-    elif outside > 0:
-        text = f"{100 * outside:.2f} % of the labels are outside the range"
         found.append(Finding("values", NOTE, text))
     for k, (value, share) in enumerate(labels["spikes"]):
         wrong = estimate({"at": figures["spikes"][k]}, "at")
