@@ -12,6 +12,7 @@ if __name__ == "__main__":
             StereoDataset.of(name, params.dataset),
             snakemake.output[0],
             Limits(**params.limits),
+            work=f"results/audit/{name}",
             worst=params.worst,
             workers=snakemake.threads,
             code=params.measuring,

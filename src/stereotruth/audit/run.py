@@ -7,8 +7,8 @@
 ``index.html``        the page: pooled figures, the worst pairs in pictures, all pairs
 ====================  =============================================================================
 
-Pairs are measured one by one; each waits in a work folder with a record of the files that it was
-measured from, so that a later call carries on where one was killed.
+Pairs are measured one by one; what was measured stays in a work folder, with a record of the files
+that it was measured from, so that a later call takes over what it would measure the same.
 """
 
 from __future__ import annotations
@@ -93,17 +93,18 @@ def audit(
     out: str | Path,
     limits: Limits,
     *,
+    work: str | Path,
     worst: int = 12,
     workers: int = 1,
     code: str = "",
 ) -> dict[str, Any]:
     """Audit all pairs of a dataset into the folder ``out``; returns the summary.
 
-    ``worst``: pairs that are shown in pictures. Raises InputError if the dataset has no pairs or a
-    file cannot be read.
+    ``work``: where what was measured of each pair stays, for runs after a kill, with other limits
+    or with more pairs. ``worst``: pairs that are shown in pictures. Raises InputError if the
+    dataset has no pairs or a file cannot be read.
     """
-    out = Path(out)
-    work = out.with_name(f".{out.name}.work")
+    out, work = Path(out), Path(work)
     pairs = dataset.pairs()
     measured = _measure_all(dataset, pairs, work, workers, code)
     log.info("looking for shared ground")
@@ -122,7 +123,6 @@ def audit(
     write_page(scratch / "index.html", dataset, audited, summary, limits, worst)
     shutil.rmtree(out, ignore_errors=True)
     scratch.rename(out)
-    shutil.rmtree(work)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary
@@ -131,7 +131,7 @@ def audit(
 def _measure_all(
     dataset: StereoDataset, pairs: Sequence[Pair], work: Path, workers: int, code: str
 ) -> list[dict[str, Any]]:
-    """Figures of all pairs; their features wait in the work folder."""
+    """Figures of all pairs; their features lie in the work folder."""
     ledger = Ledger(work / "done")
     work.mkdir(parents=True, exist_ok=True)
     ledger.keep_only({pair.name for pair in pairs})
