@@ -238,6 +238,23 @@ def true_surface(raster: Raster) -> tuple[np.ndarray, np.ndarray]:
     return heights, kinds
 
 
+def moved(values: np.ndarray, of: Raster, to: Raster) -> np.ndarray:
+    """Cells of one raster on another one whose cells are the same, 0 where it has none."""
+    down, right = (
+        round((a - b) / of.resolution) for a, b in ((of.north, to.north), (to.west, of.west))
+    )
+    out = np.zeros(to.shape, values.dtype)
+    cut = [
+        (slice(max(-n, 0), max(-n, 0) + size), slice(max(n, 0), max(n, 0) + size))
+        for n, size in zip((down, right), to.shape)
+    ]
+    part = values[tuple(source for _, source in cut)]
+    ends = (slice(t.start, t.start + n) for (t, _), n in zip(cut, part.shape))
+    into = out[tuple(ends)]
+    into[...] = part[: into.shape[0], : into.shape[1]]
+    return out
+
+
 def read_dsm(path: Path) -> tuple[np.ndarray, Raster]:
     """Heights, NaN where there are none, and their grid."""
     with rasterio.open(path) as dataset:
@@ -371,7 +388,7 @@ def main() -> None:
         make_scene(folder)
     stores = folder / "left.zarr", folder / "right.zarr"
     facts: dict[str, Any] = {}
-    truth = kinds = inside = seen = None
+    first = None
     for method, settings in methods.items():
         store, tiff = folder / f"{method}.zarr", folder / f"{method}_dsm.tif"
         margin = None if settings["kind"] == "sgm" else given.margin
@@ -380,10 +397,11 @@ def main() -> None:
         summary, seconds, peak = measured(predict_scene, *stores, store, **options)
         _, dsm_seconds, dsm_peak = measured(write_dsm, store, tiff, workers=2)
         dsm, raster = read_dsm(tiff)
-        if raster != seen:
-            truth, kinds = true_surface(raster)
-            model = EpipolarModel.from_dict(require_complete(store).attrs["epipolar"])
-            inside, seen = shown(model, raster, truth), raster
+        if first is None:
+            first = raster, *true_surface(raster)
+        truth, kinds = (moved(values, first[0], raster) for values in first[1:])
+        model = EpipolarModel.from_dict(require_complete(store).attrs["epipolar"])
+        inside = shown(model, raster, truth)
         compared, *_ = measured(untiled, folder, method, settings, tuple(given.part))
         facts[method] = {
             "cost": {

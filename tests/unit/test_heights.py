@@ -23,6 +23,7 @@ from stereotruth.matching.heights import (
     utm_epsg,
     write_dsm,
 )
+from stereotruth.workers import dask_scheduler
 
 from .test_block_store import Killed
 from .test_epipolar import HEIGHT, LAT, LON, camera
@@ -223,6 +224,19 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
     at_once = read(tmp_path / "one.tif")[0]
     assert np.array_equal(np.isfinite(whole), np.isfinite(at_once))
     assert np.nanmax(np.abs(whole - at_once)) < 1e-4
+
+
+def test_workers_of_a_dask_cluster_write_the_same_bytes(model, of_plane, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    store = write_grid(tmp_path / "d.zarr", model, of_plane)
+    write_dsm(store, tmp_path / "fresh.tif")
+    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
+        dask_scheduler(cluster.scheduler_address) as client,
+    ):
+        write_dsm(store, tmp_path / "other.tif", scheduler=client)
+    assert (tmp_path / "other.tif").read_bytes() == (tmp_path / "fresh.tif").read_bytes()
 
 
 def test_the_cell_is_the_coarser_pixel(model):

@@ -59,7 +59,7 @@ def reduced(image: Any, factor: int) -> NDArray[np.float32]:
     """
     rows, cols = (-(-n // factor) for n in image.shape[:2])
     out = np.zeros((rows, cols), dtype=np.float32)
-    step = max(1, 1024 // factor)
+    step = max(1, 256 // factor)
     for first in range(0, rows, step):
         part = np.asarray(image[first * factor : (first + step) * factor]).astype(np.float32)
         if part.ndim == 3:
