@@ -312,39 +312,62 @@ def shown(model: EpipolarModel, raster: Raster, truth: np.ndarray) -> np.ndarray
 # -------------------------------------------------------------------------------------- picture
 
 
-def hillshade(heights: np.ndarray, resolution: float) -> np.ndarray:
-    """Grey picture, light from the north-west at 45 degrees; NaN is dark."""
+def shaded(heights: np.ndarray, resolution: float, limits: tuple[float, float]) -> np.ndarray:
+    """Heights in colour, light from the north-west at 45 degrees; NaN is dark."""
     south, east = np.gradient(heights, resolution)
     light = (1.0 + east + south) / np.sqrt(1.0 + east**2 + south**2) / np.sqrt(3.0)
-    grey = np.clip(light, 0.0, 1.0) * 255
-    return np.where(np.isfinite(grey), grey, 64).astype(np.uint8)
+    light = np.where(np.isfinite(light), np.clip(0.25 + light, 0.0, 1.3), 1.0)
+    return np.clip(colours(heights, limits, "terrain") * light[..., None], 0, 255).astype(np.uint8)
 
 
-def draw(path: Path, folder: Path, methods: list[str], truth: np.ndarray) -> None:
-    """Left image and true surface, then disparity and surface model of each method."""
+def draw(path: Path, folder: Path, methods: list[str], truth: np.ndarray, side: int = 760) -> None:
+    """Left image and true surface, then disparity and surface model of each method.
+
+    Below, a detail around the crossing of two seams, which are marked at its frame.
+    """
     import cv2
     from matplotlib.figure import Figure
 
     def small(image: np.ndarray) -> np.ndarray:
-        return cv2.resize(image, (760, 760 * image.shape[0] // image.shape[1]), None, 0, 0, 3)
+        return cv2.resize(image, (side, side * image.shape[0] // image.shape[1]), None, 0, 0, 3)
 
-    figure = Figure(figsize=(4.4 * (1 + len(methods)), 9), layout="constrained")
-    axes = figure.subplots(2, 1 + len(methods))
+    seam, half = (3 * BLOCK, 2 * BLOCK), side // 2
+    detail = tuple(slice(k - half, k + half) for k in seam)
+    figure = Figure(figsize=(4.2 * (1 + len(methods)), 13.2), layout="constrained")
+    axes = figure.subplots(3, 1 + len(methods))
     left = require_complete(folder / "left.zarr")["image"][:]
-    disparities = {m: require_complete(folder / f"{m}.zarr")["disparity"][:] for m in methods}
-    limits = np.nanpercentile(next(iter(disparities.values()))[::8, ::8], (0.5, 99.5))
-    axes[0, 0].imshow(small(stretch(left)), cmap="gray", vmin=0, vmax=255)
-    axes[0, 0].set_title("left image, 4096 × 4096 px")
-    axes[1, 0].imshow(small(hillshade(truth, 0.8)), cmap="gray", vmin=0, vmax=255)
-    axes[1, 0].set_title("true surface")
-    for k, (method, disparity) in enumerate(disparities.items(), start=1):
-        axes[0, k].imshow(colours(disparity[2::5, 2::5], tuple(limits)))
-        axes[0, k].set_title(f"{method}: disparity, {limits[0]:.0f} to {limits[1]:.0f} px")
+    found = {m: require_complete(folder / f"{m}.zarr")["disparity"][:] for m in methods}
+    limits = tuple(np.nanpercentile(found[methods[0]][::8, ::8], (0.5, 99.5)))
+    near = tuple(np.nanpercentile(found[methods[0]][detail], (0.5, 99.5)))
+    heights = tuple(np.nanpercentile(truth[::8, ::8], (0.5, 99.5)))
+    grey = stretch(left)
+    panels = [
+        [
+            (small(grey), "left image, 4096 × 4096 px"),
+            (small(shaded(truth, 0.8, heights)), "true surface"),
+            (grey[detail], f"where four blocks meet, {side} × {side} px"),
+        ]
+    ]
+    for method, disparity in found.items():
         dsm, raster = read_dsm(folder / f"{method}_dsm.tif")
-        axes[1, k].imshow(small(hillshade(dsm, raster.resolution)), cmap="gray", vmin=0, vmax=255)
-        axes[1, k].set_title(f"{method}: surface model")
-    for ax in axes.ravel():
-        ax.set_axis_off()
+        surface = shaded(dsm, raster.resolution, heights)
+        panels.append(
+            [
+                (colours(disparity[2::5, 2::5], limits), f"{method}: disparity"),
+                (small(surface), f"{method}: surface model"),
+                (colours(disparity[detail], near), f"{method}: disparity"),
+            ]
+        )
+    for column, of in zip(axes.T, panels):
+        for ax, (picture, title) in zip(column, of):
+            ax.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+            ax.set_title(title, fontsize=10)
+            ax.set_axis_off()
+    for ax in axes[2]:  # where the seams are
+        ax.set_axis_on()
+        ax.set_xticks([half - 0.5], [""])
+        ax.set_yticks([half - 0.5], [""])
+        ax.tick_params(length=7, width=1.5, top=True, right=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
@@ -428,7 +451,7 @@ def main() -> None:
     if given.json:
         given.json.write_text(json.dumps(facts, indent=2) + "\n")
     if given.figure:
-        draw(given.figure, folder, list(methods), truth)
+        draw(given.figure, folder, list(methods), np.where(inside, truth, np.nan))
 
 
 if __name__ == "__main__":
