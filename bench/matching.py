@@ -2,6 +2,8 @@
 
 python bench/matching.py                              # a random texture, 1024 × 1024, 16 bit
 python bench/matching.py --dataset dataset --layout stereotruth
+
+Networks are timed where PyTorch is installed, with random weights: time does not depend on them.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from stereotruth.matching.layouts import find_pairs, read_image
 from stereotruth.matching.sgm import MODES, STEP, SemiGlobalMatcher, pad, to_8_bits
 
 RANGE = (-128, 64)  # the paper's
+PAPER_MS = {"stereonet": 238, "psmnet": 614, "hmsmnet": 511}  # on a GTX 1080 Ti
 
 
 def texture(size: int, shift: int = 9) -> list[np.ndarray]:
@@ -74,13 +77,56 @@ def sgm(left: np.ndarray, right: np.ndarray, mode: str, times: int) -> dict[str,
     )
 
 
+def networks(left: np.ndarray, right: np.ndarray, times: int, threads: int) -> dict[str, Any]:
+    """Each network as a method on raw pixels, and bare PyTorch on tensors that are ready."""
+    try:
+        import torch
+    except ImportError:
+        print("\nPyTorch is not installed: no networks")
+        return {}
+    from stereotruth.matching import networks as module
+
+    torch.set_num_threads(threads)
+    device = module.choose_device(None)
+    figures = {}
+    print(f"\nPyTorch {torch.__version__}, {device}, {threads} thread(s)")
+    print(f"{'network':<22}{'method':>18}{'bare':>18}{'ratio':>8}{'paper':>8}")
+    for kind in module.KINDS:
+        for precision in ("float32", "bfloat16"):
+            model = module.Model(kind, RANGE, 3 if left.ndim == 3 else 1)
+            method = module.NetworkMethod(model, model.build(), device, precision)
+            ready = [
+                torch.from_numpy(module.scaled(image, model, None))[None].to(device)
+                for image in (left, right)
+            ]
+
+            def bare(method: Any = method, ready: Any = ready, precision: str = precision) -> None:
+                with torch.inference_mode(), module.mixed(precision, device):
+                    method.network(*ready)
+                if device.type == "cuda":
+                    torch.cuda.synchronize()
+
+            calls = {"method": lambda m=method: m(left, right, RANGE), "bare": bare}
+            figures[f"{kind} {precision}"] = of = compare(calls, times)
+            cells = [f"{of[k]['clock_ms']:.0f} / {of[k]['cpu_ms']:.0f}" for k in of]
+            # on a GPU the processor waits
+            clock = "clock_ms" if device.type == "cuda" else "cpu_ms"
+            ratio = of["method"][clock] / of["bare"][clock]
+            name = f"{kind} {precision}"
+            print(
+                f"{name:<22}{cells[0]:>18}{cells[1]:>18}{ratio:>8.3f}{PAPER_MS[kind]:>8}",
+                flush=True,
+            )
+    return figures
+
+
 def main() -> None:
     """Print tables; ``--json`` keeps the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--dataset", type=Path, help="take the first pair of this folder")
     parser.add_argument("--layout", default="whu", help="stereotruth, whu or us3d")
     parser.add_argument("--times", type=int, default=7, help="calls of each")
-    parser.add_argument("--threads", type=int, default=1, help="OpenCV's")
+    parser.add_argument("--threads", type=int, default=1, help="of each call")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
@@ -98,8 +144,10 @@ def main() -> None:
         cells = [f"{of[k]['clock_ms']:.0f} / {of[k]['cpu_ms']:.0f}" for k in of]
         ratio = of["method"]["cpu_ms"] / of["bare"]["cpu_ms"]
         print(f"{mode:<6}{cells[0]:>16}{cells[1]:>16}{ratio:>13.3f}{cells[2]:>18}", flush=True)
+    of_networks = networks(left, right, given.times, given.threads)
     if given.json:
-        given.json.write_text(json.dumps({"sgm": figures}, indent=2) + "\n")
+        record = {"sgm": figures, "networks": of_networks}
+        given.json.write_text(json.dumps(record, indent=2) + "\n")
 
 
 if __name__ == "__main__":

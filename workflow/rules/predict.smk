@@ -19,7 +19,7 @@ rule predict_scene:
         runtime=720,
     params:
         method=lambda w: scene_method(w.method),
-        settings=scene_prediction(),
+        settings=lambda w: scene_prediction(),
         code=lambda w: source_digest("matching.scenes", *method_modules(w.method)),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"

@@ -14,6 +14,7 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
+import dask
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -112,18 +113,13 @@ def image_scaling(image: Any) -> tuple[float, float]:
 
     NumPy or Dask array of any size; exact sums, so the same whatever the blocks.
     """
-    import dask.array as da
-
-    lazy = image if isinstance(image, da.Array) else da.from_array(np.asarray(image))
-    if np.issubdtype(lazy.dtype, np.integer):
-        wide = lazy.astype(np.uint64)
-        n, s, q = da.compute((lazy != 0).sum(), wide.sum(), (wide * wide).sum())
-    else:
-        wide = lazy.astype(np.float64)
-        n, s, q = da.compute((lazy != 0).sum(), wide.sum(), (wide * wide).sum())
+    whole = np.issubdtype(image.dtype, np.integer)
+    wide = np.uint64 if whole else np.float64
+    sums = (image != 0).sum(), image.sum(dtype=wide), (image.astype(wide) ** 2).sum()
+    n, s, q = dask.compute(*sums)
     if not n:
         return 0.0, 1.0
-    mean = int(s) / int(n) if np.issubdtype(lazy.dtype, np.integer) else float(s) / int(n)
+    mean = int(s) / int(n) if whole else float(s) / int(n)
     variance = float(q) / int(n) - mean * mean
     return mean, max(variance, 0.0) ** 0.5 or 1.0
 
