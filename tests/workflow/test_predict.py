@@ -1,4 +1,4 @@
-"""Whole scenes by the workflow: disparities, surface model, and a run that is killed."""
+"""Whole scenes by the workflow: disparities and surface model."""
 
 from __future__ import annotations
 
@@ -11,29 +11,27 @@ from stereotruth.evaluation.grid_truth import truth_window
 from stereotruth.grid_store import open_grid
 from stereotruth.matching.heights import Raster
 
-from .conftest import SIZE, TINY
+from .conftest import TINY, copy_project, row_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("made")]
-SETTINGS = {**SIZE, "predict": {"block_px": 256, "overlap_px": 32}}
+pytestmark = pytest.mark.slow
+SETTINGS = {
+    "alignment": {"refine": False},  # so that no LiDAR is read
+    "predict": {"block_px": 256, "overlap_px": 32},
+}
 TARGET = "results/predict/Tiny/Tiny-1/sgm_dsm.tif"
 
 
 @pytest.fixture(scope="module")
-def predicted(made):
-    import yaml
-
-    file = made.folder / "tiny.yaml"
-    text = file.read_text()
-    file.write_text(yaml.safe_dump({**yaml.safe_load(text), **SETTINGS}))
-    run = made.snakemake(TARGET, "--configfile", "tiny.yaml")
-    yield made, run
-    file.write_text(text)
+def predicted(data, tmp_path_factory):
+    project = copy_project(tmp_path_factory.mktemp("predicted") / "project")
+    project.add_scene("tiny", [row_of(data)], **SETTINGS)
+    return project, project.snakemake(TARGET, "--configfile", "tiny.yaml")
 
 
 def test_a_scene_becomes_disparities_and_a_surface_model(predicted):
-    made, run = predicted
+    project, run = predicted
     assert run.status == 0, run.text[-3000:]
-    folder = made.folder / "results"
+    folder = project.folder / "results"
     found = open_grid(folder / "predict/Tiny/Tiny-1/sgm.zarr")
     model = EpipolarModel.load(folder / "rectify/Tiny/Tiny-1/epipolar.json")
     window = (slice(0, model.shape[0]), slice(0, model.shape[1]))
@@ -42,13 +40,13 @@ def test_a_scene_becomes_disparities_and_a_surface_model(predicted):
     known = np.isfinite(error) & (truth["visible"] == 1)
     assert known.mean() > 0.6
     assert np.median(np.abs(error[known])) < 0.25
-    with rasterio.open(made.folder / TARGET) as dataset:
+    with rasterio.open(project.folder / TARGET) as dataset:
         heights = dataset.read(1, masked=True)
         assert dataset.crs.to_epsg() == TINY.epsg
         t = dataset.transform
         raster = Raster(TINY.epsg, t.c, t.f, t.a, dataset.shape)
         assert dataset.tags()["vertical_datum"] == "WGS 84 ellipsoid"
-    assert raster.resolution == pytest.approx(0.8)
+    assert raster.resolution == 0.8
     place = (np.array([dataset.width / 2.0]), np.array([dataset.height / 2.0]))
     lon, lat = raster.ground(*place)
     assert abs(lon[0] - TINY.lon) < 0.002 and abs(lat[0] - TINY.lat) < 0.002
@@ -56,8 +54,8 @@ def test_a_scene_becomes_disparities_and_a_surface_model(predicted):
 
 
 def test_a_second_call_runs_nothing_and_a_resolution_only_the_model(predicted):
-    made, _ = predicted
-    assert made.plan(TARGET, "--configfile", "tiny.yaml") == {}
-    (made.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
-    jobs = made.plan(TARGET, "--configfile", "tiny.yaml", "coarse.yaml")
+    project, _ = predicted
+    assert project.plan(TARGET, "--configfile", "tiny.yaml") == {}
+    (project.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
+    jobs = project.plan(TARGET, "--configfile", "tiny.yaml", "coarse.yaml")
     assert jobs == {"dsm": 1}

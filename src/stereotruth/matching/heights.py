@@ -280,11 +280,11 @@ def gsd(sensor: SensorModel, size: tuple[int, int], height: float) -> float:
 
 
 def default_resolution(model: EpipolarModel) -> float:
-    """The coarser image's pixel on the ground, rounded up to 0.1 m."""
+    """The coarser image's pixel on the ground, to two digits."""
     sizes = (model.left_size, model.right_size)
     pairs = zip((model.left, model.right), sizes)
     coarse = max(gsd(sensor, size, model.reference_height) for sensor, size in pairs)
-    return math.ceil(coarse * 10.0 - 1e-6) / 10.0
+    return float(f"{coarse:.2g}")
 
 
 def _outline(rows: tuple[float, float], cols: tuple[float, float], n: int = 9) -> Floats:
@@ -400,7 +400,7 @@ def write_dsm(
 
     ``disparity_store``: a grid with ``disparity`` and the epipolar model in its attributes, of
     :func:`scenes.predict_scene` or `project`. ``resolution_m``: side of a cell; None: that of a
-    pixel of the coarser image on the ground, rounded up to 0.1 m. Heights are float32 m above the
+    pixel of the coarser image on the ground, to two digits. Heights are float32 m above the
     WGS 84 ellipsoid at the centres of the cells, nodata -9999, in the UTM zone of the scene.
     ``scheduler`` is what Dask's compute takes.
 
