@@ -32,6 +32,8 @@ from stereotruth.matching.layouts import Pair, StereoDataset, read_image
 PROJECT = Path(__file__).resolve().parents[1]
 BLOCK = 48  # px: side of the places where labels are made wrong,
 WRONG_PX = (4.0, 12.0)  # by so much
+NONE = "none"
+LAST_OF_LABELS = "labels 2 px too far right or low"
 OVERLAPS = (1.0, 0.5, 0.25, 0.15)
 
 Labels = NDArray[np.float32]
@@ -80,7 +82,7 @@ def label_faults(
 ) -> Iterator[tuple[str, str, Labels]]:
     """Name, check that should find it, faulty labels."""
     rng = np.random.default_rng(sum(pair.name.encode()))
-    yield "none", "", labels
+    yield NONE, "", labels
     for size in (0.25, 0.5, 1, 2):
         yield f"labels offset by {size:g} px", "bias", labels + np.float32(sign * size)
     yield "sign of the labels swapped", "convention", -labels
@@ -93,7 +95,9 @@ def label_faults(
     yield "unlabelled pixels hold 0", "values", np.nan_to_num(labels, nan=0.0)
     yield "unlabelled pixels hold −9999", "values", np.nan_to_num(labels, nan=-9999.0)
     yield "labels of another pair", "any", other
-    yield "labels 2 rows too low", "any", np.roll(labels, 2, axis=0)
+    for size in (1, 2):
+        name = f"labels {size} px too far right or low"
+        yield name, "registration", np.roll(labels, size, axis=sum(pair.name.encode()) // 2 % 2)
 
 
 def image_faults(
@@ -126,22 +130,22 @@ def measured(
 
 
 def run_pair(
-    dataset: StereoDataset, pair: Pair, other: Pair, truth: Path, out: Path, images: bool
+    dataset: StereoDataset, pair: Pair, other: Pair, truth: Path, out: Path, faults: bool
 ) -> None:
-    """Measure a pair with all faults, those of the images only if asked for."""
+    """Measure a pair as it is, and with all faults if asked for."""
     left, right = read_image(pair.left), read_image(pair.right)
     labels = dataset.labels(pair)
     sign = 1 if sum(pair.name.encode()) % 2 else -1
     reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
     file = out / f"{pair.name}.json"
     found = json.loads(file.read_text()) if file.is_file() else {}
-    if "none" not in found:
-        matches = match_pair(left, right, reach)
-        for name, check, faulty in label_faults(labels, pair, dataset.labels(other), truth, sign):
+    matches = match_pair(left, right, reach) if LAST_OF_LABELS not in found else None
+    for name, check, faulty in label_faults(labels, pair, dataset.labels(other), truth, sign):
+        if matches is not None and name not in found and (faults or name == NONE):
             figures = measured(left, right, faulty, matches, dataset.disparity_range)
             found[name] = {"check": check, "figures": figures}
-    if images and "images swapped" not in found:
-        for name, check, a, b in image_faults(left, right, sign):
+    for name, check, a, b in image_faults(left, right, sign) if faults else ():
+        if name not in found:
             figures = measured(a, b, labels, match_pair(a, b, reach), dataset.disparity_range)
             found[name] = {"check": check, "figures": figures}
     with replacing(file) as scratch:
@@ -184,7 +188,7 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, default=PROJECT / "dataset")
     parser.add_argument("--truth", type=Path, default=PROJECT / "results/truth")
     parser.add_argument("--out", type=Path, default=PROJECT / "bench/out/audit")
-    parser.add_argument("--images-every", type=int, default=1, help="pairs that get faulty images")
+    parser.add_argument("--every", type=int, default=1, help="faults go into every so manieth pair")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=1e9, help="start no pair after this time")
     arguments = parser.parse_args()
@@ -199,9 +203,9 @@ def main() -> None:
 
     def one(k: int) -> None:
         if time.monotonic() < end:
-            images = k % arguments.images_every == 0
+            faults = k % arguments.every == 0
             other = pairs[(k + 1) % len(pairs)]
-            run_pair(dataset, pairs[k], other, arguments.truth, arguments.out, images)
+            run_pair(dataset, pairs[k], other, arguments.truth, arguments.out, faults)
             print(pairs[k].name, flush=True)
 
     with ThreadPoolExecutor(arguments.workers) as pool:

@@ -261,6 +261,7 @@ def figures(bias, error, freedom=40):
         "bias": {"matches": 500, "bias": [bias, error, freedom], "tilt_x": plain, "tilt_y": plain},
         "contradicted": {"share": [0.001, 0.001, freedom], "labels": 5000},
         "hidden": {"share": 0.0},
+        "registration": {"move": [1, 0], "gain": [-0.1, 0.01, freedom]},
     }
 
 

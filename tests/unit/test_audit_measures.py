@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.audit import conventions, hidden
+from stereotruth.audit import conventions, hidden, registration
 from stereotruth.audit.contradiction import scan_labels
 from stereotruth.audit.estimates import Estimate, cells, location, ratio, robust_fit
 from stereotruth.audit.matches import Matches, grey, label_offsets, match_pair, smooth
@@ -106,6 +106,20 @@ def test_labels_are_held_against_matches_in_their_own_shape():
         )
         assert np.isfinite(got).mean() > 0.5
         assert np.nanmedian(got) == pytest.approx(offset - 2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("move", [(0, 0), (2, 0), (0, -2)])
+def test_labels_that_lie_on_wrong_pixels_are_found_beside_steps(move, monkeypatch):
+    monkeypatch.setattr(registration, "MIN_PIXELS", 300)
+    scene = make(17)
+    labels = np.roll(scene.labels, move[::-1], axis=(0, 1))
+    pictures = smooth(grey(scene.left)), smooth(grey(scene.right))
+    back, gain = registration.better_place(*pictures, labels)
+    if move == (0, 0):
+        assert gain.value < 0
+    else:
+        assert back == (-move[0], -move[1])
+        assert gain.interval(0.001)[0] > 0.15
 
 
 def test_too_few_cells_say_nothing():

@@ -18,6 +18,7 @@ from . import conventions, hidden
 from .contradiction import REACH_PX, scan_labels
 from .estimates import NOTHING, Estimate, Floats, cells, robust_fit, scale_of
 from .matches import Matches, grey, label_offsets, match_pair, smooth
+from .registration import better_place
 
 Picture = NDArray[np.float32]
 OFF_ROW_PX = 1.0  # a match that is further off the rows' trend
@@ -107,6 +108,8 @@ def _against_labels(
     true = labels - np.float32(bias)
     found["contradicted"] = _contradicted(left, aligned, true, matches)
     found["hidden"] = _hidden(left, aligned, true, grows)
+    move, gain = better_place(smooth(left), smooth(aligned), true)
+    found["registration"] = {"move": list(move), "gain": _plain(gain)}
     return found
 
 

@@ -15,10 +15,12 @@ from typing import Any
 
 from . import conventions
 from .pair import estimate
+from .registration import SHIFTS
 
 FAULT, UNDECIDED, NOTE = "fault", "undecided", "note"
 GOOD = "good"
 EXPLAINS = 0.05  # share of the matches that another meaning of the labels must explain more
+GAIN = 0.15  # of the squared difference beside steps, by which a move must make it less
 WRONG = 0.25  # share of wrong labels among those of one frequent value
 NEGLIGIBLE = 1e-3  # share of labels outside the range
 MIN_LEVELS = 8  # grey values of an image
@@ -27,6 +29,7 @@ CHECKS = {  # what a pair must have, in the order of the page
     "rows": "rows that correspond",
     "convention": "sign and sides as stated",
     "bias": "labels free of offset",
+    "registration": "labels on the pixels that they belong to",
     "values": "values as stated",
     "contradicted": "labels that the images bear out",
     "hidden": "labels on visible pixels only",
@@ -148,6 +151,11 @@ def _labels(figures: Mapping[str, Any], limits: Limits, level: float) -> list[Fi
     elif open_:
         text = f"labels less matches: {figures['bias']['matches']} matches do not tell"
         found.append(Finding("bias", UNDECIDED, text))
+    gain = estimate(figures, "registration", "gain")
+    if gain.interval(level / len(SHIFTS))[0] > GAIN:
+        x, y = figures["registration"]["move"]
+        text = f"beside steps, labels fit better when moved by ({x:+d}, {y:+d}) px (columns, rows)"
+        found.append(Finding("registration", FAULT, text))
     share = estimate(figures, "contradicted", "share")
     says = share.beyond(limits.contradicted_share, level)
     if says:
