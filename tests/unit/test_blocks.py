@@ -145,6 +145,22 @@ def test_weights_add_up_and_what_disagrees_is_not_mixed():
     assert np.abs(beside[0] - beside[1]).max() < 0.5 * 0.75 / 16 + 1e-6
 
 
+def test_tiles_that_are_off_by_pixels_meet_without_a_step():
+    """As those of a network are, for different offsets; the edges of buildings stay as they are."""
+    tiling = Tiling((256, 512), 256, 64)
+    y, x = np.mgrid[: tiling.side, : tiling.side]
+    tiles, town = {}, {}
+    for place in tiling.places():
+        column, row = x + place[1] * 256 - 64, y - 64
+        town[place] = np.where((row % 100 < 40) & (column % 60 < 30), 20.0, 0.0)
+        bias = (-1.0) ** place[1] * (1.6 + 0.3 * np.sin(row / 100))
+        tiles[place] = (town[place] + 0.01 * column + bias).astype(np.float32)
+    found = np.hstack([blend(tiling, (0, j), tiles) for j in range(2)])
+    step = np.diff(found - np.hstack([town[0, 0][64:-64, 64:-64], town[0, 1][64:-64, 64:-64]]))
+    assert np.abs(tiles[0, 0][64:-64, 64 + 256] - tiles[0, 1][64:-64, 64]).min() > 2.5
+    assert np.abs(step).max() < 0.01 + 3.8 * 0.75 / 64 + 0.01
+
+
 def test_a_pixel_is_valid_where_its_own_tile_says_so():
     tiling = Tiling((64, 128), 64, 32)
     tiles = {p: np.zeros((128, 128), np.float32) for p in tiling.places()}

@@ -7,14 +7,16 @@ pixels, the tile's *offset*, so that a scene may have more relief than the metho
 ``d = offset + d_method``.
 
 Where tiles overlap, their disparities are averaged with weights that fall smoothly from one to the
-other, unless they differ by more than ``AGREE_PX``: then they say different things (roof and
+other. By what two tiles differ on the whole, median by squares of ``CELL_PX`` (networks are off by
+pixels, and by others for another offset), is shared out in full; of what is left, differences up
+to ``SAME_PX``, and none from ``OTHER_PX`` on: then the tiles say different things (roof and
 ground), nothing in between is true, and the block's own tile has the word, as it has on whether a
 pixel is valid. Pixels that one of the images does not show are invalid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +31,9 @@ Place = tuple[int, int]
 
 BLOCK_PX = 1024
 OVERLAP_PX = 64
-AGREE_PX = 1.0
+CELL_PX = 32
+LARGEST_BIAS_PX = 8.0  # between tiles; what differs by more on the whole is left as it is
+SAME_PX, OTHER_PX = 2.0, 4.0
 PHASE_PX = 64  # parts begin at multiples: networks, on reduced grids, see all tiles in one phase
 
 
@@ -73,6 +77,11 @@ class Tiling:
         """[row, col] of a block."""
         starts = [k * self.block for k in place]
         return tuple(slice(s, min(s + self.block, n)) for s, n in zip(starts, self.shape))
+
+    def common_window(self, place: Place, other: Place) -> Window:
+        """[row, col] of what the tiles at two places have in common."""
+        both = zip(self.tile_window(place), self.tile_window(other), self.shape)
+        return tuple(slice(max(a.start, b.start, 0), min(a.stop, b.stop, n)) for a, b, n in both)
 
     def tile_window(self, place: Place) -> Window:
         """[row, col] of a tile; it may reach beyond the grid."""
@@ -204,6 +213,34 @@ def _weights(tiling: Tiling, axis: int, k: int) -> dict[int, NDArray[np.float64]
     return found
 
 
+def difference_on_the_whole(
+    tiling: Tiling, own: Place, other: Place, part: Callable[[Place, Window], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """By how much another tile differs from a block's own, px, over all that they have in common.
+
+    ``part`` gives a tile's disparities in a window of the grid. Medians by squares, linear between
+    their middles; 0 where they are beyond LARGEST_BIAS_PX. Seen from the other tile it is the same,
+    negative: both sides of a seam meet.
+    """
+    window = tiling.common_window(own, other)
+    difference = part(other, window) - part(own, window)
+    shape = difference.shape
+    counts = tuple(max(1, n // CELL_PX) for n in shape)
+    edges = [np.linspace(0, n, k + 1).round().astype(int) for n, k in zip(shape, counts)]
+    middles = np.zeros(counts)
+    for i in range(counts[0]):
+        for j in range(counts[1]):
+            cell = difference[edges[0][i] : edges[0][i + 1], edges[1][j] : edges[1][j + 1]]
+            known = cell[np.isfinite(cell)]
+            if 4 * known.size >= cell.size:
+                middles[i, j] = np.median(known)
+    middles[np.abs(middles) > LARGEST_BIAS_PX] = 0.0
+    for axis, (n, edge) in enumerate(zip(shape, edges)):
+        at, of = np.arange(n) + 0.5, (edge[:-1] + edge[1:]) / 2
+        middles = np.apply_along_axis(lambda v, at=at, of=of: np.interp(at, of, v), axis, middles)
+    return middles
+
+
 def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Disparities:
     """The block at a place from the tiles that reach into it, float32[h, w].
 
@@ -228,11 +265,13 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
             window = tuple(
                 slice(o.start + w.start, o.start + w.stop) for o, w in zip((rows, cols), (r, c))
             )
-            with np.errstate(invalid="ignore"):
-                difference = part((i, j), window) - own[r, c]
-                agree = np.abs(difference) <= AGREE_PX
+            bias = difference_on_the_whole(tiling, place, (i, j), part)
+            common = tiling.common_window(place, (i, j))
+            at = tuple(slice(w.start - o.start, w.stop - o.start) for w, o in zip(window, common))
+            rest = part((i, j), window) - own[r, c] - bias[at]
+            same = np.clip((OTHER_PX - np.abs(rest)) / (OTHER_PX - SAME_PX), 0.0, 1.0)
             weight = in_rows[r, None] * in_cols[None, c]
-            change[r, c] += np.where(agree, weight * difference, 0.0)
+            change[r, c] += weight * (bias[at] + np.nan_to_num(same * rest))
     return (own + change).astype(np.float32)
 
 
