@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from ..report.tables import minus, table
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX
 from .run import Audited, table_rows
-from .verdicts import CHECKS, FAULT, GOOD, UNDECIDED, Limits
+from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Limits
 
 Picture = figures.Picture
 
@@ -26,6 +27,7 @@ SIDE, BYTES = 460, 60_000  # of a picture
 DOT_PX = 3  # radius in the shown picture
 LIMIT_PX = 3.0  # ends of the colours of label less match
 ROW_LIMIT_PX = 1.5  # and of the vertical parallax
+NEGATIVE = re.compile(r"(?<!\w)-(?=\d)")  # in a text, the sign of a number
 ERRORS = "RdYlBu_r"
 COLUMNS = (
     "pair",
@@ -142,7 +144,11 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         "city": a.pair.city,
         "split": a.pair.split,
         "word": a.verdict.word,
-        "findings": [(f.level, f.text) for f in a.verdict.findings],
+        "findings": [
+            (f.level, minus(f.text))
+            for level in (FAULT, UNDECIDED, NOTE)
+            for f in a.verdict.of(level)
+        ],
         "pictures": [],
     }
 

@@ -18,6 +18,7 @@ import io
 import json
 import logging
 import shutil
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rasterio.errors import NotGeoreferencedWarning
 
 from ..grid_store import replacing
 from ..ledger import Ledger
@@ -40,6 +42,7 @@ from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Finding, Limits, Ver
 
 log = logging.getLogger("stereotruth")
 
+NONE = "none"
 CONFIDENCE = 0.05  # of all limits that are stated
 RESAMPLES = 2000
 FEW = 8  # pairs: fewer give no limits of their mean
@@ -153,7 +156,8 @@ def _measure_all(
             piece = ledger.put(pair.name, key, products, measure(dataset, pair))
         return piece.result
 
-    with ThreadPoolExecutor(workers) as pool:
+    with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # here, as threads share filters
         done = pool.map(one, pairs)
         return list(progress(done, len(pairs), f"{dataset.name}: pairs measured"))
 
@@ -286,7 +290,8 @@ def _conventions(audited: Sequence[Audited]) -> dict[str, Any]:
     labelled = [a.figures for a in audited if "labels" in a.figures]
 
     def count(*where: str) -> dict[str, int]:
-        return dict(Counter(str(_plain(figures, where)) for figures in labelled))
+        values = (_plain(figures, where) for figures in labelled)
+        return dict(Counter(NONE if value is None else str(value) for value in values))
 
     return {
         "image_shapes": dict(Counter(" × ".join(map(str, a.figures["shape"])) for a in audited)),
@@ -333,10 +338,10 @@ def statements(summary: Mapping[str, Any]) -> list[str]:
             found.append(f"{what}: {_figure(of[name], name.endswith('share'))}.")
     meaning = summary["conventions"]
     for step, count in meaning["label_steps_px"].items():
-        if step != "None":
+        if step != NONE:
             found.append(f"Labels are multiples of {float(step):g} px in {_pairs(count)}.")
     for kind, count in meaning["labels_mean"].items():
-        if kind not in (AS_STATED, "None"):
+        if kind not in (AS_STATED, NONE):
             found.append(f"Labels agree with the images as '{kind}' in {_pairs(count)}.")
     outside = of.get("outside_share")
     if outside and outside["most"] > 0:
