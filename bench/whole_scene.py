@@ -327,6 +327,7 @@ def draw(path: Path, folder: Path, methods: list[str], truth: np.ndarray, side: 
     """
     import cv2
     from matplotlib.figure import Figure
+    from PIL import Image
 
     def small(image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, (side, side * image.shape[0] // image.shape[1]), None, 0, 0, 3)
@@ -369,7 +370,8 @@ def draw(path: Path, folder: Path, methods: list[str], truth: np.ndarray, side: 
         ax.set_yticks([half - 0.5], [""])
         ax.tick_params(length=7, width=1.5, top=True, right=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=90)
+    Image.open(path).convert("RGB").quantize(192).save(path, optimize=True)
 
 
 # ----------------------------------------------------------------------------------------- table
