@@ -82,6 +82,21 @@ def test_parts_of_an_image_share_its_scaling() -> None:
     assert np.array_equal(part, networks.scaled(image, method().model, None)[:, :10])
 
 
+def test_wide_grey_values_are_brought_to_8_bits_alike_in_all_parts() -> None:
+    made = method(channels=3, scaling="us3d")
+    image = np.random.default_rng(0).integers(1, 60000, (64, 80)).astype(np.uint16)
+    image[:32] //= 10
+    statistics = made.scaling(image, da.from_array(image, chunks=30))
+    assert statistics.left == statistics.right
+    whole = networks.scaled(image, made.model, None)
+    assert np.array_equal(networks.scaled(image[:32], made.model, statistics.left), whole[:, :32])
+    assert whole.min() >= -1 and whole.max() == 1
+    eight = (image >> 8).astype(np.uint8)
+    assert made.scaling(eight, eight) == (None, None)
+    expected = eight.astype(np.float32) / 127.5 - 1
+    np.testing.assert_allclose(networks.scaled(eight, made.model, None)[1], expected, atol=1e-6)
+
+
 def test_any_range_can_be_looked_for() -> None:
     """No weight depends on the range: planes outside the training's are looked at like others."""
     image = np.random.default_rng(0).integers(1, 900, (2, 32, 64)).astype(np.uint16)

@@ -7,6 +7,7 @@ range, channels, scaling of the images, and where they come from.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -32,6 +33,7 @@ log = logging.getLogger("stereotruth")
 
 KINDS: dict[str, type[nn.Module]] = {"stereonet": StereoNet, "psmnet": PSMNet, "hmsmnet": HMSMNet}
 SCALINGS = ("standardise", "us3d")
+SAMPLES = 1 << 22  # pixels that a quantile is taken from
 GREY = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
 
 
@@ -102,10 +104,27 @@ def load_model(path: str | Path) -> tuple[Model, nn.Module, dict[str, Any]]:
 
 
 class Scaling(NamedTuple):
-    """Mean and standard deviation of both whole images: what their blocks must share."""
+    """What the blocks of both images must share, see :func:`image_statistics`."""
 
-    left: tuple[float, float]
-    right: tuple[float, float]
+    left: tuple[float, float] | None
+    right: tuple[float, float] | None
+
+
+def image_statistics(image: Any, scaling: str) -> tuple[float, float] | None:
+    """What the scaling of an image follows from (NumPy or Dask array of any size).
+
+    ``standardise``: mean and standard deviation. ``us3d``: 0 and the grey value that becomes the
+    brightest of 8 bits, above 99.9 % of the pixels that have data (of large images every k-th pixel
+    of every k-th row is looked at); None for images of 8 bits, which stay as they are.
+    """
+    if scaling == "standardise":
+        return image_scaling(image)
+    if image.dtype == np.uint8:
+        return None
+    step = math.ceil(math.sqrt(math.prod(image.shape[:2]) / SAMPLES))
+    values = np.asarray(image[::step, ::step])
+    values = values[values != 0]
+    return 0.0, float(np.quantile(values, 0.999)) if values.size else 1.0
 
 
 def image_scaling(image: Any) -> tuple[float, float]:
@@ -127,30 +146,26 @@ def image_scaling(image: Any) -> tuple[float, float]:
 def scaled(
     image: NDArray[Any], model: Model, statistics: tuple[float, float] | None
 ) -> NDArray[np.float32]:
-    """[H, W] or [H, W, 3] pixels -> [C, H, W] as the network takes them; nodata becomes 0."""
+    """[H, W] or [H, W, 3] pixels -> [C, H, W] as the network takes them; nodata becomes 0.
+
+    ``statistics`` of the whole image; None: of this one.
+    """
     grey = image.ndim == 2
+    first, second = statistics or image_statistics(image, model.scaling) or (0.0, 255.0)
     if model.scaling == "us3d":
         bands = np.repeat(image[..., None], 3, axis=2) if grey else image[..., ::-1]
-        bands = _eight_bit(bands) / np.float32(127.5) - 1
+        bands = np.minimum(bands.astype(np.float32) * np.float32(255 / second), 255)
+        bands = bands / np.float32(127.5) - 1
         if model.channels == 1:
             bands = bands[..., ::-1] @ np.array(GREY, np.float32)[:, None]
         return np.ascontiguousarray(bands.transpose(2, 0, 1), dtype=np.float32)
     if not grey and model.channels == 1:
         image = image @ np.array(GREY, np.float32)
-    mean, deviation = statistics if statistics is not None else image_scaling(image)
-    out = (image.astype(np.float32) - np.float32(mean)) / np.float32(deviation)
+    out = (image.astype(np.float32) - np.float32(first)) / np.float32(second)
     out[image == 0] = 0
     if out.ndim == 2:
         return np.repeat(out[None], model.channels, axis=0)
     return np.ascontiguousarray(out.transpose(2, 0, 1))
-
-
-def _eight_bit(bands: NDArray[Any]) -> NDArray[np.float32]:
-    """Pixels as 0 ... 255: wider ones are brought there by their 99.9 % quantile."""
-    if bands.dtype == np.uint8:
-        return bands.astype(np.float32)
-    top = float(np.quantile(bands, 0.999)) or 1.0
-    return np.minimum(bands.astype(np.float32) * np.float32(255 / top), 255)
 
 
 def padding(height: int, width: int, divisor: int) -> tuple[int, int]:
@@ -212,11 +227,9 @@ class NetworkMethod:
             self.network.set_range(span)
             self._range = span
 
-    def scaling(self, left: Any, right: Any) -> Scaling | None:
-        """Statistics of whole images (NumPy or Dask); None if the network needs none."""
-        if self.model.scaling == "us3d":
-            return None
-        return Scaling(image_scaling(left), image_scaling(right))
+    def scaling(self, left: Any, right: Any) -> Scaling:
+        """Statistics of whole images (NumPy or Dask) that all their parts must share."""
+        return Scaling(*(image_statistics(image, self.model.scaling) for image in (left, right)))
 
     def __call__(
         self,
