@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,31 +159,24 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
 
 def table6(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
     """Scores by city: generalisation within cities, extrapolation to others."""
-    chosen = _plain(methods)
-    published = paper.TABLE6 if beside_paper else {}
-    return _by_city(
-        "table6",
-        "Table 6: accuracy by city",
-        [(of, of["label"]) for of in chosen],
-        trained,
-        published,
-    )
+    title = "Table 6: accuracy by city"
+    return _by_city("table6", title, _plain(methods), trained, beside_paper=beside_paper)
 
 
 def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
     """Fine-tuned methods by city, beside the same methods trained on this dataset alone."""
     title = "Table 7: fine-tuned methods by city"
     by_name = {of["method"]: of for of in methods}
-    columns = []
+    columns: list[Row] = []
     for of in methods:
         base = of["fine_tuned_of"]
         if base is not None:
-            columns += [(by_name[base], by_name[base]["label"])] if base in by_name else []
-            columns.append((of, of["label"]))
+            columns += [by_name[base]] if base in by_name else []
+            columns.append(of)
     if not columns:
         text = "No method of the configuration has `fine_tuned_of`."
         return Table("table7", title, [], [(text, ["Method"], [])])
-    return _by_city("table7", title, columns, trained, paper.TABLE7 if beside_paper else {})
+    return _by_city("table7", title, columns, trained, beside_paper=beside_paper)
 
 
 def by_strata(methods: Sequence[Row]) -> Table:
@@ -209,11 +202,11 @@ def by_strata(methods: Sequence[Row]) -> Table:
 def _by_city(
     name: str,
     title: str,
-    columns: Sequence[tuple[Row, str]],
+    methods: Sequence[Row],
     trained: set[str],
-    published: Mapping[str, Mapping[str, tuple[float, float]]],
+    *,
+    beside_paper: bool,
 ) -> Table:
-    methods = [of for of, _ in columns]
     cities = list(dict.fromkeys(row["city"] for of in methods for row in of["cities"]))
     groups = [
         ("cities with training tiles", [city for city in cities if city in trained]),
@@ -224,7 +217,7 @@ def _by_city(
         for city in members:
             for of in methods:
                 row = {"city": city, "group": group, "method": of["label"], **_city(of, city)}
-                if values := published.get(city, {}).get(_kind(of)):
+                if beside_paper and (values := _published_of(of, city)):
                     row |= dict(zip(("paper_epe_px", "paper_d1_percent"), values))
                 rows.append(row)
             lines.append([city, *(cell for of in methods for cell in _epe_d1(of, _city(of, city)))])
@@ -237,14 +230,23 @@ def _by_city(
             cells = [cell for of, row in zip(methods, pooled) for cell in _epe_d1(of, row)]
             lines.append([f"**{group}**", *(f"**{cell}**" for cell in cells)])
     shown = [(f"Ours: EPE and D1 of {FILLED}. {_what(methods)}", _heading("City", methods), lines)]
-    known = []
-    for city in cities:
-        values = [published.get(city, {}).get(_kind(of)) for of in methods]
-        if any(values):
-            pairs = (_paper(of) for of in values)
-            known.append([city, *(text for pair in pairs for text in pair)])
-    shown += _published(_heading("City", methods), known)
+    if beside_paper:
+        there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
+        for of in methods:
+            there.setdefault((_kind(of), bool(of["fine_tuned_of"])), of)
+        known = []
+        for city in cities:
+            values = [_published_of(of, city) for of in there.values()]
+            if any(values):
+                known.append([city, *(text for of in values for text in _paper(of))])
+        shown += _published(_heading("City", list(there.values())), known)
     return Table(name, title, rows, shown)
+
+
+def _published_of(of: Row, city: str) -> tuple[float, float] | None:
+    """The paper's EPE and D1 of a kind of method in a city: table 7 of fine-tuned ones, else 6."""
+    table = paper.TABLE7 if of["fine_tuned_of"] else paper.TABLE6
+    return table.get(city, {}).get(_kind(of))
 
 
 def _published(
