@@ -14,6 +14,8 @@ from .conftest import Project
 def test_a_network_says_what_to_install(project: Project) -> None:
     root = project.folder / "pairs"
     root.mkdir()
+    for name in ("KM_left_1.tiff", "KM_right_1.tiff"):
+        (root / name).touch()
     (project.folder / "weights.pt").touch()
     of = {"root": "pairs", "layout": "whu", "disparity_range": [0, 64]}
     methods = {"ready": {"kind": "psmnet", "weights": "weights.pt"}}
@@ -22,4 +24,4 @@ def test_a_network_says_what_to_install(project: Project) -> None:
     for target in ("results/train/mine/stereonet/best.pt", "results/match/mine/ready"):
         run = project.snakemake(target, "--configfile", "my.yaml")
         assert run.status != 0
-        assert "not installed. Remedy: pip install '.[networks]'" in run.text
+        assert "not installed. Remedy: pip install '.[networks]'" in run.text, run.text
