@@ -13,7 +13,7 @@ Files are read when they are asked for, by whichever worker is asked; nothing is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -145,8 +145,3 @@ class LabelledPairs(Dataset):
             if most >= LABELLED_SHARE:
                 break
         return best
-
-
-def augmentation_of(settings: Mapping[str, Any]) -> Augmentation:
-    """From ``training.augmentation`` of the configuration."""
-    return Augmentation(**settings)

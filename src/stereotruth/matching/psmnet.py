@@ -63,7 +63,7 @@ class Features(nn.Module):
 
 
 class Hourglass(nn.Module):
-    """Down twice and up again; ``first`` of the three in a row has no one before it."""
+    """The layers of an hourglass, down twice and up again; see :meth:`PSMNet.forward`."""
 
     def __init__(self) -> None:
         super().__init__()

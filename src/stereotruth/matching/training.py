@@ -91,7 +91,7 @@ class Training:
         """
         merged: dict[str, Any] = {}
         for mapping in settings:
-            merged.update({k: v for k, v in mapping.items()})
+            merged.update(mapping)
         known = {f.name for f in fields(cls)}
         if unknown := set(merged) - known:
             raise InputError(
