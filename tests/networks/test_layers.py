@@ -65,3 +65,7 @@ def test_ranges_must_be_multiples_of_the_scale() -> None:
     for bad in ((-100, 64), (8, 8), (8, -8)):
         with pytest.raises(ValueError, match="disparity range"):
             layers.planes(bad, 16)
+    assert layers.planes((-96, 96), 16, 4) == (-6, 6)  # that of US3D, at 1/16 of the resolution
+    for bad in ((-96, 64), (-90, 102)):
+        with pytest.raises(ValueError, match="disparity range"):
+            layers.planes(bad, 16, 4)

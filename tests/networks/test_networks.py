@@ -108,6 +108,19 @@ def test_any_range_can_be_looked_for() -> None:
     assert np.array_equal(found, again(*image, (-64, 128)))
 
 
+@pytest.mark.parametrize("kind", networks.KINDS)
+def test_ranges_are_widened_to_the_networks_planes(kind: str) -> None:
+    assert networks.covering(kind, (-96, 96)) == (-96, 96)  # US3D's
+    assert networks.covering(kind, (-128, 64)) == (-128, 64)  # WHU-Stereo's
+    for wanted in ((-61, 123), (-1, 1), (3, 90)):
+        low, high = networks.covering(kind, wanted)
+        assert low <= wanted[0] and high >= wanted[1]
+        Model(kind, (low, high)).build()
+    first = {"stereonet": -104, "psmnet": -104, "hmsmnet": -112}[kind]
+    with pytest.raises(InputError, match=rf"multiples of .* take \({first}, "):
+        Model(kind, (-103, 90)).build()
+
+
 def test_weight_files_hold_all_that_is_needed(tmp_path: Path) -> None:
     made = method()
     file = tmp_path / "weights.pt"

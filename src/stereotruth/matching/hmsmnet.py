@@ -93,11 +93,13 @@ class Fusion(nn.Module):
 class HMSMNet(nn.Module):
     """Matching at 1/16, 1/8 and 1/4 of the resolution, each led by the one before, and refined.
 
-    ``disparity_range`` in px, multiples of 64, max exclusive; ``channels`` of the images.
+    ``disparity_range`` in px, max exclusive: from a multiple of 16 over multiples of 64;
+    ``channels`` of the images.
     """
 
     divisor = 64
-    range_step_px = 64
+    plane_px = 16  # of the coarsest volume
+    planes_divisor = 4
     loss_weights = (0.5, 0.7, 1.0, 0.6)
     regularisation = 1e-5
     margin_px = 512
@@ -122,7 +124,7 @@ class HMSMNet(nn.Module):
 
     def set_range(self, disparity_range: tuple[int, int]) -> None:
         """Look for these disparities, px; no weight depends on them."""
-        planes(disparity_range, self.range_step_px)
+        planes(disparity_range, self.plane_px, self.planes_divisor)
         self.planes = [planes(disparity_range, scale) for scale in SCALES]
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:

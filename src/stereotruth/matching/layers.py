@@ -164,14 +164,18 @@ def channels_last(network: nn.Module) -> nn.Module:
     return network
 
 
-def planes(disparity_range: tuple[int, int], scale: int) -> tuple[int, int]:
+def planes(disparity_range: tuple[int, int], scale: int, divisor: int = 1) -> tuple[int, int]:
     """The range of a cost volume's planes at 1/scale of the resolution (max exclusive).
 
-    Raises ValueError if the range is empty or no multiple of the scale.
+    Raises ValueError if the range is empty, if it does not begin with a plane, or if the number of
+    planes is no multiple of ``divisor``.
     """
     low, high = disparity_range
-    if low >= high or low % scale or high % scale:
-        raise ValueError(f"disparity range {low} to {high} px: no range of multiples of {scale} px")
+    if low >= high or low % scale or (high - low) % (scale * divisor):
+        raise ValueError(
+            f"disparity range {low} to {high} px: it must begin at a multiple of {scale} px "
+            f"and span multiples of {scale * divisor} px"
+        )
     return low // scale, high // scale
 
 

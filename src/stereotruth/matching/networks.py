@@ -60,7 +60,7 @@ class Model:
             return KINDS[self.kind](self.disparity_range, self.channels)
         except ValueError as error:
             raise InputError(
-                f"{self.kind}: {error}", remedy="widen disparity_range to such multiples"
+                f"{self.kind}: {error}", remedy=f"take {covering(self.kind, self.disparity_range)}"
             ) from error
 
 
@@ -168,6 +168,14 @@ def scaled(
     return np.ascontiguousarray(out.transpose(2, 0, 1))
 
 
+def covering(kind: str, wanted: tuple[int, int]) -> tuple[int, int]:
+    """The least disparity range of a network's planes that holds the ``wanted`` one, px."""
+    of = KINDS[kind]
+    first = wanted[0] // of.plane_px * of.plane_px
+    step = of.plane_px * of.planes_divisor
+    return first, first + -(-(wanted[1] - first) // step) * step
+
+
 def padding(height: int, width: int, divisor: int) -> tuple[int, int]:
     """Rows and columns to add so that both sides are multiples of ``divisor``."""
     return -height % divisor, -width % divisor
@@ -214,8 +222,7 @@ class NetworkMethod:
 
     def _look_for(self, wanted: tuple[int, int]) -> None:
         """Set the network's range."""
-        step = self.network.range_step_px
-        span = wanted[0] // step * step, -(-wanted[1] // step) * step
+        span = covering(self.model.kind, wanted)
         if span != self._range:
             if span != self.model.disparity_range:
                 log.info(
@@ -240,8 +247,8 @@ class NetworkMethod:
     ) -> NDArray[np.float32]:
         """Disparity [H, W] of the left image, px; NaN where the left pixel is nodata.
 
-        A ``disparity_range`` other than that of the training is taken, widened to multiples of
-        the network's planes.
+        A ``disparity_range`` other than that of the training is taken, widened to the
+        network's planes.
         """
         self._look_for(disparity_range)
         height, width = left.shape[:2]

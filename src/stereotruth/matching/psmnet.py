@@ -77,11 +77,13 @@ class Hourglass(nn.Module):
 class PSMNet(nn.Module):
     """Matching by three stacked hourglasses over features of both images at 1/4 of the resolution.
 
-    ``disparity_range`` in px, multiples of 16, max exclusive; ``channels`` of the images.
+    ``disparity_range`` in px, max exclusive: from a multiple of 4 over multiples of 16;
+    ``channels`` of the images.
     """
 
     divisor = 256
-    range_step_px = 16
+    plane_px = 4
+    planes_divisor = 4
     loss_weights = (0.5, 0.7, 1.0)
     regularisation = 1e-4
     margin_px = 512
@@ -101,8 +103,7 @@ class PSMNet(nn.Module):
 
     def set_range(self, disparity_range: tuple[int, int]) -> None:
         """Look for these disparities, px; no weight depends on them."""
-        planes(disparity_range, self.range_step_px)
-        self.planes = planes(disparity_range, 4)
+        self.planes = planes(disparity_range, self.plane_px, self.planes_divisor)
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:
         """[N, C, H, W] images -> three [N, H, W] disparities in px, of full size."""

@@ -74,7 +74,8 @@ class StereoNet(nn.Module):
     """
 
     divisor = 8
-    range_step_px = 8
+    plane_px = 8
+    planes_divisor = 1
     loss_weights = (1.0, 1.0, 1.0, 1.0)
     regularisation = 1e-4
     margin_px = 192  # beyond, the frame of a real tile changed it by 0.003 px at most
@@ -89,7 +90,7 @@ class StereoNet(nn.Module):
 
     def set_range(self, disparity_range: tuple[int, int]) -> None:
         """Look for these disparities, px; no weight depends on them."""
-        self.planes = planes(disparity_range, self.range_step_px)
+        self.planes = planes(disparity_range, self.plane_px)
 
     def forward(self, left: Tensor, right: Tensor) -> list[Tensor]:
         """[N, C, H, W] images -> four [N, H, W] disparities in px, coarse to fine, of full size."""
