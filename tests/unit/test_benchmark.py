@@ -88,7 +88,8 @@ def test_a_folder_of_scores_holds_tiles_cities_strata_and_pictures(compared):
     assert kunming["epe_px_low"] == ""  # three tiles are too few
     low, mean, high = (float(total[f"filled_epe_px{end}"]) for end in ("_low", "", "_high"))
     assert low < mean < high
-    assert [row["stratum"] for row in rows(folder / "strata.csv")] == ["all", "near_step"]
+    names = [row["stratum"] for row in rows(folder / "strata.csv")]
+    assert names == ["all", "near_step", "match_inside", "match_outside"]
     assert sorted(p.name for p in (folder / "panels").iterdir()) == ["KM_2.png", "WH_2.png"]
     summary = json.loads((folder / "scores.json").read_text())
     assert summary["label"] == "Half" and summary["tiles"] == 6
@@ -173,6 +174,10 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels():
         "Tuned: EPE (px)",
     ]
     assert seven.rows[1]["paper_epe_px"] == paper.TABLE7["Kunming"]["stereonet"][0]
+    methods.append(summary("again", "stereonet", cities, fine_tuned_of="net"))
+    _, _, both, _ = make_tables(methods, [], beside_paper=False)
+    names = [name.partition(":")[0] for name in both.shown[0][1] if "EPE" in name]
+    assert names == ["Net", "Tuned", "Again"]
     five, six, seven, _ = make_tables(methods[:2], [], beside_paper=False)
     assert len(five.shown) == len(six.shown) == 1
     assert "fine_tuned_of" in seven.markdown() and seven.csv() == "method\n"

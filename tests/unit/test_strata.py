@@ -9,7 +9,13 @@ import zarr
 
 from stereotruth.disparity import Status
 from stereotruth.matching.layouts import Pair
-from stereotruth.matching.strata import Products, exact_truth, label_strata, near_step
+from stereotruth.matching.strata import (
+    Products,
+    exact_truth,
+    label_strata,
+    match_in_tile,
+    near_step,
+)
 
 SIZE = 40
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -64,6 +70,16 @@ def own(tmp_path):
     return pair, Products(*(tmp_path / name for name in ("tiles", "project", "truth"))), stores
 
 
+def test_labels_know_whether_the_right_tile_holds_their_match():
+    labels = np.full((3, 8), np.nan, np.float32)
+    labels[0], labels[1] = 2.5, -2.0
+    found = match_in_tile(labels)
+    assert found["match_inside"][0].tolist() == [False] * 3 + [True] * 5
+    assert found["match_inside"][1].tolist() == [True] * 6 + [False] * 2
+    assert (found["match_outside"][:2] == ~found["match_inside"][:2]).all()
+    assert not (found["match_inside"] | found["match_outside"])[2].any()
+
+
 def test_status_and_classes_are_those_of_the_window(own):
     pair, products, stores = own
     classes = np.zeros((60, 70), np.uint8)
@@ -72,6 +88,8 @@ def test_status_and_classes_are_those_of_the_window(own):
     found = label_strata(pair, np.zeros((SIZE, SIZE), np.float32), products)
     assert list(found) == [
         "near_step",
+        "match_inside",
+        "match_outside",
         "near_occlusion",
         "ground",
         "vegetation",
@@ -111,7 +129,8 @@ def test_what_is_missing_is_left_out(own, tmp_path):
     pair, products, _ = own
     labels = np.zeros((SIZE, SIZE), np.float32)
     bare = Pair("T_3", "Town", "test", tmp_path, tmp_path, tmp_path)
-    assert list(label_strata(bare, labels, products)) == ["near_step"]
-    assert list(label_strata(pair, labels, Products())) == ["near_step"]
+    of_any_dataset = ["near_step", "match_inside", "match_outside"]
+    assert list(label_strata(bare, labels, products)) == of_any_dataset
+    assert list(label_strata(pair, labels, Products())) == of_any_dataset
     assert exact_truth(bare, products) == exact_truth(pair, Products()) == {}
     assert exact_truth(pair, Products(truth=tmp_path / "none")) == {}

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from ..errors import InputError
-from .layouts import Pair, StereoDataset, read_image
+from .layouts import Pair, StereoDataset, match_inside, read_image
 from .networks import Model, scaled
 
 TRIES = 10  # random windows looked at for one with enough labels
@@ -112,8 +112,7 @@ class LabelledPairs(Dataset):
         if self.crop_px is not None:
             rows, cols = self._window(disparity, rng)
             images, disparity = images[..., rows, cols], disparity[rows, cols].copy()
-            match = np.arange(disparity.shape[1]) - disparity
-            disparity[~((match >= 0) & (match <= disparity.shape[1] - 1))] = np.nan
+            disparity[~match_inside(disparity)] = np.nan
         images, disparity = self.augmentation.apply(images, disparity, rng)
         images = np.ascontiguousarray(images)
         return (

@@ -203,6 +203,12 @@ def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float
     return values
 
 
+def match_inside(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether a right image of the same width holds the match of each pixel; not where NaN."""
+    match = np.arange(disparity.shape[1]) - disparity
+    return (match >= 0) & (match <= disparity.shape[1] - 1)
+
+
 def _opened(path: str | Path) -> rasterio.DatasetReader:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)

@@ -2,6 +2,8 @@
 
 ==================  ================================================================================
 near_step           labels within ``NEAR_PX`` differ by more than ``STEP_PX`` (any dataset)
+match_inside,       whether the right tile holds the pixel's match, by its label; where it does not,
+match_outside       a method can but guess (any dataset)
 near_occlusion      a pixel that only one view sees lies within ``NEAR_PX`` (by the tile's status)
 ground, vegetation,
 building, other     by the class of the LiDAR point that gave the label
@@ -10,8 +12,8 @@ exact_visible       against a synthetic city's exact truth: all pixels that both
 exact_hidden        likewise, pixels behind something in the right view
 ==================  ================================================================================
 
-All but the first come from products of the workflow, of which the dataset's manifest names the
-tile, scene and window; what is missing is left out.
+All but the first three come from products of the workflow, of which the dataset's manifest names
+the tile, scene and window; what is missing is left out.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..disparity import Status
 from ..grid_store import require_complete
-from .layouts import Pair, read_image
+from .layouts import Pair, match_inside, read_image
 
 Bools = NDArray[np.bool_]
 NEAR_PX = 5
@@ -63,7 +65,7 @@ class Products:
 
 def label_strata(pair: Pair, labels: NDArray[np.float32], products: Products) -> dict[str, Bools]:
     """Masks [h, w] of the strata of a pair's labels (float32, NaN unlabelled)."""
-    found = {"near_step": near_step(labels)}
+    found = {"near_step": near_step(labels), **match_in_tile(labels)}
     status = products.status(pair)
     if status is not None:
         hidden = np.isin(status, (Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT))
@@ -98,6 +100,12 @@ def window(pair: Pair) -> tuple[slice, slice]:
     """Rows and columns of a tile in its scene."""
     row, col, size = (int(pair.row[key]) for key in ("row0", "col0", "size"))
     return slice(row, row + size), slice(col, col + size)
+
+
+def match_in_tile(labels: NDArray[np.float32]) -> dict[str, Bools]:
+    """Whether the right tile, of the same width, holds the match of each labelled pixel."""
+    inside = match_inside(labels)
+    return {"match_inside": inside, "match_outside": np.isfinite(labels) & ~inside}
 
 
 def near_step(labels: NDArray[np.float32]) -> Bools:

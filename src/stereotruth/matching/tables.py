@@ -171,7 +171,8 @@ def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> 
     for of in methods:
         base = of["fine_tuned_of"]
         if base is not None:
-            columns += [by_name[base]] if base in by_name else []
+            if base in by_name and by_name[base] not in columns:
+                columns.append(by_name[base])
             columns.append(of)
     if not columns:
         text = "No method of the configuration has `fine_tuned_of`."
