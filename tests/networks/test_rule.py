@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
+pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
 from stereotruth.matching.layouts import StereoDataset
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
+pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
 from stereotruth.errors import InputError
 from stereotruth.matching import training as module
@@ -89,6 +91,22 @@ if __name__ == "__main__":
 """
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_shows_a_bar_and_a_file_none(
+    dataset: StereoDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for stream in (Terminal(), io.StringIO()):
+        monkeypatch.setattr(sys, "stderr", stream)
+        out = tmp_path / type(stream).__name__
+        train(MODEL, dataset, out, replace(SHORT, epochs=1, crops_per_pair=4))
+        bar = "epoch 1 of 1:" in stream.getvalue() and "loss=" in stream.getvalue()
+        assert bar is stream.isatty()
+
+
 def test_a_killed_training_ends_as_an_undisturbed_one(
     dataset: StereoDataset, tmp_path: Path
 ) -> None:
@@ -126,6 +144,19 @@ def test_an_unreadable_state_is_no_obstacle(dataset: StereoDataset, tmp_path: Pa
     (tmp_path / ".net.work").mkdir()
     (tmp_path / ".net.work/last.pt").write_bytes(b"half a sta")
     assert train(MODEL, dataset, tmp_path / "net", replace(SHORT, epochs=1))["epochs"] == 1
+
+
+@pytest.mark.parametrize("initial", [True, False])
+def test_a_dataset_of_any_range_can_be_trained_on(
+    dataset: StereoDataset, tmp_path: Path, initial: bool
+) -> None:
+    path = tmp_path / "first.pt"
+    save_model(path, MODEL, MODEL.build(), {})
+    given = replace(SHORT, epochs=1, initial_weights=str(path) if initial else None)
+    odd = replace(dataset, disparity_range=(-7, 10))
+    model = module.model_of("stereonet", odd, given)
+    assert model.disparity_range == (-8, 16)
+    assert train(model, odd, tmp_path / "net", given)["model"]["disparity_range"] == (-8, 16)
 
 
 def test_frozen_parts_keep_their_weights_and_statistics(

@@ -12,13 +12,14 @@ LABELS = {"sgm": "SGM", "stereonet": "StereoNet", "psmnet": "PSM-Net", "hmsmnet"
 
 
 def need_pytorch(name: str, kind: str) -> None:
-    """Raise InputError unless ``kind`` is a network's and PyTorch is installed."""
+    """Raise InputError unless ``kind`` is a network's and what trains it is installed."""
     if kind not in NETWORKS:
         raise InputError(
             f"method {name!r} is of kind {kind!r}, which is not trained",
             remedy=f"take one of kind {', '.join(NETWORKS)}, or give it weights",
         )
-    if find_spec("torch") is None:
+    if not all(map(find_spec, ("torch", "tqdm"))):
         raise InputError(
-            f"{kind} needs PyTorch, which is not installed", remedy="pip install '.[networks]'"
+            f"{kind} needs PyTorch and tqdm, which are not installed",
+            remedy="pip install '.[networks]'",
         )

@@ -17,6 +17,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ import torch.distributed as dist
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from ..errors import InputError
 from ..grid_store import replacing
@@ -39,6 +42,7 @@ from .layouts import StereoDataset, read_image
 from .networks import (
     Model,
     choose_device,
+    covering,
     is_keras,
     load_model,
     mixed,
@@ -206,17 +210,16 @@ def _optimiser(network: nn.Module, learning_rate: float) -> torch.optim.Optimize
 
 def model_of(kind: str, dataset: StereoDataset, training: Training) -> Model:
     """The network for a dataset: its range, its number of bands; else that of the first weights."""
+    span = covering(kind, dataset.disparity_range)
     if training.initial_weights is None:
         image = read_image(dataset.pairs("train")[0].left)
         colour = image.ndim == 3
-        return Model(
-            kind, dataset.disparity_range, 3 if colour else 1, "us3d" if colour else "standardise"
-        )
+        return Model(kind, span, 3 if colour else 1, "us3d" if colour else "standardise")
     if is_keras(training.initial_weights):
         there, _ = read_keras(training.initial_weights, kind)
     else:
         there, _, _ = load_model(training.initial_weights)
-    return replace(there, kind=kind, disparity_range=dataset.disparity_range)
+    return replace(there, kind=kind, disparity_range=span)
 
 
 def start(model: Model, training: Training) -> nn.Module:
@@ -310,9 +313,9 @@ class _Job:
     device: str
     processes: int
 
-    @property
+    @cached_property
     def key(self) -> str:
-        """Digest of all that the weights follow from."""
+        """Digest of all that the weights follow from, as it was when the training began."""
         files = {
             pair.name: [str(pair.left), str(pair.right), str(pair.disparity)]
             for pair in (*self.data.pairs, *self.held.pairs)
@@ -391,9 +394,7 @@ def _run(job: _Job, rank: int, network: nn.Module, device: torch.device) -> None
         began = saved = time.monotonic()
         steps = _steps(job, state.epoch)
         before = state.seconds
-        title = f"epoch {state.epoch + 1} of {training.epochs}"
-        batches = _batches(job, state.epoch, steps[state.step :], rank)
-        for left, right, disparity in progress(batches, len(steps) - state.step, title):
+        for left, right, disparity in _shown(job, rank, state, steps[state.step :]):
             left, right, disparity = (t.to(device) for t in (left, right, disparity))
             optimiser.zero_grad(set_to_none=True)
             with mixed(precision, device):
@@ -421,6 +422,23 @@ def _run(job: _Job, rank: int, network: nn.Module, device: torch.device) -> None
         if not alone:
             dist.barrier()
         keep()
+
+
+def _shown(
+    job: _Job, rank: int, state: _State, steps: Sequence[Sequence[int]]
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """The batches of these steps, with a bar on a terminal and lines in the log."""
+    title = f"epoch {state.epoch + 1} of {job.training.epochs}"
+    batches = progress(_batches(job, state.epoch, steps, rank), len(steps), title)
+    hidden = None if rank == 0 else True  # None: where there is no terminal
+    with (
+        logging_redirect_tqdm([log] if log.handlers else []),
+        tqdm(batches, title, len(steps), leave=False, disable=hidden, unit="step") as bar,
+    ):
+        for batch in bar:
+            if state.step:
+                bar.set_postfix(loss=f"{state.loss / state.step:.3f}")
+            yield batch
 
 
 def _over(training: Training, state: _State) -> bool:
