@@ -12,7 +12,7 @@ import argparse
 import json
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,6 +24,7 @@ from stereotruth.matching.layouts import find_pairs, read_image
 from stereotruth.matching.sgm import MODES, STEP, SemiGlobalMatcher, pad, to_8_bits
 
 RANGE = (-128, 64)  # the paper's
+PRECISIONS = ("float32", "bfloat16")
 PAPER_MS = {"stereonet": 238, "psmnet": 614, "hmsmnet": 511}  # on a GTX 1080 Ti
 
 
@@ -77,7 +78,14 @@ def sgm(left: np.ndarray, right: np.ndarray, mode: str, times: int) -> dict[str,
     )
 
 
-def networks(left: np.ndarray, right: np.ndarray, times: int, threads: int) -> dict[str, Any]:
+def networks(
+    left: np.ndarray,
+    right: np.ndarray,
+    times: int,
+    threads: int,
+    kinds: Sequence[str],
+    precisions: Sequence[str],
+) -> dict[str, Any]:
     """Each network as a method on raw pixels, and bare PyTorch on tensors that are ready."""
     try:
         import torch
@@ -91,8 +99,8 @@ def networks(left: np.ndarray, right: np.ndarray, times: int, threads: int) -> d
     figures = {}
     print(f"\nPyTorch {torch.__version__}, {device}, {threads} thread(s)")
     print(f"{'network':<22}{'method':>18}{'bare':>18}{'ratio':>8}{'paper':>8}")
-    for kind in module.KINDS:
-        for precision in ("float32", "bfloat16"):
+    for kind in kinds:
+        for precision in precisions:
             model = module.Model(kind, RANGE, 3 if left.ndim == 3 else 1)
             method = module.NetworkMethod(model, model.build(), device, precision)
             ready = [
@@ -127,6 +135,8 @@ def main() -> None:
     parser.add_argument("--layout", default="whu", help="stereotruth, whu or us3d")
     parser.add_argument("--times", type=int, default=7, help="calls of each")
     parser.add_argument("--threads", type=int, default=1, help="of each call")
+    parser.add_argument("--network", action="append", choices=list(PAPER_MS), help="default: all")
+    parser.add_argument("--precision", action="append", choices=PRECISIONS, help="default: both")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
@@ -144,7 +154,8 @@ def main() -> None:
         cells = [f"{of[k]['clock_ms']:.0f} / {of[k]['cpu_ms']:.0f}" for k in of]
         ratio = of["method"]["cpu_ms"] / of["bare"]["cpu_ms"]
         print(f"{mode:<6}{cells[0]:>16}{cells[1]:>16}{ratio:>13.3f}{cells[2]:>18}", flush=True)
-    of_networks = networks(left, right, given.times, given.threads)
+    chosen = given.network or list(PAPER_MS), given.precision or PRECISIONS
+    of_networks = networks(left, right, given.times, given.threads, *chosen)
     if given.json:
         record = {"sgm": figures, "networks": of_networks}
         given.json.write_text(json.dumps(record, indent=2) + "\n")

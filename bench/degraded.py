@@ -1,0 +1,146 @@
+"""How methods bear what the synthetic pairs lack: noise, haze, shadows that moved, few grey levels.
+
+The right images of a dataset's test pairs are changed (noise: both), each method matches them, and
+EPE and D1 are printed beside those of the pairs as they are. See README.md beside this file.
+
+python bench/degraded.py --method sgm --method stereonet=results/train/.../best.pt
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereotruth.matching.holes import fill_holes
+from stereotruth.matching.layouts import StereoDataset, read_image
+from stereotruth.matching.methods import Matcher, make_method
+
+Image = NDArray[np.float32]
+Change = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
+THRESHOLD_PX = 3.0
+
+
+def smooth(shape: tuple[int, ...], wavelength: float, rng: np.random.Generator) -> Image:
+    """A random field of about 0 to 1 whose features are ``wavelength`` px wide."""
+    coarse = tuple(int(np.ceil(n / wavelength)) + 3 for n in shape)
+    values = rng.uniform(size=coarse).astype(np.float32)
+    size = tuple(int(n * wavelength) for n in reversed(coarse))
+    whole = cv2.resize(values, size, interpolation=cv2.INTER_CUBIC)
+    return whole[: shape[0], : shape[1]]
+
+
+def noise(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """White noise of a fifth of the image's standard deviation, in both images."""
+    sigma = 0.2 * left.std()
+    return tuple(image + rng.normal(0, sigma, image.shape) for image in (left, right))
+
+
+def haze(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """Half the contrast and more light, by places, in the right image."""
+    share = smooth(right.shape, 256, rng).clip(0, 1)
+    return left, right * (1 - 0.5 * share) + share * right.std()
+
+
+def shadows(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """An eighth of the right image at 0.4 of its brightness, in patches of some 40 px."""
+    field = smooth(right.shape, 40, rng)
+    return left, np.where(field > np.quantile(field, 0.875), 0.4 * right, right)
+
+
+def blur(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """The right image out of focus by 1.5 px."""
+    return left, cv2.GaussianBlur(right, (0, 0), 1.5)
+
+
+def upper_bits(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """The upper 8 of the images' 16 bits."""
+    return tuple(np.maximum(image // 256, 1) for image in (left, right))
+
+
+CHANGES: dict[str, tuple[Change, ...]] = {
+    "as they are": (),
+    "noise": (noise,),
+    "haze": (haze,),
+    "moved shadows": (shadows,),
+    "blur": (blur,),
+    "noise, haze, shadows, blur": (blur, shadows, haze, noise),
+    "upper 8 bits": (upper_bits,),
+}
+
+
+def changed(
+    left: NDArray, right: NDArray, changes: tuple[Change, ...], seed: list[int]
+) -> list[NDArray[np.uint16]]:
+    """A pair after the changes, uint16; nodata stays."""
+    rng = np.random.default_rng(seed)
+    images = [image.astype(np.float32) for image in (left, right)]
+    for change in changes:
+        images = list(change(*images, rng))
+    return [
+        np.where(image == 0, 0, np.clip(np.rint(new), 1, 65535)).astype(np.uint16)
+        for image, new in zip((left, right), images)
+    ]
+
+
+def score(matcher: Matcher, dataset: StereoDataset, changes: tuple[Change, ...]) -> dict:
+    """EPE (px) and D1 (%) over the labelled pixels of the test pairs, holes filled."""
+    low, high = dataset.disparity_range
+    total = wrong = count = 0.0
+    for number, pair in enumerate(dataset.pairs("test", labelled=True)):
+        images = changed(read_image(pair.left), read_image(pair.right), changes, [1, number])
+        found = fill_holes(
+            matcher(*images, dataset.disparity_range), grows_with_height=dataset.grows_with_height
+        )
+        label = dataset.labels(pair)
+        counts = (label >= low) & (label < high)
+        error = np.abs(found[counts] - label[counts])
+        total, wrong = total + error.sum(dtype=float), wrong + (error > THRESHOLD_PX).sum()
+        count += error.size
+    return {
+        "epe_px": round(float(total) / count, 3),
+        "d1_percent": round(100 * float(wrong) / count, 2),
+    }
+
+
+def main() -> None:
+    """Print a table; ``--json`` keeps the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--dataset", type=Path, default=Path("dataset"))
+    parser.add_argument("--range", type=int, nargs=2, default=(-64, 128), metavar="px")
+    parser.add_argument(
+        "--method", action="append", required=True, help="name[=weights]; kind before a -"
+    )
+    parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: all")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    dataset = StereoDataset("synthetic", given.dataset, "stereotruth", tuple(given.range))
+    figures: dict[str, dict[str, dict]] = {}
+    chosen = given.change or list(CHANGES)
+    print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>28}" for name in chosen), flush=True)
+    for method in given.method:
+        name, _, weights = method.partition("=")
+        settings = {"kind": name.partition("-")[0]}
+        settings |= {"weights": weights, "precision": "bfloat16"} if weights else {}
+        matcher = make_method(name, settings, given.threads)
+        figures[name] = {}
+        print(f"{name:<22}", end="", flush=True)
+        for change in chosen:
+            of = figures[name][change] = score(matcher, dataset, CHANGES[change])
+            cell = f"{of['epe_px']:.2f} / {of['d1_percent']:.1f}"
+            print(f"{cell:>28}", end="", flush=True)
+        print()
+    if given.json:
+        given.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
