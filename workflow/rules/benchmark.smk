@@ -72,7 +72,7 @@ rule benchmark_tables:
     output:
         tables=expand(
             "results/benchmark/{{dataset}}/{table}.{kind}",
-            table=("table5", "table6", "table7", "strata"),
+            table=("table5", "table6", "table7", "strata", "differences"),
             kind=("csv", "md"),
         ),
         figure=report(
@@ -102,6 +102,7 @@ rule benchmark_tables:
     params:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         split=config["benchmark"]["split"],
+        seed=config["seed"],
         code=source_digest("matching.comparison"),
         template=file_sha256(PACKAGE / "matching" / "benchmark.html.jinja"),
     message:

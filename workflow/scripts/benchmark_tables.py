@@ -15,4 +15,5 @@ if __name__ == "__main__":
             snakemake.input.scores,
             snakemake.input.predictions,
             Path(snakemake.output.page).parent,
+            seed=params.seed,
         )

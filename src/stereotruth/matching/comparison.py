@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .benchmark import choose
+from .differences import differences
 from .layouts import StereoDataset, read_image
 from .page import write_page
 from .panels import Column, draw_columns
@@ -27,15 +28,19 @@ def compare(
     scores: Sequence[str | Path],
     predictions: Sequence[str | Path],
     out: str | Path,
+    *,
+    seed: int,
 ) -> None:
     """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
 
-    ``scores``, ``predictions``: folders of the methods, in one order.
+    ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
+    intervals of differences come from.
     """
     out = Path(out)
     methods = read_scores(scores)
     trained = [pair.city for pair in dataset.pairs() if pair.split == "train"]
     tables = make_tables(methods, trained, beside_paper=dataset.layout != "us3d")
+    tables.append(differences(methods, scores, seed=seed))
     write_tables(tables, out)
     scorer = Scorer(dataset.disparity_range)
     columns = []

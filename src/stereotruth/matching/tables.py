@@ -306,17 +306,18 @@ def _epe_d1(of: Row, row: Row | None) -> list[str]:
 
 
 def _px(row: Row, key: str, *, interval: bool = True) -> str:
-    return _with_interval(row, key, 1, ".3f", interval)
+    return with_interval(row, key, 1, ".3f", shown=interval)
 
 
 def _percent(row: Row, key: str, *, interval: bool = True) -> str:
-    return _with_interval(row, key, 100, ".2f", interval)
+    return with_interval(row, key, 100, ".2f", shown=interval)
 
 
-def _with_interval(row: Row, key: str, factor: float, form: str, interval: bool) -> str:
+def with_interval(row: Row, key: str, factor: float, form: str, *, shown: bool = True) -> str:
+    """A figure and, where there is one and it is to be shown, its interval."""
     text = _number(row.get(key), factor, form)
     ends = [row.get(f"{key}_{end}") for end in ("low", "high")]
-    if interval and None not in ends:
+    if shown and None not in ends:
         text += f" [{', '.join(_number(end, factor, form) for end in ends)}]"
     return text
 
