@@ -17,10 +17,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from whole_scene import parsed
 
-from stereotruth.matching.holes import fill_holes
 from stereotruth.matching.layouts import StereoDataset, read_image
 from stereotruth.matching.methods import Matcher, make_method
+from stereotruth.matching.scores import Collector, Scorer
 
 Image = NDArray[np.float32]
 Change = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
@@ -91,21 +92,16 @@ def changed(
 
 def score(matcher: Matcher, dataset: StereoDataset, changes: tuple[Change, ...]) -> dict:
     """EPE (px) and D1 (%) over the labelled pixels of the test pairs, holes filled."""
-    low, high = dataset.disparity_range
-    total = wrong = count = 0.0
+    scorer = Scorer(dataset.disparity_range, (THRESHOLD_PX,), dataset.grows_with_height)
+    collector = Collector(scorer.thresholds_px)
     for number, pair in enumerate(dataset.pairs("test", labelled=True)):
         images = changed(read_image(pair.left), read_image(pair.right), changes, [1, number])
-        found = fill_holes(
-            matcher(*images, dataset.disparity_range), grows_with_height=dataset.grows_with_height
-        )
-        label = dataset.labels(pair)
-        counts = (label >= low) & (label < high)
-        error = np.abs(found[counts] - label[counts])
-        total, wrong = total + error.sum(dtype=float), wrong + (error > THRESHOLD_PX).sum()
-        count += error.size
+        found = matcher(*images, dataset.disparity_range)
+        collector.add(pair.name, pair.city, scorer.sums(found, dataset.labels(pair)))
+    row = collector.scores().row()
     return {
-        "epe_px": round(float(total) / count, 3),
-        "d1_percent": round(100 * float(wrong) / count, 2),
+        "epe_px": round(row["filled_epe_px"], 3),
+        "d1_percent": round(100 * row[f"filled_d1_{THRESHOLD_PX:g}_px_share"], 2),
     }
 
 
@@ -115,7 +111,7 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, default=Path("dataset"))
     parser.add_argument("--range", type=int, nargs=2, default=(-64, 128), metavar="px")
     parser.add_argument(
-        "--method", action="append", required=True, help="name[=weights]; kind before a -"
+        "--method", action="append", required=True, help="sgm, or stereonet[-x]=weights"
     )
     parser.add_argument("--change", action="append", choices=list(CHANGES), help="default: all")
     parser.add_argument("--threads", type=int, default=2)
@@ -127,9 +123,9 @@ def main() -> None:
     chosen = given.change or list(CHANGES)
     print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>28}" for name in chosen), flush=True)
     for method in given.method:
-        name, _, weights = method.partition("=")
-        settings = {"kind": name.partition("-")[0]}
-        settings |= {"weights": weights, "precision": "bfloat16"} if weights else {}
+        name, settings = parsed(method)
+        if "weights" in settings:
+            settings["precision"] = "bfloat16"
         matcher = make_method(name, settings, given.threads)
         figures[name] = {}
         print(f"{name:<22}", end="", flush=True)
