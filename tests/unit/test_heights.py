@@ -226,6 +226,41 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
     assert np.nanmax(np.abs(whole - at_once)) < 1e-4
 
 
+def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_path, monkeypatch):
+    """It widens the window of every block; parts that cannot reach a block are left out."""
+    monkeypatch.setattr(heights, "CHUNK", 128)
+    monkeypatch.setattr(heights, "SHARD", 128)
+    monkeypatch.setattr(heights, "PART", 32)
+    pixels: list[int] = []
+
+    def counted(model, disparity, row=0, col=0):
+        pixels.append(disparity.size)
+        return intersect(model, disparity, row, col)
+
+    monkeypatch.setattr(heights, "intersect", counted)
+    wild = of_plane.copy()
+    wild[200, 200] += 700.0
+    found, work = {}, {}
+    for name, d in (("calm", of_plane), ("wild", wild)):
+        pixels.clear()
+        write_dsm(write_grid(tmp_path / f"{name}.zarr", model, d), tmp_path / f"{name}.tif")
+        found[name], work[name] = read(tmp_path / f"{name}.tif")[:2], sum(pixels)
+    assert work["wild"] < 1.25 * work["calm"]
+    monkeypatch.setattr(heights._Model, "reaches", lambda *_: True)
+    pixels.clear()
+    write_dsm(tmp_path / "wild.zarr", tmp_path / "all.tif")
+    assert sum(pixels) > 1.5 * work["wild"]
+    every, raster, _ = read(tmp_path / "all.tif")
+    assert np.array_equal(every, found["wild"][0], equal_nan=True)
+    calm, place = found["calm"]
+    dr = round((raster.north - place.north) / place.resolution)
+    dc = round((place.west - raster.west) / place.resolution)
+    inside = every[dr : dr + calm.shape[0], dc : dc + calm.shape[1]]
+    assert np.isfinite(calm).sum() - np.isfinite(inside).sum() < 20  # the hole of the wild one
+    same = np.isfinite(calm) & np.isfinite(inside)
+    assert np.abs(calm - inside)[same].max() < 1e-4
+
+
 def test_workers_of_a_dask_cluster_write_the_same_bytes(model, of_plane, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
     store = write_grid(tmp_path / "d.zarr", model, of_plane)

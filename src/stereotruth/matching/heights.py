@@ -19,8 +19,10 @@ from __future__ import annotations
 import logging
 import math
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,8 @@ Floats = NDArray[np.float64]
 MAX_STEP_PX = 1.5  # of disparity between neighbours: slopes of 66° with GF-7's 1 px per m
 CHUNK = 256
 SHARD = 1024  # cells
+PART = 512  # px whose points are in memory at a time
+SLACK = 2.0  # cells by which a part may reach further than its corners tell
 NODATA = -9999.0
 LAYERS = {"height": Layer("float32", math.nan, {"units": "m", "long_name": "surface height"})}
 TOLERANCE_M = 1e-5
@@ -293,14 +297,22 @@ def _outline(rows: tuple[float, float], cols: tuple[float, float], n: int = 9) -
     return np.stack([axis.ravel() for axis in mesh])
 
 
-def height_bounds(model: EpipolarModel, low: float, high: float) -> tuple[float, float]:
-    """Least and greatest height (m) that disparities between ``low`` and ``high`` px stand for."""
-    y, x = _outline((0, model.shape[0] - 1), (0, model.shape[1] - 1), 7).astype(int)
+def _ground_at(
+    model: EpipolarModel, disparities: tuple[float, float], y: Floats, x: Floats
+) -> Floats:
+    """[3, n] longitude, latitude, height of whole pixels (y, x), at each of two disparities."""
     found = [
-        intersect(model, np.full((1, 1), d, np.float32), int(r), int(c))[2, 0, 0]
-        for d in (low, high)
+        intersect(model, np.full((1, 1), d, np.float32), int(r), int(c))[:, 0, 0]
+        for d in disparities
         for r, c in zip(y, x)
     ]
+    return np.transpose(found)
+
+
+def height_bounds(model: EpipolarModel, low: float, high: float) -> tuple[float, float]:
+    """Least and greatest height (m) that disparities between ``low`` and ``high`` px stand for."""
+    y, x = _outline((0, model.shape[0] - 1), (0, model.shape[1] - 1), 7)
+    found = _ground_at(model, (low, high), y, x)[2]
     if not np.isfinite(found).any():
         raise InputError(
             f"no rays of disparities between {low:g} and {high:g} px meet",
@@ -328,6 +340,17 @@ def raster_of(
 
 
 # ------------------------------------------------------------------------------------------ stage
+
+
+def _parts(window: tuple[slice, slice]) -> Iterator[tuple[slice, slice]]:
+    """A window in parts of ``PART`` px; neighbours share the row or column between them."""
+    starts = (range(s.start // PART * PART, s.stop - 1, PART) for s in window)
+    for corner in product(*starts):
+        y, x = (
+            slice(max(first, s.start), min(first + PART + 1, s.stop))
+            for first, s in zip(corner, window)
+        )
+        yield y, x
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,14 +393,34 @@ class _Model:
         window = self.window(rows, cols)
         if window is None:
             return out
-        y, x = window
-        for first in range(y.start, y.stop - 1, SHARD // 2):  # half a block's points at a time
-            part = slice(first, min(first + SHARD // 2 + 1, y.stop))
-            d = self.disparity[part, x]
-            lon, lat, z = intersect(self.model, d, part.start, x.start)
+        for y, x in _parts(window):
+            d = self.disparity[y, x]
+            if not self.reaches(d, (y, x), rows, cols):
+                continue
+            lon, lat, z = intersect(self.model, d, y.start, x.start)
             col, row = self.raster.cells(lon, lat)
             _surface(col - cols.start, row - rows.start, z, d, MAX_STEP_PX, out)
         return out
+
+    def reaches(
+        self, d: NDArray[np.float32], part: tuple[slice, slice], rows: slice, cols: slice
+    ) -> bool:
+        """Whether the surface of a part may lie over these cells, by its own disparities.
+
+        The window is that of all heights of the scene, which one wild disparity makes wide.
+        """
+        if not np.isfinite(d).any():
+            return False
+        y, x = _outline(*((s.start, s.stop - 1) for s in part), n=2)
+        bounds = float(np.nanmin(d)), float(np.nanmax(d))
+        lon, lat, _ = _ground_at(self.model, bounds, y, x)
+        if not np.isfinite(lon).all():
+            return True
+        places = self.raster.cells(lon, lat)
+        return all(
+            at.max() + SLACK >= window.start and at.min() - SLACK <= window.stop - 1
+            for at, window in zip(places, (cols, rows))
+        )
 
     def block(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
         """Make one block and write it; its result is the count of cells with a height."""
