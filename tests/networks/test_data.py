@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader
 from stereotruth.errors import InputError
 from stereotruth.matching.data import Augmentation, LabelledPairs
 from stereotruth.matching.layouts import StereoDataset, read_image
+from stereotruth.matching.networks import scaled
 
 from .conftest import SIZE
 
@@ -34,19 +35,45 @@ def test_labels_out_of_range_count_nowhere(dataset: StereoDataset) -> None:
     assert [bool(torch.isfinite(data[k][2]).any()) for k in range(3)] == [True, True, False]
 
 
-def test_windows_hold_only_labels_whose_match_is_inside(dataset: StereoDataset) -> None:
+def test_windows_lose_matches_that_they_cut_off_and_no_others(dataset: StereoDataset) -> None:
     data = LabelledPairs.of(dataset, "train", crop_px=(32, 24), seed=3)
-    for k, d in enumerate((-6, 3, 9)):
-        left, right, disparity = data[k]
-        assert left.shape == (1, 32, 24)
-        known = torch.isfinite(disparity)
-        assert known.any() and (disparity[known] == d).all()
-        cols = torch.arange(24) - d
-        inside = (cols >= 0) & (cols < 24)
-        assert not known[:, ~inside].any()
-        # the pixels correspond, so the same window was cut of both (each image has its own scale)
-        a, b = left[0][:, inside], right[0][:, cols[inside]]
-        assert torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1] > 0.999
+    cut, ended = 0, 0
+    for epoch in range(12):
+        data.epoch = epoch
+        for k, d in enumerate((-6, 3, 9)):
+            left, right, disparity = data[k]
+            assert left.shape == (1, 32, 24)
+            known = torch.isfinite(disparity)
+            assert known.any() and (disparity[known] == d).all()
+            labelled = known.any(dim=1)  # rows
+            cols = torch.arange(24) - d
+            inside = (cols >= 0) & (cols < 24)
+            assert known[labelled][:, inside].all()
+            # the pixels correspond, so the same window was cut of both (each has its own scale)
+            a, b = left[0][:, inside], right[0][:, cols[inside]]
+            assert torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1] > 0.999
+            whole = scaled(read_image(data.pairs[k].left), data.model, None)[0]
+            first = next(
+                c
+                for c in range(SIZE - 23)
+                if any(np.array_equal(whole[r : r + 32, c : c + 24], left[0]) for r in range(33))
+            )
+            in_tile = (first + cols >= 0) & (first + cols < SIZE)
+            assert not known[:, in_tile & ~inside].any()
+            assert known[labelled][:, ~in_tile].all()
+            cut, ended = cut + int((in_tile & ~inside).sum()), ended + int((~in_tile).sum())
+    assert cut and ended
+
+
+def test_windows_show_rims_and_middle_about_as_often(dataset: StereoDataset) -> None:
+    """Within a factor of two; windows from random corners showed the outermost pixel 1 in 49."""
+    data = LabelledPairs.of(dataset, "train", crop_px=(16, 16))
+    rng, anywhere = np.random.default_rng(1), np.zeros((SIZE, SIZE), np.float32)
+    seen = np.zeros((SIZE, SIZE))
+    for _ in range(4000):
+        seen[data._window(anywhere, rng)] += 1
+    for along in seen.mean(axis=0), seen.mean(axis=1):
+        assert along.min() > 0.45 * along.max()
 
 
 def test_windows_follow_from_seed_epoch_and_number(dataset: StereoDataset) -> None:

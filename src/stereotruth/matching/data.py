@@ -68,7 +68,8 @@ class LabelledPairs(Dataset):
 
     Images are scaled as ``model`` says, by the statistics of the whole image. Disparity is in px;
     NaN where there is no label, where it is out of the dataset's range, and where the window
-    that was cut leaves the match outside.
+    cuts off a match that the whole right image has. Where that ends before the match, as it may
+    in any pair that is to be matched, the label stays.
 
     ``crop_px``: rows and columns of a random window of each pair, the same in both images; None:
     the whole pair. ``epoch``: windows and changes follow from ``seed``, ``epoch`` and the pair's
@@ -110,9 +111,10 @@ class LabelledPairs(Dataset):
         images = np.stack([scaled(image, self.model, None) for image in (left, right)])
         rng = np.random.default_rng([self.seed, self.epoch, index])
         if self.crop_px is not None:
-            rows, cols = self._window(disparity, rng)
-            images, disparity = images[..., rows, cols], disparity[rows, cols].copy()
-            disparity[~match_inside(disparity)] = np.nan
+            window = self._window(disparity, rng)
+            seen = match_inside(disparity)[window]
+            images, disparity = images[..., *window], disparity[window].copy()
+            disparity[seen & ~match_inside(disparity)] = np.nan
         images, disparity = self.augmentation.apply(images, disparity, rng)
         images = np.ascontiguousarray(images)
         return (
@@ -124,7 +126,11 @@ class LabelledPairs(Dataset):
     def _window(
         self, disparity: NDArray[np.float32], rng: np.random.Generator
     ) -> tuple[slice, slice]:
-        """A random window, the first of some in which enough pixels are labelled."""
+        """A random window, the first of some in which enough pixels are labelled.
+
+        It is drawn from all that overlap the pair and moved into it, so that the rims, where the
+        right image ends, are seen about as often as the rest.
+        """
         assert self.crop_px is not None
         height, width = self.crop_px
         if height > disparity.shape[0] or width > disparity.shape[1]:
@@ -135,8 +141,10 @@ class LabelledPairs(Dataset):
             )
         best, most = (slice(0, height), slice(0, width)), -1.0
         for _ in range(TRIES):
-            r = int(rng.integers(disparity.shape[0] - height + 1))
-            c = int(rng.integers(disparity.shape[1] - width + 1))
+            r, c = (
+                int(np.clip(rng.integers(1 - side, size), 0, size - side))
+                for side, size in zip(self.crop_px, disparity.shape)
+            )
             window = slice(r, r + height), slice(c, c + width)
             share = float(np.isfinite(disparity[window]).mean())
             if share > most:
