@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import shutil
 import sys
 import time
@@ -30,6 +29,7 @@ from stereotruth.grid_store import Layer, blocks, building, create_grid, require
 from stereotruth.matching.blocks import match
 from stereotruth.matching.heights import Raster, write_dsm
 from stereotruth.matching.methods import make_method
+from stereotruth.matching.predictions import peak_memory_mb
 from stereotruth.matching.scenes import predict_scene
 from stereotruth.rectification import rectify
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
@@ -121,7 +121,7 @@ def _measured(function: Callable, arguments: tuple, options: Mapping[str, Any]) 
     begin = time.monotonic()
     result = function(*arguments, **options)
     seconds = time.monotonic() - begin
-    return result, seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return result, seconds, peak_memory_mb()
 
 
 def measured(function: Callable, *arguments: Any, **options: Any) -> tuple[Any, float, float]:

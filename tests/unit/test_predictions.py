@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -144,3 +146,17 @@ def test_images_that_do_not_fit_each_other_are_refused(dataset):
 def test_no_record_is_told(tmp_path):
     with pytest.raises(InputError, match="no predictions"):
         read_record(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system counts as it does")
+def test_peak_memory_is_that_of_the_process_alone():
+    """Not that of the process which started it, as Linux's ru_maxrss would have it."""
+    ballast = np.ones(80 << 20)  # 640 MB
+    code = (
+        "from stereotruth.matching.predictions import peak_memory_mb as peak; import numpy as np;"
+        "before = peak(); held = np.ones(25 << 20); print(before, peak())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, after = map(float, run.stdout.split())
+    assert ballast.nbytes / 2**20 > before > 10
+    assert after - before == pytest.approx(200, abs=30)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import platform
+import re
 import resource
 import shutil
 import sys
@@ -251,6 +252,12 @@ def _summary(found: Mapping[str, Prediction]) -> dict[str, float | None]:
 
 
 def peak_memory_mb() -> float:
-    """Most memory that this process ever held, in MB (2^20 bytes)."""
+    """Most memory that this process ever held, in MB (2^20 bytes).
+
+    Linux's ``ru_maxrss`` begins with that of the process that started this one, ``VmHWM`` does not.
+    """
+    status = Path("/proc/self/status")
+    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+) kB", status.read_text())):
+        return int(found[1]) / 1024
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MB
