@@ -30,7 +30,7 @@ import shutil
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -789,6 +789,11 @@ def export_city(
         stack.enter_context(exclusive(out))
         shutil.rmtree(scratch, ignore_errors=True)
         stack.callback(shutil.rmtree, scratch, ignore_errors=True)
+        # all appear when the tiles do: a job that outlives its run cannot be found halfway
+        matches, coverage, contact_sheet = (
+            None if path is None else stack.enter_context(replacing(path))
+            for path in (matches, coverage, contact_sheet)
+        )
         kinds = {"left", "right", "disp", "status", "orientation"}
         if any(source.of_right is not None for source in sources):
             kinds |= set(RIGHT_FILES)
@@ -801,10 +806,9 @@ def export_city(
             return _write_tile(scratch, *chosen[k], k, cut)
 
         written, scene_checks = [], {s.scene: _SceneChecks(s.gcp_rms) for s in sources}
-        sink = nullcontext(Path(os.devnull)) if matches is None else replacing(matches)
+        matches_file = Path(os.devnull) if matches is None else matches
         with (
             warnings.catch_warnings(),
-            sink as matches_file,
             matches_file.open("w", newline="", encoding="utf-8") as stream,
             ThreadPoolExecutor(workers) as pool,
         ):
@@ -831,9 +835,9 @@ def export_city(
         }
         save(scratch / "export.json", record)
         if coverage is not None:
-            _draw_coverage(Path(coverage), city, rows, scans)
+            _draw_coverage(coverage, city, rows, scans)
         if contact_sheet is not None:
-            _draw_contact_sheet(Path(contact_sheet), city, rows, scratch, nodata)
+            _draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
         shutil.rmtree(out, ignore_errors=True)
         scratch.rename(out)
         _forget_others(cut, rows)
