@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scores import CONFIDENCE, MIN_TILES
+from .scores import CONFIDENCE, MIN_TILES, resampled
 from .tables import FILLED, Row, Table, with_interval
 
 Sums = dict[str, NDArray[np.float64]]  # by tile: labelled pixels, and a figure's sum over them
@@ -50,9 +50,8 @@ def difference(first: Sums, second: Sums, times: int, seed: int) -> dict[str, An
     if tiles:
         found["value"] = float(pooled(sums.sum(axis=0)))
     if len(tiles) >= MIN_TILES and times:
-        count = len(tiles)
-        drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), times)
-        found["low"], found["high"] = np.percentile(pooled(drawn @ sums), CONFIDENCE).tolist()
+        samples = pooled(resampled(sums, times, seed))
+        found["low"], found["high"] = np.percentile(samples, CONFIDENCE).tolist()
     return found
 
 

@@ -82,13 +82,11 @@ class Scores:
         sums = self.sums[:, self.strata.index(stratum)]
         sums = sums if where is None else sums[where]
         sums = sums[sums[:, 0] > 0]
-        count = len(sums)
-        if count < MIN_TILES or not times:
+        if len(sums) < MIN_TILES or not times:
             return dict.fromkeys(
                 name for name in self._figures(self.sums[0, 0]) if name != "labelled"
             )
-        drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), times)
-        samples = [self._figures(total) for total in drawn @ sums]
+        samples = [self._figures(total) for total in resampled(sums, times, seed)]
         found = {}
         for name in samples[0]:
             values = [sample[name] for sample in samples if sample[name] is not None]
@@ -96,6 +94,13 @@ class Scores:
                 low, high = np.percentile(values, CONFIDENCE) if values else (np.nan, np.nan)
                 found[name] = (round(float(low), 6), round(float(high), 6)) if values else None
         return found
+
+
+def resampled(sums: Floats, times: int, seed: int) -> Floats:
+    """Totals [times, quantity] of sums [tile, quantity], tiles drawn with replacement."""
+    count = len(sums)
+    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), times)
+    return drawn @ sums
 
 
 def _both(names: Sequence[str]) -> list[str]:
