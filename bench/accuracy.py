@@ -19,13 +19,16 @@ from typing import Any
 import yaml
 
 from stereotruth import sheets
-from stereotruth.alignment import Alignment, align
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.alignment.align import align
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.dataset import warped_tile
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.error_statistics import LIMITS
 from stereotruth.errors import InputError
-from stereotruth.evaluation import checkpoints, truth, warping
-from stereotruth.evaluation.grid_truth import write_grid_truth
-from stereotruth.evaluation.statistics import LIMITS
-from stereotruth.grid_store import require_complete
+from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
+from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.products.grids import require_complete
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -73,8 +76,8 @@ def print_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
         print("  ".join(f"{row[c]:<{width[c]}}" for c in columns))
 
 
-def truth_row(name: str, comparison: truth.Comparison) -> dict[str, Any]:
-    row = truth.table_row(name, comparison)
+def truth_row(name: str, comparison: labels_against_truth.Comparison) -> dict[str, Any]:
+    row = labels_against_truth.table_row(name, comparison)
     return {
         "scope": name,
         "labels": row["labels"],
@@ -135,7 +138,7 @@ def goal_rows(cities: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     return rows
 
 
-def status_rows(comparisons: Mapping[str, truth.ByClass]) -> list[dict[str, str]]:
+def status_rows(comparisons: Mapping[str, labels_against_truth.ByClass]) -> list[dict[str, str]]:
     """Where visible pixels without a label went, and which hidden ones have one: % of each."""
     rows = []
     for name, parts in comparisons.items():
@@ -177,7 +180,9 @@ def status_rows(comparisons: Mapping[str, truth.ByClass]) -> list[dict[str, str]
     return rows
 
 
-def calibration_rows(comparisons: Mapping[str, truth.ByClass]) -> list[dict[str, str]]:
+def calibration_rows(
+    comparisons: Mapping[str, labels_against_truth.ByClass],
+) -> list[dict[str, str]]:
     """Calibration of the uncertainty by class and by decile of the uncertainty."""
     rows = []
     for city, parts in comparisons.items():
@@ -211,7 +216,7 @@ def table4(city: str) -> list[dict[str, str]]:
 
 
 def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
-    disparity, parallax = (e.figures() for e in truth.geometry_errors(model, store))
+    disparity, parallax = (e.figures() for e in labels_against_truth.geometry_errors(model, store))
     return {
         "scene": scene,
         "alignment": alignment,
@@ -279,8 +284,8 @@ def project_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
     """Align with noise-free GCPs, rectify and project again; the disparity store."""
-    from stereotruth.disparity import project_scene
-    from stereotruth.rectification import rectify
+    from stereotruth.disparity.project import project_scene
+    from stereotruth.epipolar.rectify import rectify
 
     scene = made.scene
     shutil.rmtree(folder, ignore_errors=True)
@@ -323,10 +328,10 @@ def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
         rows = [r for r in csv.DictReader(stream) if r["scene"] == made.scene.scene]
     found = []
     for k, row in enumerate(r for r in rows if r["complete"] == "yes"):
-        tile = warping.warp_tile(made.tiles, row)
+        tile = warped_tile.warp_tile(made.tiles, row)
         found.append({"tile": tile.name, "correlation": f"{tile.correlation:.4f}"})
         if k < count:
-            warping.draw_panels(tile, folder / f"{tile.name}.png")
+            scene_warping.draw_panels(tile, folder / f"{tile.name}.png")
     return found
 
 
@@ -354,7 +359,7 @@ def scenes_made(config: Mapping[str, Any], only: Sequence[str] | None) -> list[M
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
     config = read_config(arguments.configfile)
     report: dict[str, Any] = {"truth": [], "exact": [], "geometry": [], "points": [], "warping": []}
-    by_city: dict[str, truth.SceneComparison] = {}
+    by_city: dict[str, labels_against_truth.SceneComparison] = {}
     cities = []
     for made in scenes_made(config, arguments.city):
         name = made.scene.scene
@@ -363,7 +368,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             raw = made.input / "truth.zarr"
             tiles = made.tiles if (made.tiles / "manifest.csv").is_file() else None
             true = made.truth(made.exact, made.disparity, arguments.workers)
-            result = truth.compare_scene(
+            result = labels_against_truth.compare_scene(
                 made.disparity, true, tiles, scene=name, workers=arguments.workers
             )
             for scope, parts in (("scene", result.whole), ("tiles", result.all_tiles)):
@@ -373,9 +378,9 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
                     report["truth"] += [truth_row(f"  {k}", parts.parts[k]) for k in parts.classes]
             if arguments.tiles:
                 report["truth"] += [truth_row(f"  {t}", c) for t, c in result.tiles.items()]
-            by_city.setdefault(made.scene.city, truth.SceneComparison(made.scene.city)).merge(
-                result
-            )
+            by_city.setdefault(
+                made.scene.city, labels_against_truth.SceneComparison(made.scene.city)
+            ).merge(result)
             model = EpipolarModel.from_dict(require_complete(made.disparity).attrs["epipolar"])
             if not raw.is_dir():
                 print(f"{name}: for the alignment alone, make {raw} (snakemake --cores 2 {raw})")
@@ -387,7 +392,9 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             folder = made.exact / "noise-free"
             exact = with_exact_gcps(made, folder, config, arguments.workers)
             true = made.truth(folder, exact, arguments.workers)
-            result = truth.compare_scene(exact, true, None, scene=name, workers=arguments.workers)
+            result = labels_against_truth.compare_scene(
+                exact, true, None, scene=name, workers=arguments.workers
+            )
             report["exact"].append(truth_row(f"{name} scene", result.whole.total))
             model = EpipolarModel.from_dict(require_complete(exact).attrs["epipolar"])
             if raw.is_dir():
@@ -397,7 +404,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
                 made.disparity, made.input / "checkpoints.csv", scene=name
             )
             report["points"].append({"scene": name, **figures})
-        warped = warping.evaluate_warping(made.left, made.right, made.disparity)
+        warped = scene_warping.evaluate_warping(made.left, made.right, made.disparity)
         tiles_warped = panels(made, arguments.panels or Path(), 2 if arguments.panels else 0)
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
     parts = {c: r.all_tiles if r.tiles else r.whole for c, r in by_city.items()}

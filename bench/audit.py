@@ -21,13 +21,15 @@ import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from stereotruth.audit import sharing
-from stereotruth.audit.conventions import label_values
-from stereotruth.audit.matches import Matches, match_pair
-from stereotruth.audit.pair import EXTRA_PX, measure_arrays
-from stereotruth.audit.verdicts import FAULT, UNDECIDED, Limits, judge
-from stereotruth.grid_store import replacing, require_complete
-from stereotruth.matching.layouts import Pair, StereoDataset, read_image
+from stereotruth.dataset.stereo_dataset import Pair, StereoDataset
+from stereotruth.evaluation.audit import sharing
+from stereotruth.evaluation.audit.conventions import label_values
+from stereotruth.evaluation.audit.matches import Matches, match_pair
+from stereotruth.evaluation.audit.pair import EXTRA_PX, measure_arrays
+from stereotruth.evaluation.audit.verdicts import FAULT, UNDECIDED, Limits, judge
+from stereotruth.products.files import replacing
+from stereotruth.products.grids import require_complete
+from stereotruth.products.rasters import read_image
 
 PROJECT = Path(__file__).resolve().parents[1]
 BLOCK = 48  # px: side of the places where labels are made wrong,

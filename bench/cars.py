@@ -30,10 +30,10 @@ from scale import Watch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, map_coordinates, minimum_filter
 
-from stereotruth.alignment import Alignment
-from stereotruth.epipolar import EpipolarModel
-from stereotruth.points import PointStore
-from stereotruth.rpc import SensorModel
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.lidar.point_store import PointStore
 from stereotruth.simulate.__main__ import SEED, make_scene
 from stereotruth.simulate.cities import CITIES, CitySpec
 from stereotruth.simulate.surfaces import ROOF, WATER

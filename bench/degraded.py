@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from whole_scene import parsed
 
-from stereotruth.matching.layouts import StereoDataset, read_image
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.matching.benchmark.scores import Collector, Scorer
 from stereotruth.matching.methods import Matcher, make_method
-from stereotruth.matching.scores import Collector, Scorer
+from stereotruth.products.rasters import read_image
 
 Image = NDArray[np.float32]
 Change = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]

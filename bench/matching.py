@@ -20,8 +20,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from stereotruth.matching.layouts import find_pairs, read_image
+from stereotruth.dataset.stereo_dataset import find_pairs
+from stereotruth.matching.networks import image_scaling, inference, weights
 from stereotruth.matching.sgm import MODES, STEP, SemiGlobalMatcher, pad, to_8_bits
+from stereotruth.products.rasters import read_image
 
 RANGE = (-128, 64)  # the paper's
 PRECISIONS = ("float32", "bfloat16")
@@ -92,24 +94,23 @@ def networks(
     except ImportError:
         print("\nPyTorch is not installed: no networks")
         return {}
-    from stereotruth.matching import networks as module
 
     torch.set_num_threads(threads)
-    device = module.choose_device(None)
+    device = inference.choose_device(None)
     figures = {}
     print(f"\nPyTorch {torch.__version__}, {device}, {threads} thread(s)")
     print(f"{'network':<22}{'method':>18}{'bare':>18}{'ratio':>8}{'paper':>8}")
     for kind in kinds:
         for precision in precisions:
-            model = module.Model(kind, RANGE, 3 if left.ndim == 3 else 1)
-            method = module.NetworkMethod(model, model.build(), device, precision)
+            model = weights.SavedNetwork(kind, RANGE, 3 if left.ndim == 3 else 1)
+            method = inference.NetworkMethod(model, model.build(), device, precision)
             ready = [
-                torch.from_numpy(module.scaled(image, model, None))[None].to(device)
+                torch.from_numpy(image_scaling.scaled(image, model, None))[None].to(device)
                 for image in (left, right)
             ]
 
             def bare(method: Any = method, ready: Any = ready, precision: str = precision) -> None:
-                with torch.inference_mode(), module.mixed(precision, device):
+                with torch.inference_mode(), inference.mixed(precision, device):
                     method.network(*ready)
                 if device.type == "cuda":
                     torch.cuda.synchronize()

@@ -34,18 +34,21 @@ import yaml
 from rasterio.transform import RPCTransformer
 
 import stereotruth
-from stereotruth.alignment import align
-from stereotruth.block_store import making
-from stereotruth.correlation import correlate
-from stereotruth.crs_patches import PatchedTransform
-from stereotruth.disparity import project_scene
-from stereotruth.epipolar import EpipolarModel
-from stereotruth.grid_store import Layer, require_complete
-from stereotruth.patches import read_patch
-from stereotruth.pixel_points import Collection
-from stereotruth.points import Points, PointStore, ingest
-from stereotruth.rectification import Source, rectify, rectify_image
-from stereotruth.rpc import RPC, SensorModel, read_rpc
+from stereotruth.alignment.align import align
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.paper_correlation import correlate
+from stereotruth.disparity.pixel_points import Collection
+from stereotruth.disparity.project import project_scene
+from stereotruth.epipolar.image_reader import Source
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rectify import rectify, rectify_image
+from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import Points, PointStore
+from stereotruth.lidar.projection_polynomials import PatchedTransform
+from stereotruth.products.grids import Layer, require_complete
+from stereotruth.products.resumable_grids import making
 from stereotruth.simulate.cities import CITIES, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -298,7 +301,9 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         ):
             clock, used = fastest(call, 1)
             seconds[name], cpu[name] = min(seconds[name], clock), min(cpu[name], used)
-    start_up = fastest(lambda: job("import stereotruth.points, stereotruth.runlog", env=env), 3)[1]
+    start_up = fastest(lambda: job("import stereotruth.lidar.ingest, stereotruth.job", env=env), 3)[
+        1
+    ]
     total = seconds["ingest"] + seconds["project"]
     profiles = {}
     if arguments.profile:

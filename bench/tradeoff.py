@@ -28,9 +28,9 @@ from accuracy import (
 )
 from matplotlib.figure import Figure
 
-from stereotruth.disparity import SHARD, project_scene
+from stereotruth.disparity.project import SHARD, project_scene
 from stereotruth.errors import InputError
-from stereotruth.evaluation.truth import (
+from stereotruth.evaluation.labels_against_truth import (
     ByClass,
     Labels,
     Truth,
@@ -38,7 +38,8 @@ from stereotruth.evaluation.truth import (
     open_truth,
     status_names,
 )
-from stereotruth.grid_store import blocks, replacing, require_complete
+from stereotruth.products.files import replacing
+from stereotruth.products.grids import blocks, require_complete
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
 # name: occlusion method, representative, thresholds of the correlation (None: it takes none)
@@ -70,7 +71,7 @@ def measure(
     result = ByClass()
     with tempfile.TemporaryDirectory(dir=made.exact) as folder:
         out = Path(folder) / "disparity.zarr"
-        with patch("stereotruth.disparity.blocks", lambda *_: list(windows)):
+        with patch("stereotruth.disparity.project.blocks", lambda *_: list(windows)):
             project_scene(made.left, made.right, made.points, out, **settings, workers=workers)
         store = require_complete(out)
         true = open_truth(truth, store.attrs["epipolar"])

@@ -20,21 +20,21 @@ from typing import Any
 import numpy as np
 import rasterio
 
-from stereotruth.alignment import align
-from stereotruth.epipolar import EpipolarModel
-from stereotruth.evaluation.grid_truth import truth_window
-from stereotruth.evaluation.statistics import ErrorSum
-from stereotruth.figures import colours, stretch
-from stereotruth.grid_store import Layer, blocks, building, create_grid, require_complete
-from stereotruth.matching.blocks import match
-from stereotruth.matching.heights import Raster, write_dsm
+from stereotruth.alignment.align import align
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.error_statistics import ErrorSum
+from stereotruth.evaluation.epipolar_truth import truth_window
+from stereotruth.matching.benchmark.predictions import peak_memory_mb
 from stereotruth.matching.methods import make_method
-from stereotruth.matching.predictions import peak_memory_mb
-from stereotruth.matching.scenes import predict_scene
-from stereotruth.rectification import rectify
+from stereotruth.matching.scenes.predict_scene import predict_scene
+from stereotruth.matching.scenes.surface_model import Raster, write_dsm
+from stereotruth.matching.scenes.whole_images import match
+from stereotruth.products.grids import Layer, blocks, building, create_grid, require_complete
+from stereotruth.products.pictures import colours, stretch
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
+from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.kernels import kernel
-from stereotruth.simulate.points import simulate_points
 from stereotruth.simulate.render import prepare, simulate_image
 from stereotruth.simulate.surfaces import IN_IMAGES, cast
 

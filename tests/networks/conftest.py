@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.matching.layouts import StereoDataset
+from stereotruth.dataset.stereo_dataset import StereoDataset
 
 SIZE, RANGE = 64, (-16, 16)
 SHARED = Path(__file__).parents[3] / "shared" / "published"

@@ -10,10 +10,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from torch.utils.data import DataLoader
 
+from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.data import Augmentation, LabelledPairs
-from stereotruth.matching.layouts import StereoDataset, read_image
-from stereotruth.matching.networks import scaled
+from stereotruth.matching.networks.image_scaling import scaled
+from stereotruth.matching.networks.training_pairs import Augmentation, LabelledPairs
+from stereotruth.products.rasters import read_image
 
 from .conftest import SIZE
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-
-from stereotruth.matching import layers
+from stereotruth.matching.networks import layers
 
 
 @pytest.mark.parametrize("low, high", [(-3, 4), (-12, -2), (2, 15)])

@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
-from stereotruth.matching.layouts import StereoDataset
+from stereotruth.dataset.stereo_dataset import StereoDataset
 
 from ..workflow.conftest import Project, copy_project
 from .conftest import RANGE

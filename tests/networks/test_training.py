@@ -15,22 +15,26 @@ from pathlib import Path
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
+from stereotruth.matching.networks import training_state
+
 pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
+from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching import training as module
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.matching.networks import Model, load_model, save_model
-from stereotruth.matching.training import Training, loss_of, start, train
+from stereotruth.matching.networks.losses import loss_of
+from stereotruth.matching.networks.training import train
+from stereotruth.matching.networks.training_settings import TrainingSettings
+from stereotruth.matching.networks.training_state import start
+from stereotruth.matching.networks.weights import SavedNetwork, load_weights, save_weights
 
 from .conftest import RANGE
 
-MODEL = Model("stereonet", RANGE)
-SHORT = Training(epochs=2, crop_px=(32, 64), device="cpu", threads=1, seed=4)
+MODEL = SavedNetwork("stereonet", RANGE)
+SHORT = TrainingSettings(epochs=2, crop_px=(32, 64), device="cpu", threads=1, seed=4)
 
 
 def weights(out: Path) -> dict[str, torch.Tensor]:
-    return load_model(out / "best.pt")[1].state_dict()
+    return load_weights(out / "best.pt")[1].state_dict()
 
 
 def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -50,7 +54,7 @@ def test_the_loss_counts_labelled_pixels_only() -> None:
 
 
 def test_the_learning_rate_is_halved_every_ten_epochs() -> None:
-    rates = [module._learning_rate(Training(), epoch) for epoch in (0, 9, 10, 25)]
+    rates = [training_state.learning_rate_of(TrainingSettings(), epoch) for epoch in (0, 9, 10, 25)]
     assert rates == [1e-3, 1e-3, 5e-4, 2.5e-4]
 
 
@@ -68,7 +72,7 @@ def test_training_lowers_the_loss_and_keeps_the_best(
     assert summary["best"]["epoch"] == int(best["epoch"])
     assert json.loads((out / "training.json").read_text())["best"] == summary["best"]
     assert summary["parameters"] == 621380 and summary["pairs"] == {"train": 3, "val": 1}
-    assert load_model(out / "best.pt")[2]["code"] == "x"
+    assert load_weights(out / "best.pt")[2]["code"] == "x"
     assert (out / "curves.png").stat().st_size > 1000
 
 
@@ -151,10 +155,10 @@ def test_a_dataset_of_any_range_can_be_trained_on(
     dataset: StereoDataset, tmp_path: Path, initial: bool
 ) -> None:
     path = tmp_path / "first.pt"
-    save_model(path, MODEL, MODEL.build(), {})
+    save_weights(path, MODEL, MODEL.build(), {})
     given = replace(SHORT, epochs=1, initial_weights=str(path) if initial else None)
     odd = replace(dataset, disparity_range=(-7, 10))
-    model = module.model_of("stereonet", odd, given)
+    model = training_state.model_of("stereonet", odd, given)
     assert model.disparity_range == (-8, 16)
     assert train(model, odd, tmp_path / "net", given)["model"]["disparity_range"] == (-8, 16)
 
@@ -164,7 +168,7 @@ def test_frozen_parts_keep_their_weights_and_statistics(
 ) -> None:
     torch.manual_seed(8)
     network = MODEL.build()
-    save_model(tmp_path / "first.pt", MODEL, network, {})
+    save_weights(tmp_path / "first.pt", MODEL, network, {})
     given = replace(
         SHORT, epochs=1, initial_weights=str(tmp_path / "first.pt"), frozen=("features",)
     )
@@ -184,18 +188,20 @@ def test_several_processes_share_each_step(dataset: StereoDataset, tmp_path: Pat
 
 def test_mistakes_are_named(dataset: StereoDataset, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="unknown keys epoch"):
-        Training.of({"epoch": 3})
+        TrainingSettings.of({"epoch": 3})
     with pytest.raises(InputError, match=r"crop_px \[30, 64\]: no multiples of 8 px"):
         train(MODEL, dataset, tmp_path / "net", replace(SHORT, crop_px=(30, 64)))
     with pytest.raises(InputError, match="no epoch was done"):
         train(MODEL, dataset, tmp_path / "net", replace(SHORT, epochs=0))
-    save_model(tmp_path / "p.pt", Model("psmnet", RANGE), Model("psmnet", RANGE).build(), {})
+    save_weights(
+        tmp_path / "p.pt", SavedNetwork("psmnet", RANGE), SavedNetwork("psmnet", RANGE).build(), {}
+    )
     with pytest.raises(InputError, match="weights of psmnet with 1 channels, not of stereonet"):
         start(MODEL, replace(SHORT, initial_weights=str(tmp_path / "p.pt")))
 
 
 def test_settings_of_a_method_precede_the_general_ones() -> None:
-    made = Training.of(
+    made = TrainingSettings.of(
         {"epochs": 120, "crop_px": [64, 64], "augmentation": {"noise": 0.1}}, {"epochs": 3}
     )
     assert (made.epochs, made.crop_px, made.augmentation.noise) == (3, (64, 64), 0.1)

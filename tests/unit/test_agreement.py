@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.agreement import outvoted, supported, surface_correlation, warp_to_left
-from stereotruth.patches import read_patch
+from stereotruth.disparity.image_agreement import (
+    outvoted,
+    supported,
+    surface_correlation,
+    warp_to_left,
+)
+from stereotruth.disparity.image_patches import read_patch
 
 LEVEL = np.zeros((2, 80, 80))
 

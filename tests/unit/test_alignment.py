@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereotruth.alignment import RPC_SHIFT, Alignment, align, from_rpcs
-from stereotruth.alignment_report import write_alignment
-from stereotruth.control_points import COLUMNS, read_gcps
+from stereotruth.alignment.align import RPC_SHIFT, align, from_rpcs
+from stereotruth.alignment.align_report import write_alignment
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.control_points import COLUMNS, read_gcps
+from stereotruth.alignment.robust_fit import System, find_blunders
+from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.errors import InputError
-from stereotruth.robust_fit import System, find_blunders
-from stereotruth.rpc import RPC, SensorModel
 
 SHARED = Path(__file__).parents[3] / "shared"
 MARSEILLE = SHARED / "real" / "marseille"

@@ -12,11 +12,12 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.audit import run, sharing
-from stereotruth.audit.estimates import Estimate
-from stereotruth.audit.verdicts import FAULT, GOOD, Limits, judge
+from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.layouts import StereoDataset
+from stereotruth.evaluation.audit import audit, sharing
+from stereotruth.evaluation.audit import audit as run
+from stereotruth.evaluation.audit.estimates import Estimate
+from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits, judge
 
 from .audit_scene import make, sample, texture
 
@@ -83,7 +84,7 @@ def audited(tmp_path_factory):
     same.right = same.left
     add(root, 12, same)
     out = root / "audit" / "mine"
-    summary = run.audit(dataset(root), out, LIMITS, work=root / "work", worst=3, workers=2)
+    summary = audit.audit(dataset(root), out, LIMITS, work=root / "work", worst=3, workers=2)
     return root, out, summary
 
 
@@ -157,21 +158,21 @@ def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run, "measure", killed)
     with pytest.raises(KeyboardInterrupt):
-        run.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+        audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
     assert not out.exists()
     seen.clear()
     monkeypatch.setattr(run, "measure", lambda of, p: (seen.append(p.name), whole(of, p))[1])
-    summary = run.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+    summary = audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
     assert len(seen) == 1
     assert summary["verdicts"][GOOD] == 3 and not summary["shared"]
     seen.clear()
     strict = replace(LIMITS, parallax_px=0.001)
     work = tmp_path / "work"
-    assert run.audit(dataset(root), out, strict, work=work)["verdicts"][GOOD] < 3
-    run.audit(dataset(root), out, LIMITS, work=work, worst=1)
+    assert audit.audit(dataset(root), out, strict, work=work)["verdicts"][GOOD] < 3
+    audit.audit(dataset(root), out, LIMITS, work=work, worst=1)
     assert not seen
     fresh = {"work": tmp_path / "fresh", "worst": 1, "workers": 2}
-    again = run.audit(dataset(root), tmp_path / "again", LIMITS, **fresh)
+    again = audit.audit(dataset(root), tmp_path / "again", LIMITS, **fresh)
     assert again == summary
     for file in out.iterdir():
         assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes(), file.name
@@ -181,7 +182,7 @@ def test_pairs_without_labels(tmp_path):
     scene = make(50, shift=(0.0, 0.6))
     write(tmp_path / "KM_left_1.tiff", scene.left)
     write(tmp_path / "KM_right_1.tiff", scene.right)
-    run.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+    audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
     rows, summary = read(tmp_path / "out")
     assert rows["KM_1"]["verdict"] == FAULT and "vertical parallax" in rows["KM_1"]["faults"]
     assert summary["labelled_pairs"] == 0
@@ -192,7 +193,7 @@ def test_files_that_do_not_fit_and_empty_images(tmp_path):
     add(tmp_path, 1, scene, labels=scene.labels[:-5])
     scene.right[:] = 7
     add(tmp_path, 2, scene)
-    run.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+    audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
     rows, _ = read(tmp_path / "out")
     assert "differ in size" in rows["KM_1"]["faults"]
     assert "the right image is empty" in rows["KM_2"]["faults"]
@@ -203,7 +204,7 @@ def test_an_unreadable_file_is_named(tmp_path):
     add(tmp_path, 1, scene)
     (tmp_path / "test/left/KM_left_1.tiff").write_bytes(b"no image")
     with pytest.raises(InputError, match="KM_left_1"):
-        run.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+        audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
 
 
 def overlapping(shift, seed, angle=0.0):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.audit import conventions, hidden, registration
-from stereotruth.audit.contradiction import scan_labels
-from stereotruth.audit.estimates import Estimate, cells, location, ratio, robust_fit
-from stereotruth.audit.matches import Matches, grey, label_offsets, match_pair, smooth
-from stereotruth.audit.pair import estimate, measure_arrays
+from stereotruth.evaluation.audit import conventions, hidden, registration
+from stereotruth.evaluation.audit.contradiction import scan_labels
+from stereotruth.evaluation.audit.estimates import Estimate, cells, location, ratio, robust_fit
+from stereotruth.evaluation.audit.matches import Matches, grey, label_offsets, match_pair, smooth
+from stereotruth.evaluation.audit.pair import estimate, measure_arrays
 
 from .audit_scene import BLOCK, HEIGHT_PX, make, sample, texture
 

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
+from stereotruth.dataset.stereo_dataset import Pair, StereoDataset, find_pairs
 from stereotruth.errors import InputError
-from stereotruth.matching import panels, paper
-from stereotruth.matching.benchmark import choose, describe, score
-from stereotruth.matching.comparison import compare
-from stereotruth.matching.layouts import Pair, StereoDataset, find_pairs
-from stereotruth.matching.panels import Column, draw_columns, error_picture
-from stereotruth.matching.predictions import predict
-from stereotruth.matching.tables import make_tables, read_scores
+from stereotruth.matching.benchmark import panels, published_scores
+from stereotruth.matching.benchmark.compare_methods import compare
+from stereotruth.matching.benchmark.panels import Column, draw_columns, error_picture
+from stereotruth.matching.benchmark.predictions import predict
+from stereotruth.matching.benchmark.score_method import choose, describe, score
+from stereotruth.matching.benchmark.tables import make_tables, read_scores
 
 from ..browser import look, needs_chromium
 from .test_layouts import write
@@ -174,7 +174,7 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels():
         "Net: EPE (px)",
         "Tuned: EPE (px)",
     ]
-    assert seven.rows[1]["paper_epe_px"] == paper.TABLE7["Kunming"]["stereonet"][0]
+    assert seven.rows[1]["paper_epe_px"] == published_scores.TABLE7["Kunming"]["stereonet"][0]
     methods.append(summary("again", "stereonet", cities, fine_tuned_of="net"))
     _, _, both, _ = make_tables(methods, [], beside_paper=False)
     names = [name.partition(":")[0] for name in both.shown[0][1] if "EPE" in name]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.block_store import making
-from stereotruth.grid_store import Layer, Strip, blocks, open_grid
+from stereotruth.products.grids import Layer, Strip, blocks, open_grid
+from stereotruth.products.resumable_grids import making
 
 SHAPE = (70, 100)
 LAYERS = {

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.matching.blocks import Tiling, blend, match, view_of
-from stereotruth.matching.offsets import best_offset, find_offsets, reduced
+from stereotruth.matching.scenes.offsets import best_offset, find_offsets, reduced
+from stereotruth.matching.scenes.scene_tiles import blend
+from stereotruth.matching.scenes.tiling import Tiling, view_of
+from stereotruth.matching.scenes.whole_images import match
 from stereotruth.matching.sgm import SemiGlobalMatcher
 
 SHAPE = (150, 230)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.correlation import correlate
-from stereotruth.patches import read_patch
-from stereotruth.pixel_points import Collection
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.paper_correlation import correlate
+from stereotruth.disparity.pixel_points import Collection
 
 SHAPE = (120, 160)
 ROWS, COLS = slice(-6, 130), slice(-6, 180)

@@ -12,9 +12,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from stereotruth import crs
 from stereotruth.errors import InputError
-from stereotruth.points import read_header
+from stereotruth.lidar import declared_crs, geoid, to_wgs84
+from stereotruth.lidar.las_files import read_header
 
 SHARED = Path(__file__).parents[3] / "shared"
 FT, US_FT = 0.3048, 1200 / 3937
@@ -77,7 +77,7 @@ def undulations(west: float, south: float, step: float, shape: tuple[int, int]) 
     ],
 )
 def test_lidar_crs_is_epsg_compound_or_wkt(text, horizontal, datum) -> None:
-    system = crs.parse_crs(text)
+    system = declared_crs.parse_crs(text)
     assert system.horizontal.to_epsg() == horizontal
     assert system.vertical_datum == datum
     assert not system.ellipsoidal
@@ -88,7 +88,7 @@ def test_lidar_crs_is_epsg_compound_or_wkt(text, horizontal, datum) -> None:
 )
 def test_unusable_lidar_crs_is_refused_by_name(text) -> None:
     with pytest.raises(InputError, match="lidar_crs"):
-        crs.parse_crs(text)
+        declared_crs.parse_crs(text)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_unusable_lidar_crs_is_refused_by_name(text) -> None:
     ],
 )
 def test_wkt_says_unit_and_surface_of_heights(wkt, datum, ellipsoidal, height_unit) -> None:
-    system, problems = crs.header_crs(header_of(wkt))
+    system, problems = declared_crs.header_crs(header_of(wkt))
     assert not problems
     assert system.vertical_datum == datum
     assert system.ellipsoidal == ellipsoidal
@@ -135,7 +135,7 @@ def test_wkt_says_unit_and_surface_of_heights(wkt, datum, ellipsoidal, height_un
 
 def test_depths_are_refused() -> None:
     vertical = 'VERT_CS["d",VERT_DATUM["Mean Sea Level",2005],UNIT["metre",1],AXIS["Depth",DOWN]]'
-    system, problems = crs.header_crs(header_of(f'COMPD_CS["c",{UTM_WKT1},{vertical}]'))
+    system, problems = declared_crs.header_crs(header_of(f'COMPD_CS["c",{UTM_WKT1},{vertical}]'))
     assert system is None
     assert "point down" in problems[0]
 
@@ -164,7 +164,7 @@ def test_geokeys_say_the_same(keys, horizontal_unit, datum, ellipsoidal, height_
     keys = dict(keys)
     keys.setdefault(1024, 1)
     header = header_of(keys=[(key, 0, 1, value) for key, value in keys.items()], wkt_bit=False)
-    system, problems = crs.header_crs(header)
+    system, problems = declared_crs.header_crs(header)
     assert not problems
     if horizontal_unit is not None:
         assert system.horizontal_unit_m == pytest.approx(horizontal_unit, rel=1e-12)
@@ -178,16 +178,16 @@ def test_geokeys_say_the_same(keys, horizontal_unit, datum, ellipsoidal, height_
 )
 def test_geokeys_without_a_system_are_none(keys) -> None:
     with pytest.raises(InputError, match="lidar_crs") as refused:
-        crs.resolve(header_of(keys=keys, wkt_bit=False), None, "a.laz")
+        declared_crs.resolve(header_of(keys=keys, wkt_bit=False), None, "a.laz")
     assert "a.laz" in str(refused.value)
 
 
 def test_the_header_bit_decides_between_wkt_and_geokeys() -> None:
     keys = [(1024, 0, 1, 1), (3072, 0, 1, 26911)]
-    by_wkt, _ = crs.header_crs(header_of(UTM_WKT1, keys, wkt_bit=True))
-    by_keys, _ = crs.header_crs(header_of(UTM_WKT1, keys, wkt_bit=False))
+    by_wkt, _ = declared_crs.header_crs(header_of(UTM_WKT1, keys, wkt_bit=True))
+    by_keys, _ = declared_crs.header_crs(header_of(UTM_WKT1, keys, wkt_bit=False))
     assert (by_wkt.horizontal.to_epsg(), by_keys.horizontal.to_epsg()) == (32610, 26911)
-    with_vertical, _ = crs.header_crs(header_of(UTM_WKT1, [*keys, (4096, 0, 1, 5703)]))
+    with_vertical, _ = declared_crs.header_crs(header_of(UTM_WKT1, [*keys, (4096, 0, 1, 5703)]))
     assert with_vertical.vertical_datum == "NAVD88 height"
 
 
@@ -200,7 +200,7 @@ def test_wkt_in_an_extended_record(tmp_path) -> None:
     las.write(tmp_path / "a.laz")
     header = read_header(tmp_path / "a.laz")
     assert not any(record.user_id == "LASF_Projection" for record in header.vlrs)
-    assert crs.header_crs(header)[0].horizontal.to_epsg() == 32610
+    assert declared_crs.header_crs(header)[0].horizontal.to_epsg() == 32610
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="shared real files are absent")
@@ -210,7 +210,7 @@ def test_user_defined_geokeys_agree_with_wkt_on_a_real_file() -> None:
     transformers = []
     for wkt_bit in (False, True):
         header.global_encoding.wkt = wkt_bit
-        system, _ = crs.header_crs(header)
+        system, _ = declared_crs.header_crs(header)
         assert system.horizontal_unit_m == pytest.approx(FT)
         transformers.append(
             pyproj.Transformer.from_crs(system.horizontal, "EPSG:4326", always_xy=True)
@@ -223,27 +223,27 @@ def test_user_defined_geokeys_agree_with_wkt_on_a_real_file() -> None:
 
 
 def test_the_file_wins_over_lidar_crs_and_says_so() -> None:
-    system, notes = crs.resolve(header_of(UTM_WKT1), "EPSG:32611", "a.laz")
+    system, notes = declared_crs.resolve(header_of(UTM_WKT1), "EPSG:32611", "a.laz")
     assert system.horizontal.to_epsg() == 32610
     assert any("lidar_crs" in note and "WGS 84 / UTM zone 11N" in note for note in notes)
-    _, notes = crs.resolve(header_of(UTM_WKT1), "EPSG:32610", "a.laz")
+    _, notes = declared_crs.resolve(header_of(UTM_WKT1), "EPSG:32610", "a.laz")
     assert notes == []
 
 
 def test_lidar_crs_supplies_the_vertical_part_that_a_file_lacks() -> None:
     without_codes = pyproj.CRS("EPSG:2154").to_wkt("WKT1_GDAL").replace('"2154"', '"0"')
     header = header_of(without_codes, low=(700000, 6600000, 0))
-    system, notes = crs.resolve(header, "EPSG:2154+5720", "a.laz")
+    system, notes = declared_crs.resolve(header, "EPSG:2154+5720", "a.laz")
     assert system.vertical_datum == "NGF-IGN69 height"
     assert any("NGF-IGN69" in note for note in notes)
 
 
 def test_unreadable_wkt_falls_back_to_lidar_crs() -> None:
-    system, notes = crs.resolve(header_of("PROJCS[broken"), "EPSG:32610", "a.laz")
+    system, notes = declared_crs.resolve(header_of("PROJCS[broken"), "EPSG:32610", "a.laz")
     assert system.horizontal.to_epsg() == 32610
     assert any("WKT" in note for note in notes)
     with pytest.raises(InputError, match="WKT cannot be used"):
-        crs.resolve(header_of("PROJCS[broken"), None, "a.laz")
+        declared_crs.resolve(header_of("PROJCS[broken"), None, "a.laz")
 
 
 # ------------------------------------------------------------------ geoid grids
@@ -257,7 +257,7 @@ def test_geoid_is_bilinear_as_in_proj(tmp_path, west) -> None:
     rng = np.random.default_rng(1)
     lon, lat = rng.uniform(-124, -121, 5000), rng.uniform(43, 45, 5000)
     lon[:4], lat[:4] = [-124, -121, -124, -121], [43, 43, 45, 45]  # the outermost nodes
-    ours = crs.GeoidGrid(grid)(lon, lat)
+    ours = geoid.GeoidGrid(grid)(lon, lat)
     proj = pyproj.Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
         f"+step +proj=vgridshift +grids={grid} +multiplier=1 "
@@ -272,7 +272,7 @@ def test_geoid_is_bilinear_as_in_proj(tmp_path, west) -> None:
 def test_global_geoid_has_no_seam(tmp_path) -> None:
     step = 0.5
     values = 30 * np.sin(np.radians(np.arange(720) * step)) * np.ones((361, 1))
-    grid = crs.GeoidGrid(write_gtx(tmp_path / "g.gtx", values, 0.0, -90.0, step))
+    grid = geoid.GeoidGrid(write_gtx(tmp_path / "g.gtx", values, 0.0, -90.0, step))
     lon = np.array([-0.25, 0.25, 359.75, 180.0, -180.0, 179.75, -179.75])
     expected = 30 * np.sin(np.radians(lon))
     np.testing.assert_allclose(grid(lon, np.zeros(7)), expected, atol=2e-3)  # chord of 0.5°
@@ -281,11 +281,11 @@ def test_global_geoid_has_no_seam(tmp_path) -> None:
 
 def test_geoid_reads_more_rows_as_chunks_ask(tmp_path) -> None:
     values = undulations(0.0, 40.0, 0.1, (101, 51))
-    grid = crs.GeoidGrid(write_gtx(tmp_path / "g.gtx", values, 0.0, 40.0, 0.1))
+    grid = geoid.GeoidGrid(write_gtx(tmp_path / "g.gtx", values, 0.0, 40.0, 0.1))
     lon, lat = np.full(200, 1.23), np.linspace(40, 50, 200)
     order = np.random.default_rng(0).permutation(200)
     one_by_one = np.array([grid(lon[k : k + 1], lat[k : k + 1])[0] for k in order])
-    at_once = crs.GeoidGrid(grid.path)(lon, lat)
+    at_once = geoid.GeoidGrid(grid.path)(lon, lat)
     np.testing.assert_array_equal(one_by_one, at_once[order])
 
 
@@ -294,7 +294,7 @@ def test_points_without_undulation_are_refused(tmp_path, problem) -> None:
     values = undulations(10.0, 40.0, 0.1, (11, 11))
     if problem == "nodata":
         values[5, 5] = np.nan
-    grid = crs.GeoidGrid(write_gtx(tmp_path / "small.gtx", values, 10.0, 40.0, 0.1))
+    grid = geoid.GeoidGrid(write_gtx(tmp_path / "small.gtx", values, 10.0, 40.0, 0.1))
     lon = np.array([10.1, 10.51 if problem == "nodata" else 11.2])
     with pytest.raises(InputError, match=r"small\.gtx.* 1 points|1 points .*small\.gtx"):
         grid(lon, np.array([40.1, 40.51]))
@@ -320,8 +320,8 @@ def geotiff(path: Path, values: np.ndarray, system: str, scale: float = 1.0) -> 
 
 def test_geotiff_grid_with_scale(tmp_path) -> None:
     values = np.round(undulations(10.0, 40.0, 0.1, (11, 11))[::-1], 2)
-    plain = crs.GeoidGrid(geotiff(tmp_path / "a.tif", values, "EPSG:4326"))
-    scaled = crs.GeoidGrid(geotiff(tmp_path / "b.tif", values, "EPSG:4326", scale=0.01))
+    plain = geoid.GeoidGrid(geotiff(tmp_path / "a.tif", values, "EPSG:4326"))
+    scaled = geoid.GeoidGrid(geotiff(tmp_path / "b.tif", values, "EPSG:4326", scale=0.01))
     lon, lat = np.array([10.0, 10.33, 11.0]), np.array([41.0, 40.77, 40.0])
     np.testing.assert_allclose(plain(lon[[0, 2]], lat[[0, 2]]), [values[0, 0], values[-1, -1]])
     np.testing.assert_allclose(plain(lon, lat), scaled(lon, lat), atol=0.011)
@@ -333,15 +333,15 @@ def test_geotiff_grid_with_scale(tmp_path) -> None:
 def test_grids_of_other_kinds_are_refused(tmp_path, system, reason) -> None:
     grid = geotiff(tmp_path / "a.tif", np.zeros((11, 11)), system)
     with pytest.raises(InputError, match=reason):
-        crs.GeoidGrid(grid)
+        geoid.GeoidGrid(grid)
 
 
 def test_missing_or_broken_grid_is_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"none\.gtx"):
-        crs.GeoidGrid(tmp_path / "none.gtx")
+        geoid.GeoidGrid(tmp_path / "none.gtx")
     (tmp_path / "bad.gtx").write_bytes(b"not a grid")
     with pytest.raises(InputError, match=r"bad\.gtx"):
-        crs.GeoidGrid(tmp_path / "bad.gtx")
+        geoid.GeoidGrid(tmp_path / "bad.gtx")
 
 
 # ------------------------------------------------------------------ the transformation
@@ -358,7 +358,7 @@ def oregon_truth() -> tuple[float, float]:
 @pytest.mark.parametrize(("code", "unit"), [(2991, 1.0), (2992, FT), (3643, 1.0), (3644, FT)])
 def test_feet_and_metres_are_the_same_place(code, unit) -> None:
     low = tuple(value / unit for value in LOW)
-    transform = crs.to_wgs84(header_of(pyproj.CRS(code).to_wkt(), low=low), "a.las")
+    transform = to_wgs84.to_wgs84(header_of(pyproj.CRS(code).to_wkt(), low=low), "a.las")
     lon, lat, height = transform(X / unit, Y / unit, Z / unit)
     np.testing.assert_allclose([lon, lat], oregon_truth(), rtol=0, atol=2e-9)
     np.testing.assert_allclose(height, Z, atol=1e-6)
@@ -371,9 +371,9 @@ def test_compound_of_metres_and_survey_feet_with_a_geoid(tmp_path) -> None:
     horizontal = pyproj.CRS("EPSG:2991").to_wkt("WKT1_GDAL")
     header = header_of(f'COMPD_CS["c",{horizontal},{NAVD88_FTUS}]', low=LOW)
     with pytest.raises(InputError, match=r"NAVD88.*geoid") as refused:
-        crs.to_wgs84(header, "bmx.las")
+        to_wgs84.to_wgs84(header, "bmx.las")
     assert "bmx.las" in str(refused.value)
-    transform = crs.to_wgs84(header, "bmx.las", geoid=geoid)
+    transform = to_wgs84.to_wgs84(header, "bmx.las", geoid=geoid)
     lon, lat, height = transform(X, Y, Z / US_FT)
     np.testing.assert_allclose([lon, lat], oregon_truth(), rtol=0, atol=2e-9)
     np.testing.assert_allclose(height, Z - 22.5, atol=1e-5)
@@ -383,7 +383,7 @@ def test_compound_of_metres_and_survey_feet_with_a_geoid(tmp_path) -> None:
 def test_declared_ellipsoidal_heights_take_no_geoid(tmp_path) -> None:
     geoid = write_gtx(tmp_path / "g.gtx", np.full((31, 31), -22.5), -124.0, 43.0, 0.1)
     header = header_of(UTM.to_3d().to_wkt())
-    transform = crs.to_wgs84(header, "a.laz", geoid=geoid)
+    transform = to_wgs84.to_wgs84(header, "a.laz", geoid=geoid)
     assert transform(np.array([5e5]), np.array([4.85e6]), Z)[2] == pytest.approx(Z)
     assert any("not applied" in note for note in transform.notes)
 
@@ -391,7 +391,7 @@ def test_declared_ellipsoidal_heights_take_no_geoid(tmp_path) -> None:
 def test_geoid_makes_undeclared_heights_orthometric(tmp_path) -> None:
     geoid = write_gtx(tmp_path / "g.gtx", np.full((31, 31), -22.5), -124.0, 43.0, 0.1)
     header = header_of(UTM.to_wkt())
-    assert crs.to_wgs84(header, "a.laz", geoid=geoid)(np.array([5e5]), np.array([4.85e6]), Z)[
+    assert to_wgs84.to_wgs84(header, "a.laz", geoid=geoid)(np.array([5e5]), np.array([4.85e6]), Z)[
         2
     ] == pytest.approx(Z - 22.5)
 
@@ -399,14 +399,14 @@ def test_geoid_makes_undeclared_heights_orthometric(tmp_path) -> None:
 def test_a_datum_in_the_file_name_needs_the_geoid() -> None:
     header = header_of(UTM.to_wkt())
     with pytest.raises(InputError, match="IGN69"):
-        crs.to_wgs84(header, "LHD_FXX_0382_6565_PTS_O_LAMB93_IGN69.copc.laz")
-    crs.to_wgs84(header_of(UTM.to_3d().to_wkt()), "b_EGM96.laz")  # declared: no doubt
-    crs.to_wgs84(header, "designavd88x.laz")  # part of a word
+        to_wgs84.to_wgs84(header, "LHD_FXX_0382_6565_PTS_O_LAMB93_IGN69.copc.laz")
+    to_wgs84.to_wgs84(header_of(UTM.to_3d().to_wkt()), "b_EGM96.laz")  # declared: no doubt
+    to_wgs84.to_wgs84(header, "designavd88x.laz")  # part of a word
 
 
 def test_longitude_latitude_files() -> None:
     header = header_of(pyproj.CRS("EPSG:4979").to_wkt(), low=(114, 30, 0))
-    lon, lat, height = crs.to_wgs84(header, "a.laz")(
+    lon, lat, height = to_wgs84.to_wgs84(header, "a.laz")(
         np.array([114.1234567]), np.array([30.7654321]), Z
     )
     assert (lon[0], lat[0], height[0]) == pytest.approx((114.1234567, 30.7654321, 120), abs=1e-12)
@@ -415,13 +415,13 @@ def test_longitude_latitude_files() -> None:
 def test_degrees_in_a_projected_system_are_refused() -> None:
     header = header_of(UTM.to_wkt(), low=(-30, -40, 0))
     with pytest.raises(InputError, match="look like degrees"):
-        crs.to_wgs84(header, "a.laz")
+        to_wgs84.to_wgs84(header, "a.laz")
 
 
 def test_heights_follow_a_datum_shift() -> None:
     """3-D where both are 3-D: swisstopo's shift from CH1903 (Bessel) moves heights by 49.6 m."""
     header = header_of(pyproj.CRS("EPSG:21781").to_wkt(), low=(600000, 200000, 0))
-    transform = crs.to_wgs84(header, "a.laz")
+    transform = to_wgs84.to_wgs84(header, "a.laz")
     x, y = np.array([600000.0]), np.array([200000.0])
     lon, lat, height = transform(x, y, np.array([100.0]))
     # Bern: the translation (674.374, 15.056, 405.346), done by hand in geocentric coordinates
@@ -442,7 +442,7 @@ def test_geoid_heights_ignore_the_shift_of_an_old_datum(tmp_path) -> None:
     """N is above WGS 84: H + N is final, whatever ellipsoid the map coordinates are on."""
     geoid = write_gtx(tmp_path / "g.gtx", np.full((31, 31), 49.5), 6.0, 45.0, 0.1)
     header = header_of(pyproj.CRS("EPSG:21781").to_wkt(), low=(600000, 200000, 0))
-    height = crs.to_wgs84(header, "a.laz", geoid=geoid)(
+    height = to_wgs84.to_wgs84(header, "a.laz", geoid=geoid)(
         np.array([600000.0]), np.array([200000.0]), np.array([540.0])
     )[2]
     assert height == pytest.approx(589.5, abs=1e-5)
@@ -455,32 +455,32 @@ def test_the_datum_of_the_geoid_decides_about_the_shift(tmp_path, name) -> None:
     geoid = write_gtx(tmp_path / f"{name}.gtx", values, -124.0, 43.0, 0.1)
     header = header_of(pyproj.CRS("EPSG:2993").to_wkt(), low=(200_000, 300_000, 0))
     x, y, z = np.array([200_000.0]), np.array([300_000.0]), np.array([100.0])
-    bare = crs.to_wgs84(header, "a.laz")(x, y, z)[2]
+    bare = to_wgs84.to_wgs84(header, "a.laz")(x, y, z)[2]
     assert 0.1 < abs(bare[0] - 100) < 1
     base = 100 if name == "egm96" else bare[0]
-    height = crs.to_wgs84(header, "a.laz", geoid=geoid)(x, y, z)[2]
+    height = to_wgs84.to_wgs84(header, "a.laz", geoid=geoid)(x, y, z)[2]
     assert height[0] == pytest.approx(base - 22.5, abs=1e-6)
 
 
 def test_ballpark_and_missing_grids_are_named() -> None:
-    beijing = crs.to_wgs84(
+    beijing = to_wgs84.to_wgs84(
         header_of(pyproj.CRS("EPSG:2436").to_wkt(), low=(500000, 3400000, 0)), "a.laz"
     )
     assert beijing.accuracy_m is None
     assert any("Beijing 1954" in note for note in beijing.notes)
-    british = crs.to_wgs84(
+    british = to_wgs84.to_wgs84(
         header_of(pyproj.CRS("EPSG:27700").to_wkt(), low=(400000, 300000, 0)), "a.laz"
     )
     assert any("OSTN15" in note for note in british.notes) or british.accuracy_m < 1.5
-    wgs84 = crs.to_wgs84(header_of(UTM.to_3d().to_wkt()), "a.laz")
+    wgs84 = to_wgs84.to_wgs84(header_of(UTM.to_3d().to_wkt()), "a.laz")
     assert (wgs84.accuracy_m, wgs84.notes) == (0.0, ())
 
 
 def test_points_far_from_the_area_of_their_system() -> None:
-    system = crs.parse_crs("EPSG:2154")
-    assert crs.check_area(system, (2.0, 2.1), (47.0, 47.1), "a.laz") is None
-    assert "Lambert-93" in crs.check_area(system, (2.0, 2.1), (38.0, 38.1), "a.laz")
+    system = declared_crs.parse_crs("EPSG:2154")
+    assert to_wgs84.check_area(system, (2.0, 2.1), (47.0, 47.1), "a.laz") is None
+    assert "Lambert-93" in to_wgs84.check_area(system, (2.0, 2.1), (38.0, 38.1), "a.laz")
     with pytest.raises(InputError, match="outside of the area"):
-        crs.check_area(system, (114.0, 114.1), (30.0, 30.1), "a.laz")
-    pacific = crs.parse_crs("EPSG:3832")  # its area crosses the antimeridian
-    assert crs.check_area(pacific, (179.0, 179.1), (-20.0, -19.9), "a.laz") is None
+        to_wgs84.check_area(system, (114.0, 114.1), (30.0, 30.1), "a.laz")
+    pacific = declared_crs.parse_crs("EPSG:3832")  # its area crosses the antimeridian
+    assert to_wgs84.check_area(pacific, (179.0, 179.1), (-20.0, -19.9), "a.laz") is None

@@ -9,7 +9,7 @@ import pyproj
 import pytest
 from pyproj.transformer import TransformerGroup
 
-from stereotruth.crs_patches import TOLERANCE_DEG, TOLERANCE_M, PatchedTransform
+from stereotruth.lidar.projection_polynomials import TOLERANCE_DEG, TOLERANCE_M, PatchedTransform
 
 
 def transformer(epsg: int) -> tuple[pyproj.Transformer, float]:

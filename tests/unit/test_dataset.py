@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.dataset import assemble_dataset
+from stereotruth.dataset.manifest import write_manifest
+from stereotruth.dataset.published_layout import assemble_dataset
+from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
-from stereotruth.tiles import write_manifest
-from stereotruth.verification import defects
 
 SPLITS = ["train", "train", "val", "test", "none", "unlabelled"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.matching.differences import difference, differences
+from stereotruth.matching.benchmark.differences import difference, differences
 
 FIELDS = ["tile", "labelled", "filled_epe_px", "filled_d1_3_px_share"]
 

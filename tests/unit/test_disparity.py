@@ -11,12 +11,16 @@ import pyproj
 import pytest
 import zarr
 
-from stereotruth.disparity import MAX_POINTS, Settings, Status, _Scene, project_scene
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.disparity.pixel_labels import RIDGE
+from stereotruth.disparity.project import MAX_POINTS, _Scene, project_scene
+from stereotruth.disparity.settings import Settings
+from stereotruth.disparity.status import Status
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, building, create_grid, open_grid
-from stereotruth.points import PointStore, ingest, query_points
-from stereotruth.representative import RIDGE
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore, query_points
+from stereotruth.products.grids import Layer, building, create_grid, open_grid
 
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from .test_points import tree_digest, write_las

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.errors import InputError
-from stereotruth.rpc import RPC, SensorModel, read_rpc
 
 SHARED = Path(__file__).parents[3] / "shared"
 MARSEILLE = SHARED / "real" / "marseille"

@@ -13,12 +13,15 @@ import rasterio
 import zarr
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth import grid_store
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.dataset import warped_tile
+from stereotruth.epipolar import warping
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.error_statistics import Calibration, ErrorSum, median_and_nmad
 from stereotruth.errors import InputError
-from stereotruth.evaluation import checkpoints, truth, warping
-from stereotruth.evaluation.statistics import Calibration, ErrorSum, median_and_nmad
-from stereotruth.rpc import SensorModel
+from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
+from stereotruth.products import grids
 
 from .test_alignment import LAT, LON, linear_rpc
 
@@ -64,7 +67,7 @@ def ground_at(left: SensorModel, col, row):
 
 
 def write_store(path: Path, layers: dict[str, np.ndarray], **attrs) -> Path:
-    with grid_store.building(path) as scratch:
+    with grids.building(path) as scratch:
         group = zarr.open_group(scratch, mode="w", zarr_format=3)
         group.attrs.update(attrs)
         for name, values in layers.items():
@@ -142,11 +145,11 @@ def write_disparity(
     }
     attrs = {"units": "px", "long_name": "see the name"}
     flags = {"flag_values": [0, 1, 2, 3], "flag_meanings": STATUSES}
-    with grid_store.building(path) as scratch:
-        arrays = grid_store.create_grid(
+    with grids.building(path) as scratch:
+        arrays = grids.create_grid(
             scratch,
             scene.model.shape,
-            {n: grid_store.Layer(d, f, attrs | flags) for n, (d, f, _) in layers.items()},
+            {n: grids.Layer(d, f, attrs | flags) for n, (d, f, _) in layers.items()},
             chunk=128,
             shard=256,
             attrs={"epipolar": scene.model.to_dict()},
@@ -219,8 +222,10 @@ def test_calibration_of_a_normal_distribution_and_of_another_by_decile():
 # -------------------------------------------------------------------------------------- truth
 
 
-def compared(scene: Scene, store: Path, workers: int = 2) -> truth.SceneComparison:
-    return truth.compare_scene(store, scene.truth, None, scene="S-1", workers=workers)
+def compared(scene: Scene, store: Path, workers: int = 2) -> labels_against_truth.SceneComparison:
+    return labels_against_truth.compare_scene(
+        store, scene.truth, None, scene="S-1", workers=workers
+    )
 
 
 def test_perfect_labels_have_no_error(scene, tmp_path):
@@ -244,10 +249,10 @@ def test_errors_are_those_of_the_alignment(scene, tmp_path):
     moved = np.array(scene.model.right_to_epipolar(*(at + np.array([0.3, -0.4])))) - before
     errors = compared(scene, store).whole.figures()["errors"]
     assert errors["bias"] == pytest.approx(-moved[0], abs=0.003)
-    disparity, parallax = truth.geometry_errors(wrong, scene.raw_truth, step=5)
+    disparity, parallax = labels_against_truth.geometry_errors(wrong, scene.raw_truth, step=5)
     assert disparity.figures()["bias"] == pytest.approx(-moved[0], abs=0.003)
     assert parallax.figures()["rms"] < 1e-3  # measured in the images, whatever the sensor says
-    disparity, parallax = truth.geometry_errors(scene.model, scene.raw_truth, step=5)
+    disparity, parallax = labels_against_truth.geometry_errors(scene.model, scene.raw_truth, step=5)
     assert disparity.figures()["max"] < 1e-6
     assert disparity.count > 4000
 
@@ -261,13 +266,15 @@ def test_counts_are_those_of_a_plain_loop(scene, tmp_path, monkeypatch):
     t = {n: a[:] for n, a in zarr.open_group(scene.truth, mode="r").arrays()}
     groups = ("visible", "hidden", "in_lidar_only", "in_images_only", "visible_lost",
               "hidden_bared")  # fmt: skip
-    counts = {(c, g, s): 0 for c in truth.CLASSES for g in groups for s in (True, False)}
-    errors = dict.fromkeys(truth.CLASSES, 0)
+    counts = {
+        (c, g, s): 0 for c in labels_against_truth.CLASSES for g in groups for s in (True, False)
+    }
+    errors = dict.fromkeys(labels_against_truth.CLASSES, 0)
     for y, x in np.ndindex(labels.shape):
         surface, edge = t["surface"][y, x], t["edge"][y, x]
         if not surface or not t["covered"][y, x]:
             continue
-        name = truth.CLASSES[surface]
+        name = labels_against_truth.CLASSES[surface]
         if edge == 1 and name in ("ground", "roof"):
             name = "roof_edge"
         elif edge == 2 and name == "ground":
@@ -283,7 +290,7 @@ def test_counts_are_those_of_a_plain_loop(scene, tmp_path, monkeypatch):
                 errors[name] += labelled and group == "visible"
 
     for block in (1024, 96):
-        monkeypatch.setattr(truth, "BLOCK", block)
+        monkeypatch.setattr(labels_against_truth, "BLOCK", block)
         result = compared(scene, store)
         classes = result.whole.figures()["surfaces"]
         assert classes.keys() == {"ground", "roof", "water", "roof_edge", "tree_edge"}
@@ -297,7 +304,7 @@ def test_counts_are_those_of_a_plain_loop(scene, tmp_path, monkeypatch):
         whole = result.whole.figures()
         for group in groups:
             expected = [
-                sum(counts[c, group, flag] for c in truth.CLASSES if c != "water")
+                sum(counts[c, group, flag] for c in labels_against_truth.CLASSES if c != "water")
                 for flag in (True, False)
             ]
             assert min(expected) > 100
@@ -351,8 +358,8 @@ def test_rule_writes_figures_of_scene_and_tiles(scene, tmp_path):
     store = write_disparity(scene, tmp_path / "disparity.zarr", labels)
     write_tile(tmp_path / "tiles", scene, labels)
     files = tmp_path / "out" / "truth.json", tmp_path / "out" / "truth.csv"
-    made = truth.MadeScene("S-1", store, scene.truth, tmp_path / "tiles")
-    truth.evaluate_truth("S-1", [made], *files, workers=2)
+    made = labels_against_truth.MadeScene("S-1", store, scene.truth, tmp_path / "tiles")
+    labels_against_truth.evaluate_truth("S-1", [made], *files, workers=2)
     figures = json.loads(files[0].read_text())
     assert figures["whole_scene"]["errors"]["mean_absolute"] < 1e-3
     assert figures["exported_tiles"]["labels"] == 128 * 118
@@ -371,7 +378,7 @@ def test_rule_writes_figures_of_scene_and_tiles(scene, tmp_path):
     (tmp_path / "other").mkdir()
     shifted = write_disparity(scene, tmp_path / "other" / "d.zarr", perfect_labels(scene) + 0.5)
     both = [made, replace(made, name="S-2", disparity=shifted)]
-    city = truth.evaluate_truth("S", both, *files).whole.figures()
+    city = labels_against_truth.evaluate_truth("S", both, *files).whole.figures()
     one = figures["whole_scene"]
     assert city["pixels"] == {group: 2 * n for group, n in one["pixels"].items()}
     two = city["errors"]["count"] - one["errors"]["count"]
@@ -381,16 +388,16 @@ def test_rule_writes_figures_of_scene_and_tiles(scene, tmp_path):
 def test_missing_and_unlike_stores_are_refused(scene, tmp_path):
     store = write_disparity(scene, tmp_path / "disparity.zarr", perfect_labels(scene))
     with pytest.raises(InputError, match="no such Zarr store"):
-        truth.compare_scene(store, tmp_path / "none.zarr", None, scene="S-1")
+        labels_against_truth.compare_scene(store, tmp_path / "none.zarr", None, scene="S-1")
     with pytest.raises(InputError, match="no truth store"):
-        truth.compare_scene(store, store, None, scene="S-1")
+        labels_against_truth.compare_scene(store, store, None, scene="S-1")
     with pytest.raises(InputError, match="no manifest"):
-        truth.compare_scene(store, scene.truth, tmp_path, scene="S-1")
+        labels_against_truth.compare_scene(store, scene.truth, tmp_path, scene="S-1")
     moved = replace(scene.model, left_image=scene.model.left_image.shifted(0.1, 0.0))
     other = scene._replace(model=moved)
     store = write_disparity(other, tmp_path / "moved.zarr", perfect_labels(scene))
     with pytest.raises(InputError, match="another epipolar model"):
-        truth.compare_scene(store, scene.truth, None, scene="S-1")
+        labels_against_truth.compare_scene(store, scene.truth, None, scene="S-1")
 
 
 # ------------------------------------------------------------------------------- check points
@@ -451,31 +458,31 @@ def test_warping_finds_the_left_image_again(scene, tmp_path):
     disparity[:, 50:60] = np.nan
     right_x = x  # right(x_r) = texture at the left position x with x − d(x) = x_r
     right = texture((right_x + 3.3) / 0.98, y)
-    layer = grid_store.Layer("uint16", 0, {"units": "DN", "long_name": "image"})
+    layer = grids.Layer("uint16", 0, {"units": "DN", "long_name": "image"})
     stores = []
     for name, image in (("left", texture(x, y)), ("right", right)):
-        with grid_store.building(tmp_path / f"{name}.zarr") as scratch:
-            arrays = grid_store.create_grid(
+        with grids.building(tmp_path / f"{name}.zarr") as scratch:
+            arrays = grids.create_grid(
                 scratch, shape, {"image": layer}, chunk=128, shard=256, attrs={}
             )
             arrays["image"][:] = np.rint(image).astype("uint16")
         stores.append(tmp_path / f"{name}.zarr")
     right_way = write_disparity(scene, tmp_path / "d.zarr", disparity)
-    figures = warping.evaluate_warping(*stores, right_way)
+    figures = scene_warping.evaluate_warping(*stores, right_way)
     assert figures["correlation"] > 0.9999
     assert figures["pixels"] > 0.9 * disparity.size * (shape[1] - 20) / shape[1]
     wrong_way = write_disparity(scene, tmp_path / "e.zarr", -disparity)
-    assert warping.evaluate_warping(*stores, wrong_way)["correlation"] < 0.9
+    assert scene_warping.evaluate_warping(*stores, wrong_way)["correlation"] < 0.9
 
     values = np.rint(texture(x, y))[:64, :64]
-    tile = warping.WarpedTile(
+    tile = warped_tile.WarpedTile(
         "T_1",
         values,
         warping.warp_rows(np.rint(right)[:64], (x - disparity)[:64, :64]),
         disparity[:64, :64],
     )
     assert tile.correlation > 0.9999
-    warping.draw_panels(tile, tmp_path / "panels" / "T_1.png")
+    scene_warping.draw_panels(tile, tmp_path / "panels" / "T_1.png")
     assert [p.name for p in (tmp_path / "panels").iterdir()] == ["T_1.png"]
 
 

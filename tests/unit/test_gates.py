@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.gates import FIGURES, NO_LIMITS, Limits, flag, missed
+from stereotruth.dataset.quality_limits import FIGURES, NO_LIMITS, Limits, flag, missed
 
 GOOD = {
     "gcp_rms_px": 0.4,

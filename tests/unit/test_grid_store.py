@@ -6,7 +6,8 @@ import xarray as xr
 import zarr
 
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, blocks, building, create_grid, open_grid, replacing
+from stereotruth.products.files import replacing
+from stereotruth.products.grids import Layer, blocks, building, create_grid, open_grid
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
 

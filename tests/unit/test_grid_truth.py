@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.epipolar import EpipolarModel, ImageModel
+from stereotruth.epipolar.model import EpipolarModel, ImageModel
+from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
-from stereotruth.evaluation.grid_truth import height_edges, truth_window, write_grid_truth
-from stereotruth.rpc import SensorModel
+from stereotruth.evaluation.epipolar_truth import height_edges, truth_window, write_grid_truth
 from stereotruth.simulate.camera import locate, project, rays
 from stereotruth.simulate.render import prepare
 from stereotruth.simulate.surfaces import terrain_heights

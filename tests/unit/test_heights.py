@@ -10,20 +10,21 @@ import pytest
 import rasterio
 from scipy.optimize import least_squares
 
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.intersection import intersect
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, building, create_grid
-from stereotruth.matching import heights
-from stereotruth.matching.heights import (
+from stereotruth.job import dask_scheduler
+from stereotruth.matching.scenes import surface_model
+from stereotruth.matching.scenes.surface_model import (
     Raster,
     default_resolution,
     gsd,
-    intersect,
     raster_of,
     utm_epsg,
     write_dsm,
 )
-from stereotruth.workers import dask_scheduler
+from stereotruth.products.grids import Layer, building, create_grid
 
 from .test_block_store import Killed
 from .test_epipolar import HEIGHT, LAT, LON, camera
@@ -184,9 +185,9 @@ def test_a_block_of_buildings_has_its_roofs_and_open_edges(model, tmp_path):
 
 def test_of_two_surfaces_over_a_cell_the_higher_one_counts():
     out = np.full((6, 6), np.nan, np.float32)
-    heights._triangle((0.0, 0.0, 5.0), (5.0, 0.0, 5.0), (0.0, 5.0, 5.0), out)
-    heights._triangle((0.0, 0.0, 9.0), (2.0, 0.0, 9.0), (0.0, 2.0, 9.0), out)
-    heights._triangle((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (0.0, 5.0, 1.0), out)
+    surface_model._triangle((0.0, 0.0, 5.0), (5.0, 0.0, 5.0), (0.0, 5.0, 5.0), out)
+    surface_model._triangle((0.0, 0.0, 9.0), (2.0, 0.0, 9.0), (0.0, 2.0, 9.0), out)
+    surface_model._triangle((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (0.0, 5.0, 1.0), out)
     wanted = np.full((6, 6), np.nan)
     row, col = np.mgrid[:6, :6]
     wanted[row + col <= 5] = 5.0
@@ -196,9 +197,9 @@ def test_of_two_surfaces_over_a_cell_the_higher_one_counts():
 
 def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch):
     store = write_grid(tmp_path / "d.zarr", model, of_plane)
-    monkeypatch.setattr(heights, "SHARD", 256)
+    monkeypatch.setattr(surface_model, "SHARD", 256)
     write_dsm(store, tmp_path / "fresh.tif", workers=2)
-    out, made, block = tmp_path / "dsm.tif", [], heights._Model.block
+    out, made, block = tmp_path / "dsm.tif", [], surface_model.SurfaceModel.block
 
     def counted(self, store, key, rows, cols):
         if len(made) == 2:
@@ -207,19 +208,21 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
         made.append((rows.start, cols.start))
 
     with monkeypatch.context() as patch:
-        patch.setattr(heights._Model, "block", counted)
+        patch.setattr(surface_model.SurfaceModel, "block", counted)
         with pytest.raises(Killed):
             write_dsm(store, out, scheduler="synchronous")
     assert not out.exists()
     before = made[:]
     made = ["from here on"]  # two of them would be a kill
-    monkeypatch.setattr(heights._Model, "block", lambda *a: (block(*a), made.append(a[3].start)))
+    monkeypatch.setattr(
+        surface_model.SurfaceModel, "block", lambda *a: (block(*a), made.append(a[3].start))
+    )
     write_dsm(store, out, scheduler="synchronous")
     assert len(before) == 2
     assert out.read_bytes() == (tmp_path / "fresh.tif").read_bytes()
     assert {p.name for p in tmp_path.iterdir()} == {"d.zarr", "fresh.tif", "dsm.tif"}
     whole = read(out)[0]
-    monkeypatch.setattr(heights, "SHARD", 1024)
+    monkeypatch.setattr(surface_model, "SHARD", 1024)
     write_dsm(store, tmp_path / "one.tif")
     at_once = read(tmp_path / "one.tif")[0]
     assert np.array_equal(np.isfinite(whole), np.isfinite(at_once))
@@ -228,16 +231,16 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
 
 def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_path, monkeypatch):
     """It widens the window of every block; parts that cannot reach a block are left out."""
-    monkeypatch.setattr(heights, "CHUNK", 128)
-    monkeypatch.setattr(heights, "SHARD", 128)
-    monkeypatch.setattr(heights, "PART", 32)
+    monkeypatch.setattr(surface_model, "CHUNK", 128)
+    monkeypatch.setattr(surface_model, "SHARD", 128)
+    monkeypatch.setattr(surface_model, "PART", 32)
     pixels: list[int] = []
 
     def counted(model, disparity, row=0, col=0):
         pixels.append(disparity.size)
         return intersect(model, disparity, row, col)
 
-    monkeypatch.setattr(heights, "intersect", counted)
+    monkeypatch.setattr(surface_model, "intersect", counted)
     wild = of_plane.copy()
     wild[200, 200] += 700.0
     found, work = {}, {}
@@ -246,7 +249,7 @@ def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_pa
         write_dsm(write_grid(tmp_path / f"{name}.zarr", model, d), tmp_path / f"{name}.tif")
         found[name], work[name] = read(tmp_path / f"{name}.tif")[:2], sum(pixels)
     assert work["wild"] < 1.25 * work["calm"]
-    monkeypatch.setattr(heights._Model, "reaches", lambda *_: True)
+    monkeypatch.setattr(surface_model.SurfaceModel, "reaches", lambda *_: True)
     pixels.clear()
     write_dsm(tmp_path / "wild.zarr", tmp_path / "all.tif")
     assert sum(pixels) > 1.5 * work["wild"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.matching.holes import fill_holes
+from stereotruth.matching.benchmark.holes import fill_holes
 
 N = np.nan
 

@@ -9,14 +9,9 @@ import numpy as np
 import pytest
 import rasterio
 
+from stereotruth.dataset.stereo_dataset import StereoDataset, find_pairs
 from stereotruth.errors import InputError
-from stereotruth.matching.layouts import (
-    StereoDataset,
-    find_pairs,
-    image_shape,
-    read_disparity,
-    read_image,
-)
+from stereotruth.products.rasters import image_shape, read_disparity, read_image
 
 PUBLISHED = Path(__file__).parents[3] / "shared" / "published"
 needs_published = pytest.mark.skipif(not PUBLISHED.is_dir(), reason="no published pairs here")

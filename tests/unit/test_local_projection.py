@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
-from stereotruth.local_projection import LocalProjection
-from stereotruth.points import CELL_BITS
+from stereotruth.disparity.local_projection import LocalProjection
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.lidar.lattice import CELL_BITS
 
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, camera
 

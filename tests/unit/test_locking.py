@@ -8,8 +8,8 @@ import signal
 import time
 from pathlib import Path
 
-from stereotruth.grid_store import replacing
-from stereotruth.locking import FileLock, exclusive
+from stereotruth.products.files import replacing
+from stereotruth.products.locks import FileLock, exclusive
 
 SPAWN = multiprocessing.get_context("spawn")
 

@@ -5,19 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.epipolar import fit_epipolar
-from stereotruth.occlusion import (
-    COVER_PX,
-    MANY,
-    MAX_COVER_PX,
-    SURFACE_PX,
-    Rays,
-    build_surface,
-    hidden_pixels,
-    seen_surface,
-)
-from stereotruth.pixel_points import POINT, PX, PixelPoints
-from stereotruth.points import LATTICE_DEG, Points
+from stereotruth.disparity.hidden_pixels import Rays, build_surface, hidden_pixels
+from stereotruth.disparity.one_surface import SURFACE_PX
+from stereotruth.disparity.pixel_points import POINT, PX, PixelPoints
+from stereotruth.disparity.seen_surface import COVER_PX, MANY, MAX_COVER_PX, seen_surface
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.lidar.lattice import LATTICE_DEG
+from stereotruth.lidar.point_store import Points
 
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereotruth.patches import read_patch
-from stereotruth.pixel_points import PX, Collection, PixelPoints
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.pixel_points import PX, Collection, PixelPoints
 
 ROWS, COLS = slice(10, 50), slice(30, 90)
 ORIGIN = (1000, 2000)

@@ -13,9 +13,10 @@ import pyproj
 import pytest
 import zarr
 
-from stereotruth import points
 from stereotruth.errors import InputError
-from stereotruth.points import Points, PointStore, coverage, ingest, query_points, summary
+from stereotruth.lidar import cell_sort, lattice, point_store
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import Points, PointStore, coverage, query_points, summary
 
 SHARED = Path(__file__).parents[3] / "shared"
 UTM = pyproj.CRS("EPSG:32650").to_3d()
@@ -136,14 +137,14 @@ def test_coordinates_and_lattice_are_consistent(tmp_path) -> None:
 
 
 def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(points, "SHARD_POINTS", 4096)
-    monkeypatch.setattr(points, "CHUNK_POINTS", 1024)
+    monkeypatch.setattr(point_store, "SHARD_POINTS", 4096)
+    monkeypatch.setattr(point_store, "CHUNK_POINTS", 1024)
     write_las(tmp_path / "a.laz", 20_000)
     digests = set()
     for k, (chunk, workers, kept_in_memory) in enumerate(
         [(20_000, 1, 1 << 20), (333, 1, 1 << 20), (7000, 2, 9000), (900, 1, 0), (10**6, 1, 1)]
     ):
-        monkeypatch.setattr(points, "SCRATCH_POINTS", kept_in_memory)
+        monkeypatch.setattr(cell_sort, "SCRATCH_POINTS", kept_in_memory)
         store = tmp_path / f"{k}.zarr"
         ingest(tmp_path / "a.laz", store, chunk_points=chunk, workers=workers)
         digests.add(tree_digest(store))
@@ -155,7 +156,7 @@ def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
 def test_a_full_disk_says_so() -> None:
     with Path("/dev/full").open("wb", buffering=0) as disk:
-        runs = points._Runs(np.empty((1000, 4), np.int32), disk)
+        runs = cell_sort.SortedRuns(np.empty((1000, 4), np.int32), disk)
         lattice, attributes = np.zeros((3, 1000), np.int64), np.zeros(1000, np.uint32)
         runs.add(lattice, attributes)
         with pytest.raises(OSError, match="No space left") as error:
@@ -169,7 +170,7 @@ def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
     write_las(tmp_path / "a.laz", xyz=xyz)
     ingest(tmp_path / "a.laz", tmp_path / "a.zarr", chunk_points=700)
     got = everything(PointStore(tmp_path / "a.zarr"))
-    cell = np.column_stack([got.lat_q >> points.CELL_BITS, got.lon_q >> points.CELL_BITS])
+    cell = np.column_stack([got.lat_q >> lattice.CELL_BITS, got.lon_q >> lattice.CELL_BITS])
     changes = np.flatnonzero((np.diff(cell, axis=0) != 0).any(axis=1)) + 1
     visited = cell[np.r_[0, changes]]
     assert len(np.unique(visited, axis=0)) == len(visited) > 20  # each cell is one range

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.layouts import StereoDataset, read_disparity
-from stereotruth.matching.predictions import predict, read_prediction, read_record
+from stereotruth.matching.benchmark.predictions import predict, read_prediction, read_record
+from stereotruth.products.rasters import read_disparity
 
 from .test_layouts import write
 
@@ -153,7 +154,8 @@ def test_peak_memory_is_that_of_the_process_alone():
     """Not that of the process which started it, as Linux's ru_maxrss would have it."""
     ballast = np.ones(80 << 20)  # 640 MB
     code = (
-        "from stereotruth.matching.predictions import peak_memory_mb as peak; import numpy as np;"
+        "from stereotruth.matching.benchmark.predictions import peak_memory_mb as peak;"
+        "import numpy as np;"
         "before = peak(); held = np.ones(25 << 20); print(before, peak())"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth import provenance
+from stereotruth.products import provenance
 
 
 @pytest.fixture
@@ -26,32 +26,32 @@ def edit(file: Path, old: str, new: str) -> None:
 
 
 def test_digest_follows_imports_within_the_package():
-    modules = provenance.source_modules("grid_store")
-    assert {"grid_store", "errors"} <= set(modules)
+    modules = provenance.source_modules("products.grids")
+    assert {"products.grids", "errors"} <= set(modules)
     assert "sheets" not in modules
 
 
 def test_a_change_of_an_imported_module_changes_the_digest(package):
-    before = provenance.source_digest("grid_store"), provenance.source_digest("sheets")
-    edit(package / "grid_store.py", "clevel=5", "clevel=7")
-    after = provenance.source_digest("grid_store"), provenance.source_digest("sheets")
+    before = provenance.source_digest("products.grids"), provenance.source_digest("sheets")
+    edit(package / "products" / "grids.py", "clevel=5", "clevel=7")
+    after = provenance.source_digest("products.grids"), provenance.source_digest("sheets")
     assert before[0] != after[0]
     assert before[1] == after[1]
 
 
 def test_digests_are_remembered_but_never_in_place_of_an_edit(package):
-    first = provenance.source_digest("grid_store")
+    first = provenance.source_digest("products.grids")
     (remembered,) = (package / "__pycache__").glob("sources-*.json")
     provenance._sources.cache_clear()
-    assert provenance.source_digest("grid_store") == first
-    edit(package / "grid_store.py", "clevel=5", "clevel=7")
-    assert provenance.source_digest("grid_store") != first
-    edit(package / "grid_store.py", "clevel=7", "clevel=5")
+    assert provenance.source_digest("products.grids") == first
+    edit(package / "products" / "grids.py", "clevel=5", "clevel=7")
+    assert provenance.source_digest("products.grids") != first
+    edit(package / "products" / "grids.py", "clevel=7", "clevel=5")
     provenance._sources.cache_clear()
-    assert provenance.source_digest("grid_store") == first
+    assert provenance.source_digest("products.grids") == first
     remembered.write_text("{")
     provenance._sources.cache_clear()
-    assert provenance.source_digest("grid_store") == first
+    assert provenance.source_digest("products.grids") == first
 
 
 def test_comments_and_docstrings_do_not_change_the_digest(package):
@@ -61,7 +61,13 @@ def test_comments_and_docstrings_do_not_change_the_digest(package):
     assert provenance.source_digest("errors") == before
 
 
-STAGES = ("points", "alignment", "rectification", "disparity", "tiles")
+STAGES = (
+    "lidar.ingest",
+    "alignment.align",
+    "epipolar.rectify",
+    "disparity.project",
+    "dataset.export",
+)
 
 
 def test_a_stage_depends_on_no_later_stage_and_on_no_simulation():
@@ -75,7 +81,7 @@ def test_a_stage_depends_on_no_later_stage_and_on_no_simulation():
 
 def test_the_simulator_shares_no_code_with_the_pipeline():
     modules = set(provenance.source_modules("simulate.render", "simulate.lidar", "simulate.truth"))
-    assert not modules & {*STAGES, "rpc", "epipolar", "occlusion", "correlation"}
+    assert not modules & {*STAGES, "epipolar.rpc", "epipolar.model", "disparity.hidden_pixels"}
 
 
 def test_records_hold_checksums_and_are_equal_for_equal_work(tmp_path):

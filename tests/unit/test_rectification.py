@@ -11,12 +11,13 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.epipolar import fit_epipolar
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.image_reader import Source
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.resampling import resample
+from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
-from stereotruth.grid_store import open_grid
-from stereotruth.rectification import Source, rectify
-from stereotruth.resampling import resample
-from stereotruth.rpc import SensorModel
+from stereotruth.products.grids import open_grid
 
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from .test_rpc import write_image
@@ -296,8 +297,8 @@ def digest(store: Path) -> str:
 
 
 def test_the_same_bytes_for_any_number_of_workers(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("stereotruth.rectification.SHARD", 256)
-    monkeypatch.setattr("stereotruth.rectification.CHUNK", 64)
+    monkeypatch.setattr("stereotruth.epipolar.rectify.SHARD", 256)
+    monkeypatch.setattr("stereotruth.epipolar.rectify.CHUNK", 64)
     rng = np.random.default_rng(2)
     images = [rng.integers(1, 3000, SIZE[::-1]).astype(np.uint16) for _ in range(2)]
     digests = []

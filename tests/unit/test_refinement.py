@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.alignment import Alignment, GcpResidual, ViewFit
-from stereotruth.epipolar import fit_epipolar
+from stereotruth.alignment.adjustment import estimate
+from stereotruth.alignment.aligned_pair import Alignment, GcpResidual, ViewFit
+from stereotruth.alignment.refine import refine
+from stereotruth.alignment.refine_report import write_refinement
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
-from stereotruth.refinement import estimate, refine
-from stereotruth.refinement_report import write_refinement
-from stereotruth.rpc import SensorModel
 
 from .test_disparity import write_points
 from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.report import drawings, page, pictures, tables
-from stereotruth.tiles import write_tiff
+from stereotruth.products import html_tables, pictures
+from stereotruth.products.rasters import write_tiff
+from stereotruth.report import drawings, page, tile_pictures
 
 from ..browser import look, needs_chromium, screenshot
 
@@ -185,7 +186,9 @@ def picture(uri: str) -> np.ndarray:
 
 def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
     rows = write_city(tmp_path, 1)
-    made = pictures.tile_pictures(tmp_path, rows[0], thumbnail=(SIZE, 10**6), slider=(SIZE, 10**6))
+    made = tile_pictures.tile_pictures(
+        tmp_path, rows[0], thumbnail=(SIZE, 10**6), slider=(SIZE, 10**6)
+    )
     assert made.histogram == {SHIFT: SIZE**2 - 600}
     assert made.disparity_px == (SHIFT, SHIFT)
     assert made.correlation == pytest.approx(1.0)
@@ -195,10 +198,10 @@ def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
     assert left[inner].std() > 20
     difference = picture(made.uris["slider_difference"])
     assert difference[inner].min() > 235
-    assert np.abs(warped[15:25, 26:44] - pictures.NO_MATCH).max() < 25
-    assert np.abs(difference[15:25, 26:44] - pictures.NO_DIFFERENCE).max() < 25
+    assert np.abs(warped[15:25, 26:44] - tile_pictures.NO_MATCH).max() < 25
+    assert np.abs(difference[15:25, 26:44] - tile_pictures.NO_DIFFERENCE).max() < 25
     status = picture(made.uris["status"])
-    colours = pictures.status_colours(list(FLAGS.values()))
+    colours = tile_pictures.status_colours(list(FLAGS.values()))
     for place, name in ((status[60:, 60:], "labelled"), (status[15:25, 26:44], "a_new_reason")):
         assert np.abs(place - tuple(bytes.fromhex(colours[name][1:]))).max() < 25
 
@@ -206,7 +209,9 @@ def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
 def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
     rows = write_city(tmp_path, 1)
     write_tiff(tmp_path / rows[0]["disp"], np.full((SIZE, SIZE), 4, np.float32), nodata=-999)
-    made = pictures.tile_pictures(tmp_path, rows[0], thumbnail=(9, 10**6), slider=(SIZE, 10**6))
+    made = tile_pictures.tile_pictures(
+        tmp_path, rows[0], thumbnail=(9, 10**6), slider=(SIZE, 10**6)
+    )
     assert made.correlation < 0.9
     assert picture(made.uris["slider_difference"])[40:, 20:80].min(axis=2).mean() < 150
 
@@ -422,7 +427,7 @@ def test_histograms_share_their_axis_and_keep_every_label():
     ],
 )
 def test_values_are_shown_as_people_read_them(name, text, shown):
-    assert tables.show(name, text) == shown
+    assert html_tables.show(name, text) == shown
 
 
 # ------------------------------------------------------------------------------ in a browser

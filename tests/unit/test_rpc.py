@@ -13,8 +13,9 @@ from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC as RasterioRPC
 from rasterio.transform import RPCTransformer
 
+from stereotruth.epipolar.rpc import RPC, SensorModel, localize_point, project_point
+from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.errors import InputError
-from stereotruth.rpc import RPC, SensorModel, localize_point, project_point, read_rpc
 
 SHARED = Path(__file__).parents[3] / "shared"
 MARSEILLE = SHARED / "real" / "marseille"

@@ -9,12 +9,12 @@ import pytest
 import zarr
 
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, building, create_grid, open_grid
-from stereotruth.matching import scenes
-from stereotruth.matching.blocks import match
+from stereotruth.job import dask_scheduler
 from stereotruth.matching.methods import make_method
-from stereotruth.matching.scenes import predict_scene
-from stereotruth.workers import dask_scheduler
+from stereotruth.matching.scenes import predict_scene as whole
+from stereotruth.matching.scenes.predict_scene import predict_scene
+from stereotruth.matching.scenes.whole_images import match
+from stereotruth.products.grids import Layer, building, create_grid, open_grid
 
 from .test_block_store import Killed, tree
 from .test_blocks import textured
@@ -64,7 +64,7 @@ def fresh(images, tmp_path_factory) -> Path:
 
 def tiles_made(monkeypatch, stop_after: int | None = None) -> list[tuple[int, int]]:
     """The places of the tiles that are made from here on; a kill after some of them."""
-    made, tile = [], scenes._Scene.tile
+    made, tile = [], whole._ImagePair.tile
 
     def counted(self, out, key, place, offset):
         if stop_after is not None and len(made) == stop_after:
@@ -72,7 +72,7 @@ def tiles_made(monkeypatch, stop_after: int | None = None) -> list[tuple[int, in
         tile(self, out, key, place, offset)
         made.append(place)
 
-    monkeypatch.setattr(scenes._Scene, "tile", counted)
+    monkeypatch.setattr(whole._ImagePair, "tile", counted)
     return made
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.matching.holes import fill_holes
-from stereotruth.matching.scores import Collector, Scorer
+from stereotruth.matching.benchmark.holes import fill_holes
+from stereotruth.matching.benchmark.scores import Collector, Scorer
 
 N = np.nan
 SCORER = Scorer((-4, 10), (3.0, 1.0))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.evaluation import classes, sift
+from stereotruth.dataset import sift_matches, tile_classes
 
 SIZE = 320
 BLOCK = (140, 230)  # columns of the raised block in the left image
@@ -60,7 +60,7 @@ def pair(texture) -> Pair:
 
 
 def test_disparities_are_right_in_sign_and_without_bias(pair):
-    found = sift.match_tile(*pair)
+    found = sift_matches.match_tile(*pair)
     figures = found.figures()
     assert figures["sift_matches"] > 300
     assert abs(figures["sift_median_error_px"]) < 0.01  # a quarter of a pixel without upscaling
@@ -77,16 +77,16 @@ def test_disparities_are_right_in_sign_and_without_bias(pair):
 
 
 def test_no_key_point_on_steps_or_beside_missing_labels(pair):
-    found = sift.match_tile(*pair)
+    found = sift_matches.match_tile(*pair)
     x = np.rint(found.x)
     for edge in (BLOCK[0] - 0.5, BLOCK[1] - 0.5, BLOCK[0] - RAISED - 1.5):
-        assert np.abs(x - edge).min() > sift.WINDOW // 2
+        assert np.abs(x - edge).min() > sift_matches.WINDOW // 2
 
 
 @pytest.mark.parametrize("offset", [1.0, -0.4])
 def test_a_planted_offset_of_the_labels_is_found(pair, offset):
     wrong = pair._replace(disparity=pair.disparity + offset)
-    figures = sift.match_tile(*wrong).figures()
+    figures = sift_matches.match_tile(*wrong).figures()
     assert figures["sift_matches"] > 300
     for name in ("sift_mean_error_px", "sift_median_error_px"):
         assert figures[name] == pytest.approx(-offset, abs=0.05)
@@ -96,7 +96,7 @@ def test_a_planted_offset_of_the_labels_is_found(pair, offset):
 
 @pytest.mark.parametrize("shift", [0.4, -2.5])
 def test_a_planted_row_shift_is_found(texture, shift):
-    figures = sift.match_tile(*render(texture, shift)).figures()
+    figures = sift_matches.match_tile(*render(texture, shift)).figures()
     assert figures["y_parallax_median_px"] == pytest.approx(shift, abs=0.03)
     assert figures["y_parallax_rms_px"] == pytest.approx(abs(shift), abs=0.1)
     if abs(shift) > 1:  # rows do not correspond: nearly nothing is left for table 4
@@ -106,17 +106,19 @@ def test_a_planted_row_shift_is_found(texture, shift):
 def test_constant_labels_by_hand():
     disparity = np.zeros((9, 20))
     disparity[:, 10:] = 0.5
-    assert sift.constant_labels(disparity).all()
+    assert sift_matches.constant_labels(disparity).all()
     disparity[:, 10:] = 0.6
-    assert np.array_equal(np.flatnonzero(~sift.constant_labels(disparity)[4]), [8, 9, 10, 11])
+    assert np.array_equal(
+        np.flatnonzero(~sift_matches.constant_labels(disparity)[4]), [8, 9, 10, 11]
+    )
     disparity[:, 10:] = 0.0
     disparity[4, 5] = np.nan
     wanted = np.ones((9, 20), bool)
     wanted[2:7, 3:8] = False
-    assert np.array_equal(sift.constant_labels(disparity), wanted)
+    assert np.array_equal(sift_matches.constant_labels(disparity), wanted)
     sparse = np.where(np.random.default_rng(2).random((200, 200)) < 0.6, 1.0, np.nan)
     sparse[:, 100:] = np.nan
-    found = sift.constant_labels(sparse)
+    found = sift_matches.constant_labels(sparse)
     assert 0.4 < found[:, :98].sum() / np.isfinite(sparse[:, :98]).sum() < 0.7
     assert found[:, 98:].mean() < 0.02
     assert not found[np.isnan(sparse)].any()
@@ -126,19 +128,19 @@ def test_images_without_texture_and_tiles_without_labels_give_no_matches(pair):
     flat = np.full((SIZE, SIZE), 500, np.uint16)
     nothing = np.full((SIZE, SIZE), np.nan)
     for tile in ((flat, flat, pair.disparity), (pair.left, pair.right, nothing)):
-        found = sift.match_tile(*tile)
+        found = sift_matches.match_tile(*tile)
         assert found.x.size == 0
         figures = found.figures()
         assert figures.pop("sift_matches") == 0
         assert set(figures.values()) == {None}
-        assert sift.match_rows({}, found) == []
+        assert sift_matches.match_rows({}, found) == []
 
 
 def test_other_places_have_other_textures(pair):
     """Right image of another place: hardly a match, and those are gross."""
     other = pair.right[::-1]
-    found = sift.match_tile(pair.left, other, pair.disparity)
-    assert found.x.size < 0.02 * sift.match_tile(*pair).x.size
+    found = sift_matches.match_tile(pair.left, other, pair.disparity)
+    assert found.x.size < 0.02 * sift_matches.match_tile(*pair).x.size
 
 
 # -------------------------------------------------------------------------------------- classes
@@ -150,7 +152,9 @@ def heights(slope: float = 0.0) -> np.ndarray:
 
 
 def kind(codes: np.ndarray, height: np.ndarray, share: float) -> str:
-    return classes.tile_class(codes, height, (slice(0, len(codes)), slice(0, len(codes))), share)
+    return tile_classes.tile_class(
+        codes, height, (slice(0, len(codes)), slice(0, len(codes))), share
+    )
 
 
 def test_class_by_the_classes_of_the_lidar():
@@ -177,9 +181,9 @@ def test_class_by_shape_where_the_lidar_has_no_classes(slope):
     houses = trees.copy()
     houses[100:140, 50:110] = ground[120, 80] + 18.0  # one of 26 by 39 m, 2.7 % of the tile
     houses[rng.random((300, 300)) < 0.05] = np.nan
-    found = classes.buildings_by_shape(houses)
+    found = tile_classes.buildings_by_shape(houses)
     assert found[105:135, 55:105].mean() > 0.9  # of which 5 % are not known
     assert kind(unknown, houses, 0.02) == "building"
     corner = slice(60, 100), slice(20, 60)  # the house is beside it
-    assert classes.tile_class(unknown[corner], houses, corner, 0.02) == "vegetation"
-    assert not classes.buildings_by_shape(np.full((50, 50), np.nan)).any()
+    assert tile_classes.tile_class(unknown[corner], houses, corner, 0.02) == "vegetation"
+    assert not tile_classes.buildings_by_shape(np.full((50, 50), np.nan)).any()

@@ -16,14 +16,21 @@ from rasterio.transform import RPCTransformer
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from stereotruth.errors import InputError
-from stereotruth.provenance import source_modules
-from stereotruth.simulate import CITIES, Character, CitySpec, SceneSpec, lidar_files
-from stereotruth.simulate import world as worlds
+from stereotruth.products.provenance import source_modules
+from stereotruth.simulate import layout, world
 from stereotruth.simulate.camera import locate, project, rays
-from stereotruth.simulate.cities import LEFT_GSD_M, RIGHT_GSD_M
+from stereotruth.simulate.cities import (
+    CITIES,
+    LEFT_GSD_M,
+    RIGHT_GSD_M,
+    Character,
+    CitySpec,
+    SceneSpec,
+    lidar_files,
+)
+from stereotruth.simulate.control_points import make_points, simulate_points
 from stereotruth.simulate.geodesy import LocalFrame
 from stereotruth.simulate.lidar import simulate_lidar_tile, tile_box
-from stereotruth.simulate.points import make_points, simulate_points
 from stereotruth.simulate.render import prepare, simulate_image
 from stereotruth.simulate.surfaces import IN_IMAGES, IN_LIDAR, terrain_heights
 from stereotruth.simulate.truth import open_truth, simulate_truth
@@ -273,7 +280,7 @@ def test_points_are_exact_and_measured_with_a_quarter_of_a_pixel(town: Path) -> 
 
 
 def test_same_spec_gives_the_same_files(town: Path, tmp_path: Path) -> None:
-    worlds._build.cache_clear()
+    world._build.cache_clear()
     prepare.__globals__["_prepare"].cache_clear()
     scene = TOWN.scenes[0]
     name = lidar_files(TOWN, scene)[1]
@@ -305,7 +312,7 @@ def test_old_las_format_and_refusals(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("city", CITIES.values(), ids=list(CITIES))
 def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
-    surfaces = worlds.build_surfaces(city)
+    surfaces = world.build_surfaces(city)
     slope = np.hypot(*np.gradient(surfaces.terrain, surfaces.step))
     assert math.degrees(math.atan(slope.max())) < 51
     relief = np.ptp(surfaces.terrain)
@@ -314,8 +321,8 @@ def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
     for scene in city.scenes:
         names = lidar_files(city, scene)
         assert 4 <= len(names) <= 9 and len(set(names)) == len(names)
-        local = np.abs(worlds.scene_coordinates(city, scene, surfaces.boxes[:, :2]))
-        inside = (local < worlds.half_size(scene)).all(axis=1)
+        local = np.abs(layout.scene_coordinates(city, scene, surfaces.boxes[:, :2]))
+        inside = (local < layout.half_size(scene)).all(axis=1)
         for view in (IN_IMAGES, IN_LIDAR):
             assert ((surfaces.box_view == view) & inside).sum() >= 3
         measured, exact, checks = make_points(city, scene, seed=1)
@@ -333,10 +340,19 @@ def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
 
 def test_shares_no_code_with_the_pipeline() -> None:
     modules = source_modules(
-        "simulate.render", "simulate.lidar", "simulate.truth", "simulate.points"
+        "simulate.render", "simulate.lidar", "simulate.truth", "simulate.control_points"
     )
     others = {m for m in modules if not m.startswith("simulate")}
-    assert others <= {"", "errors", "grid_store", "locking", "runlog", "provenance"}
+    assert others <= {
+        "",
+        "errors",
+        "job",
+        "products",
+        "products.files",
+        "products.grids",
+        "products.locks",
+        "products.provenance",
+    }
 
 
 def test_lidar_tiles_part_the_scene() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stereotruth.splits import SPLITS, Place, overlaps, scaled_counts, split_tiles
+from stereotruth.dataset.splits import SPLITS, Place, overlaps, scaled_counts, split_tiles
 
 PAPER = {
     "Shaoguan": (20, 5, 23),

@@ -7,9 +7,9 @@ import pytest
 import rasterio
 import zarr
 
-from stereotruth.disparity import Status
-from stereotruth.matching.layouts import Pair
-from stereotruth.matching.strata import (
+from stereotruth.dataset.stereo_dataset import Pair
+from stereotruth.disparity.status import Status
+from stereotruth.matching.benchmark.strata import (
     Products,
     exact_truth,
     label_strata,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.disparity import project_scene
+from stereotruth.disparity.project import project_scene
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Strip
-from stereotruth.workers import dask_scheduler
+from stereotruth.job import dask_scheduler
+from stereotruth.products.grids import Strip
 
 from .test_block_store import tree
 from .test_disparity import Scene, write_image, write_points
@@ -22,8 +22,8 @@ from .test_disparity import Scene, write_image, write_points
 @pytest.fixture
 def scene(tmp_path, monkeypatch) -> Scene:
     """Small blocks, so that there are many; stores that say what they are made of."""
-    monkeypatch.setattr("stereotruth.disparity.SHARD", 96)
-    monkeypatch.setattr("stereotruth.disparity.CHUNK", 24)
+    monkeypatch.setattr("stereotruth.disparity.project.SHARD", 96)
+    monkeypatch.setattr("stereotruth.disparity.project.CHUNK", 24)
     (tmp_path / "scene").mkdir()
     scene = Scene(tmp_path / "scene", box=True)
     name(scene.store, "points")

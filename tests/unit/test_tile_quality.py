@@ -10,11 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from stereotruth.dataset.quality_limits import Limits
+from stereotruth.dataset.summary import summary_lines
+from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
-from stereotruth.evaluation import images
-from stereotruth.gates import Limits
-from stereotruth.tiles import summary_lines
-from stereotruth.verification import defects
+from stereotruth.evaluation import labels_against_images
 
 from .test_tiles import LAT, LON, METRE_LAT, METRE_LON, make_scene, rows_of, run
 
@@ -124,7 +124,7 @@ def test_evaluation_of_a_city(made, tmp_path):
     files = {name: tmp_path / f"{name}.csv" for name in ("table4", "sift", "warping")}
     files |= {f"{name}_figure": tmp_path / f"{name}.png" for name in ("sift", "warping")}
     stores = {"s1": (scene.left, scene.right, scene.disparity)}
-    table = images.evaluate_city("Town", clean.out, clean.matches, stores, **files)
+    table = labels_against_images.evaluate_city("Town", clean.out, clean.matches, stores, **files)
 
     def read(name: str) -> list[dict[str, str]]:
         with files[name].open(newline="") as stream:
@@ -157,11 +157,11 @@ def test_evaluation_of_a_city(made, tmp_path):
 
 def test_a_line_of_table_4_by_hand():
     tiles = [np.array([0.1, -0.3, 0.2, 8.2]), np.array([-1.0]), np.array([])]
-    row = images.table4_row("Town (building)", tiles)
+    row = labels_against_images.table4_row("Town (building)", tiles)
     assert (row["pair_number"], row["matches_number"]) == (2, 5)
     assert row["mean_of_mean_disparity_errors_px"] == pytest.approx((2.05 - 1.0) / 2)
     assert row["mean_of_mean_absolute_disparity_errors_px"] == pytest.approx((2.2 + 1.0) / 2)
     assert row["gross_mismatches_share"] == pytest.approx(0.2)
     assert row["without_gross_mean_of_mean_absolute_disparity_errors_px"] == pytest.approx(0.6)
-    empty = images.table4_row("Town (vegetation)", [np.array([])])
+    empty = labels_against_images.table4_row("Town (vegetation)", [np.array([])])
     assert (empty["pair_number"], empty["mean_of_mean_disparity_errors_px"]) == (0, "")

@@ -16,15 +16,20 @@ import rasterio
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from stereotruth.dataset import assemble_dataset
-from stereotruth.epipolar import EpipolarModel, fit_epipolar
+from stereotruth.dataset.export import export_city
+from stereotruth.dataset.orientation import evaluate
+from stereotruth.dataset.published_layout import assemble_dataset
+from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.dataset.splits import shared_ground
+from stereotruth.dataset.summary import summary_lines
+from stereotruth.dataset.tile_files import round_disparity
+from stereotruth.dataset.verify import defects, verify
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.errors import InputError
-from stereotruth.grid_store import Layer, building, create_grid
-from stereotruth.orientation import evaluate
-from stereotruth.rpc import RPC, SensorModel
-from stereotruth.splits import shared_ground
-from stereotruth.tiles import Scene, export_city, round_disparity, summary_lines, write_tiff
-from stereotruth.verification import defects, verify
+from stereotruth.products.grids import Layer, building, create_grid
+from stereotruth.products.rasters import write_tiff
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -83,7 +88,7 @@ def make_scene(
     texture: Callable[[np.ndarray, np.ndarray], np.ndarray] = texture,
     label_offset: float = 0.0,
     row_shift: float = 0.0,
-) -> Scene:
+) -> SceneFiles:
     """Stores of one scene; labels end at epipolar row ``bare_from``.
 
     Planted errors: of the labels (px), and of the right image's rows (px, down).
@@ -133,11 +138,11 @@ def make_scene(
         arrays["height"][:] = np.where(known, height, np.nan)
         arrays["status"][:] = np.where(known, 1, np.where(inside & (y < bare_from), 4, 0))
     stores = (folder / f"{name}.zarr" for name in ("scene", "left", "right"))
-    return Scene(folder.name, *stores)
+    return SceneFiles(folder.name, *stores)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     return make_scene(tmp_path_factory.mktemp("scenes") / "s1", bare_from=240)
 
 
@@ -147,7 +152,7 @@ run = partial(
 
 
 @pytest.fixture(scope="module")
-def exported(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+def exported(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("out")
     looks = {"coverage": folder / "coverage.png", "contact_sheet": folder / "contact.png"}
     return folder / "Town", run([scene], folder / "Town", workers=2, **looks)
@@ -222,7 +227,7 @@ def test_right_tile_warped_by_the_disparity_is_the_left_tile(exported: tuple[Pat
 
 
 def test_sidecar_leads_back_to_sensor_pixels_and_ground(
-    exported: tuple[Path, dict], scene: Scene
+    exported: tuple[Path, dict], scene: SceneFiles
 ) -> None:
     folder, _ = exported
     import zarr
@@ -272,7 +277,7 @@ def test_height_from_stored_disparity(exported: tuple[Path, dict]) -> None:
     assert np.abs(error).max() < 0.03
 
 
-def test_checksums_find_an_edited_file(scene: Scene, tmp_path: Path) -> None:
+def test_checksums_find_an_edited_file(scene: SceneFiles, tmp_path: Path) -> None:
     folder = tmp_path / "Town"
     run([scene], folder)
     assert defects(folder) == []
@@ -295,7 +300,9 @@ def test_checksums_find_an_edited_file(scene: Scene, tmp_path: Path) -> None:
     assert not (tmp_path / "dataset").exists()
 
 
-def test_same_bytes_with_any_number_of_workers(exported: tuple[Path, dict], scene: Scene) -> None:
+def test_same_bytes_with_any_number_of_workers(
+    exported: tuple[Path, dict], scene: SceneFiles
+) -> None:
     folder, _ = exported
     again = folder.parent / "again" / "Town"
     run([scene], again, workers=1)
@@ -305,7 +312,7 @@ def test_same_bytes_with_any_number_of_workers(exported: tuple[Path, dict], scen
 
 @pytest.mark.parametrize("right_offset", ["tile", "scene"])
 def test_offset_is_whole_and_of_tile_or_scene(
-    scene: Scene, tmp_path: Path, right_offset: str
+    scene: SceneFiles, tmp_path: Path, right_offset: str
 ) -> None:
     run([scene], tmp_path / "T", right_offset=right_offset, disparity_dtype="float32")
     rows = [row for row in rows_of(tmp_path / "T") if row["complete"] == "yes"]
@@ -323,7 +330,7 @@ def test_offset_is_whole_and_of_tile_or_scene(
     assert np.nanmax(np.abs(back - original)) < 1e-5
 
 
-def test_overlapping_tiles_share_no_ground_across_splits(scene: Scene, tmp_path: Path) -> None:
+def test_overlapping_tiles_share_no_ground_across_splits(scene: SceneFiles, tmp_path: Path) -> None:
     summary = run([scene], tmp_path / "T", stride=SIZE // 2)
     assert summary["splits"]["realised"]["none"] > 0
     assert all(summary["splits"]["realised"][s] > 0 for s in ("train", "val", "test"))
@@ -333,7 +340,7 @@ def test_overlapping_tiles_share_no_ground_across_splits(scene: Scene, tmp_path:
     assert not (tmp_path / "S").exists()
 
 
-def test_two_scenes_of_one_city(scene: Scene, tmp_path: Path) -> None:
+def test_two_scenes_of_one_city(scene: SceneFiles, tmp_path: Path) -> None:
     """A second pair over the same ground: its tiles count on, and share no ground across splits."""
     other = make_scene(tmp_path / "s2", turn=0.3)
     summary = run([scene, other], tmp_path / "T", workers=2)
@@ -346,7 +353,7 @@ def test_two_scenes_of_one_city(scene: Scene, tmp_path: Path) -> None:
     assert all(realised[name] for name in ("train", "val", "test"))
 
 
-def test_nothing_to_export_is_refused(scene: Scene, tmp_path: Path) -> None:
+def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"Town: not one labelled .*labels incomplete") as caught:
         run([scene], tmp_path / "T", min_labelled=0.99)
     assert "tiles.min_labelled" in caught.value.remedy
@@ -390,7 +397,7 @@ def test_half_precision_tiff(tmp_path: Path) -> None:
     assert np.array_equal(np.frombuffer(raw, "<f2"), stored.astype("f2").ravel())
 
 
-def test_other_readers(exported: tuple[Path, dict], scene: Scene, tmp_path: Path) -> None:
+def test_other_readers(exported: tuple[Path, dict], scene: SceneFiles, tmp_path: Path) -> None:
     folder, _ = exported
     left = read(folder / "left" / "TN_left_0.tiff")
     for path in (folder / "left" / "TN_left_0.tiff",):

@@ -58,8 +58,8 @@ def test_tiles_are_made_with_all_their_files(made):
 
 def test_disparity_agrees_with_the_exact_truth(made, tmp_path):
     """Labelled and truly visible pixels: the limits that the project has set itself."""
-    from stereotruth.evaluation.grid_truth import write_grid_truth
-    from stereotruth.evaluation.truth import compare_scene
+    from stereotruth.evaluation.epipolar_truth import write_grid_truth
+    from stereotruth.evaluation.labels_against_truth import compare_scene
 
     epipolar = made.folder / "results/rectify/Tiny/Tiny-1/epipolar.json"
     write_grid_truth(TINY, TINY.scenes[0], epipolar, tmp_path / "truth.zarr")

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from stereotruth.provenance import source_modules
+from stereotruth.products.provenance import source_modules
 
 from .conftest import ROOT
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereotruth.epipolar import EpipolarModel
-from stereotruth.evaluation.grid_truth import truth_window
-from stereotruth.grid_store import open_grid
-from stereotruth.matching.heights import Raster
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.evaluation.epipolar_truth import truth_window
+from stereotruth.matching.scenes.surface_model import Raster
+from stereotruth.products.grids import open_grid
 
 from .conftest import TINY, copy_project, row_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from stereotruth.evaluation.checkpoints import evaluate_checkpoints
-from stereotruth.evaluation.warping import evaluate_warping
+from stereotruth.evaluation.scene_warping import evaluate_warping
 
 from .conftest import ROOT
 

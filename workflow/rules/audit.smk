@@ -19,9 +19,9 @@ rule audit:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         limits={k: v for k, v in config["audit"].items() if k != "worst"},
         worst=config["audit"]["worst"],
-        measuring=source_digest("audit.pair", "audit.sharing"),
-        code=source_digest("audit.run"),
-        template=file_sha256(PACKAGE / "audit" / "page.html.jinja"),
+        measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),
+        code=source_digest("evaluation.audit.audit"),
+        template=file_sha256(PACKAGE / "evaluation" / "audit" / "page.html.jinja"),
     message:
         "Auditing dataset {wildcards.dataset}"
     script:

@@ -21,7 +21,7 @@ rule match:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         method=lambda w: scene_method(w.method),
         split=config["benchmark"]["split"],
-        code=lambda w: source_digest("matching.predictions", *method_modules(w.method)),
+        code=lambda w: source_digest("matching.benchmark.predictions", *method_modules(w.method)),
     message:
         "Matching dataset {wildcards.dataset} by {wildcards.method}"
     script:
@@ -57,7 +57,7 @@ rule score:
         bootstrap=config["benchmark"]["bootstrap"],
         panels=config["benchmark"]["panels"],
         seed=config["seed"],
-        code=source_digest("matching.benchmark"),
+        code=source_digest("matching.benchmark.score_method"),
     message:
         "Scoring {wildcards.method} on dataset {wildcards.dataset}"
     script:
@@ -103,8 +103,8 @@ rule benchmark_tables:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         split=config["benchmark"]["split"],
         seed=config["seed"],
-        code=source_digest("matching.comparison"),
-        template=file_sha256(PACKAGE / "matching" / "benchmark.html.jinja"),
+        code=source_digest("matching.benchmark.compare_methods"),
+        template=file_sha256(PACKAGE / "matching" / "benchmark" / "page.html.jinja"),
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

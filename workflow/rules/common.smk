@@ -9,9 +9,9 @@ from snakemake.exceptions import WorkflowError
 
 from stereotruth import sheets
 from stereotruth.errors import InputError
-from stereotruth.locking import FileLock
+from stereotruth.products.locks import FileLock
 from stereotruth.matching.kinds import LABELS as METHOD_LABELS, MODULES as METHOD_MODULES
-from stereotruth.provenance import PACKAGE, file_sha256, source_digest
+from stereotruth.products.provenance import PACKAGE, file_sha256, source_digest
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
 SCHEMAS = Path(workflow.basedir) / "workflow" / "schemas"

@@ -14,7 +14,7 @@ rule grid_truth:
         mem_mb=3000,
         runtime=60,
     params:
-        code=source_digest("evaluation.grid_truth"),
+        code=source_digest("evaluation.epipolar_truth"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
     script:
@@ -45,7 +45,7 @@ rule evaluate_truth:
         mem_mb=3000,
         runtime=60,
     params:
-        code=source_digest("evaluation.truth"),
+        code=source_digest("evaluation.labels_against_truth"),
     message:
         "Comparing scene {wildcards.scene} with its exact truth"
     script:
@@ -81,7 +81,7 @@ rule evaluate_truth_city:
         runtime=60,
     params:
         scenes=lambda w: synthetic_scenes(w.city),
-        code=source_digest("evaluation.truth"),
+        code=source_digest("evaluation.labels_against_truth"),
     message:
         "Comparing city {wildcards.city} with its exact truth"
     script:

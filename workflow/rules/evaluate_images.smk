@@ -45,7 +45,7 @@ rule evaluate_images:
         runtime=30,
     params:
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
-        code=source_digest("evaluation.images"),
+        code=source_digest("evaluation.labels_against_images"),
     message:
         "Holding the labels of {wildcards.city} against the images"
     script:

@@ -47,7 +47,7 @@ rule export:
         evaluation=config["evaluation"],
         seed=config["seed"],
         strict=config["strict"],
-        code=source_digest("tiles"),
+        code=source_digest("dataset.export"),
     message:
         "Cutting the tiles of {wildcards.city}"
     script:
@@ -70,7 +70,7 @@ rule dataset:
         mem_mb=1000,
         runtime=60,
     params:
-        code=source_digest("dataset"),
+        code=source_digest("dataset.published_layout"),
     message:
         "Putting the cities together in the layout of the published dataset"
     script:

@@ -17,7 +17,7 @@ rule ingest:
     params:
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
         drop_classes=config["ingest"]["drop_classes"],
-        code=source_digest("points"),
+        code=source_digest("lidar.ingest"),
     message:
         "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"
     script:

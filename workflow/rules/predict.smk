@@ -20,7 +20,7 @@ rule predict_scene:
     params:
         method=lambda w: scene_method(w.method),
         settings=lambda w: scene_prediction(),
-        code=lambda w: source_digest("matching.scenes", *method_modules(w.method)),
+        code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"
     script:
@@ -46,7 +46,7 @@ rule dsm:
         runtime=240,
     params:
         settings=config["predict"]["dsm"],
-        code=source_digest("matching.heights"),
+        code=source_digest("matching.scenes.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"
     script:

@@ -29,7 +29,7 @@ rule project:
     params:
         view="left",
         settings=PROJECTION,
-        code=source_digest("disparity"),
+        code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
     script:
@@ -51,7 +51,7 @@ use rule project as project_right with:
     params:
         view="right",
         settings=PROJECTION,
-        code=source_digest("disparity"),
+        code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
 
@@ -77,7 +77,7 @@ rule project_strip:
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
         settings=PROJECTION,
-        code=source_digest("disparity"),
+        code=source_digest("disparity.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"
     script:

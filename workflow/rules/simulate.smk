@@ -62,7 +62,7 @@ rule simulate_truth:
         runtime=30,
     params:
         seed=config["seed"],
-        code=source_digest("simulate.truth", "simulate.points"),
+        code=source_digest("simulate.truth", "simulate.control_points"),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"
     script:

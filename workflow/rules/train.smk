@@ -29,7 +29,7 @@ rule train:
         dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
         kind=lambda w: method_settings(w.method)["kind"],
         training=lambda w: training_of(w.method),
-        code=source_digest("matching.training", "matching.kinds"),
+        code=source_digest("matching.networks.training", "matching.kinds"),
     message:
         "Training {wildcards.method} on dataset {wildcards.dataset}"
     script:

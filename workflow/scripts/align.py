@@ -1,9 +1,9 @@
 """One scene's images to its ground control points."""
 
-from stereotruth.alignment import align, from_rpcs
-from stereotruth.alignment_report import write_alignment
-from stereotruth.provenance import describe
-from stereotruth.runlog import job
+from stereotruth.alignment.align import align, from_rpcs
+from stereotruth.alignment.align_report import write_alignment
+from stereotruth.job import job
+from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

@@ -1,9 +1,9 @@
 """What the images and labels of a dataset say of each other."""
 
-from stereotruth.audit.run import audit
-from stereotruth.audit.verdicts import Limits
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.runlog import job
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.evaluation.audit.audit import audit
+from stereotruth.evaluation.audit.verdicts import Limits
+from stereotruth.job import job
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from stereotruth.matching.comparison import compare
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.runlog import job
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.job import job
+from stereotruth.matching.benchmark.compare_methods import compare
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

@@ -1,7 +1,7 @@
 """All cities' tiles in the layout of the published dataset."""
 
-from stereotruth.dataset import assemble_dataset
-from stereotruth.runlog import job
+from stereotruth.dataset.published_layout import assemble_dataset
+from stereotruth.job import job
 
 if __name__ == "__main__":
     with job(snakemake.log[0], "dataset"):

@@ -1,8 +1,7 @@
 """A scene's disparities to a surface model."""
 
-from stereotruth.matching.heights import write_dsm
-from stereotruth.runlog import job
-from stereotruth.workers import dask_scheduler
+from stereotruth.job import dask_scheduler, job
+from stereotruth.matching.scenes.surface_model import write_dsm
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method

@@ -1,7 +1,7 @@
 """One city's labels against its images: SIFT matches (table 4) and image warping."""
 
-from stereotruth.evaluation.images import evaluate_city
-from stereotruth.runlog import job
+from stereotruth.evaluation.labels_against_images import evaluate_city
+from stereotruth.job import job
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from stereotruth.evaluation.truth import MadeScene, evaluate_truth
-from stereotruth.runlog import job
+from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
+from stereotruth.job import job
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

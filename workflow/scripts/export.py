@@ -3,9 +3,11 @@
 import json
 from pathlib import Path
 
-from stereotruth.gates import Limits
-from stereotruth.runlog import job
-from stereotruth.tiles import Scene, export_city, summary_lines
+from stereotruth.dataset.export import export_city
+from stereotruth.dataset.quality_limits import Limits
+from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.dataset.summary import summary_lines
+from stereotruth.job import job
 
 if __name__ == "__main__":
     given, city, tiles = snakemake.input, snakemake.params.city, snakemake.params.tiles
@@ -14,7 +16,7 @@ if __name__ == "__main__":
         summary = export_city(
             scenes=list(
                 map(
-                    Scene,
+                    SceneFiles,
                     snakemake.params.scenes,
                     given.disparity,
                     given.left,

@@ -1,8 +1,8 @@
 """The exact truth of one synthetic scene on its left epipolar grid."""
 
-from stereotruth.evaluation.grid_truth import write_grid_truth
-from stereotruth.provenance import describe
-from stereotruth.runlog import job
+from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.job import job
+from stereotruth.products.provenance import describe
 from stereotruth.simulate.cities import CITIES
 
 if __name__ == "__main__":

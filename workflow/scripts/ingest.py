@@ -1,8 +1,8 @@
 """One LiDAR file to a point store."""
 
-from stereotruth.points import ingest
-from stereotruth.provenance import describe
-from stereotruth.runlog import job
+from stereotruth.job import job
+from stereotruth.lidar.ingest import ingest
+from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.job import job
+from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.matching.kinds import NETWORKS
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.matching.predictions import predict
-from stereotruth.runlog import job
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

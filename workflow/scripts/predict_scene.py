@@ -1,9 +1,8 @@
 """A stereo method over a whole scene."""
 
+from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.kinds import NETWORKS
-from stereotruth.matching.scenes import predict_scene
-from stereotruth.runlog import job
-from stereotruth.workers import dask_scheduler
+from stereotruth.matching.scenes.predict_scene import predict_scene
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method

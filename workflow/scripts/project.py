@@ -1,8 +1,7 @@
 """One scene's points to its disparity grid."""
 
-from stereotruth.disparity import project_scene
-from stereotruth.runlog import job
-from stereotruth.workers import dask_scheduler
+from stereotruth.disparity.project import project_scene
+from stereotruth.job import dask_scheduler, job
 
 if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, snakemake.config["dask"]["scheduler_address"]

@@ -1,8 +1,8 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
-from stereotruth.disparity import project_scene
-from stereotruth.grid_store import Strip
-from stereotruth.runlog import job
+from stereotruth.disparity.project import project_scene
+from stereotruth.job import job
+from stereotruth.products.grids import Strip
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)

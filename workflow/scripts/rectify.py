@@ -1,9 +1,9 @@
 """One aligned pair to epipolar images."""
 
-from stereotruth.alignment import Alignment
-from stereotruth.provenance import describe
-from stereotruth.rectification import rectify
-from stereotruth.runlog import job
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.job import job
+from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

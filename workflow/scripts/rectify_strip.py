@@ -1,9 +1,9 @@
 """One strip of an aligned pair to blocks of its epipolar images."""
 
-from stereotruth.alignment import Alignment
-from stereotruth.grid_store import Strip
-from stereotruth.rectification import rectify
-from stereotruth.runlog import job
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.job import job
+from stereotruth.products.grids import Strip
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from stereotruth.alignment import Alignment
-from stereotruth.points import PointStore
-from stereotruth.provenance import describe, digest, file_sha256
-from stereotruth.refinement import refine
-from stereotruth.refinement_report import write_refinement
-from stereotruth.runlog import job
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.refine import refine
+from stereotruth.alignment.refine_report import write_refinement
+from stereotruth.job import job
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.products.provenance import describe, digest, file_sha256
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

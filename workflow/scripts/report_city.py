@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from stereotruth.job import job
 from stereotruth.report.page import write_report
-from stereotruth.runlog import job
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from stereotruth.matching.benchmark import score
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.matching.strata import Products
-from stereotruth.runlog import job
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.job import job
+from stereotruth.matching.benchmark.score_method import score
+from stereotruth.matching.benchmark.strata import Products
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

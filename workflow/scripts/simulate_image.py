@@ -1,6 +1,6 @@
 """One image of a synthetic scene."""
 
-from stereotruth.runlog import job
+from stereotruth.job import job
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.render import simulate_image
 

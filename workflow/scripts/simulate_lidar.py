@@ -1,6 +1,6 @@
 """One LiDAR file of a synthetic scene."""
 
-from stereotruth.runlog import job
+from stereotruth.job import job
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.lidar import simulate_lidar_tile
 

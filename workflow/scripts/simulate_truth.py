@@ -1,8 +1,8 @@
 """The exact truth of a synthetic scene: per pixel, and as points."""
 
-from stereotruth.runlog import job
+from stereotruth.job import job
 from stereotruth.simulate.cities import CITIES
-from stereotruth.simulate.points import simulate_points
+from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.truth import simulate_truth
 
 if __name__ == "__main__":

@@ -2,18 +2,20 @@
 
 from pathlib import Path
 
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.job import job
 from stereotruth.matching.kinds import need_pytorch
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.runlog import job
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with job(snakemake.log[0], f"train {of.dataset} {of.method}"):
         need_pytorch(of.method, params.kind)
-        from stereotruth.matching.training import Training, model_of, train
+        from stereotruth.matching.networks.training import train
+        from stereotruth.matching.networks.training_settings import TrainingSettings
+        from stereotruth.matching.networks.training_state import model_of
 
         dataset = StereoDataset.of(of.dataset, params.dataset)
-        training = Training.of(params.training)
+        training = TrainingSettings.of(params.training)
         train(
             model_of(params.kind, dataset, training),
             dataset,

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from stereotruth.dataset.verify import verify
 from stereotruth.errors import InputError
-from stereotruth.runlog import job
-from stereotruth.verification import verify
+from stereotruth.job import job
 
 if __name__ == "__main__":
     with job(snakemake.log[0], "verify"):

@@ -1,1 +1,1 @@
-"""How good products are: against exact truth, at check points, and by warping images."""
+"""How good labels are. In: labels, images, exact truth, check points. Out: figures and tables."""

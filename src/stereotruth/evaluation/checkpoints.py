@@ -17,12 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control_points import ControlPoints, read_gcps
-from ..epipolar import EpipolarModel
-from ..grid_store import blocks, require_complete
-from .statistics import LIMITS, median_and_nmad
+from ..alignment.control_points import ControlPoints, read_gcps
+from ..epipolar.model import EpipolarModel
+from ..error_statistics import LIMITS, median_and_nmad
+from ..products.grids import blocks, require_complete
 
 Floats = NDArray[np.float64]
+
+
 STEP_PX = 1.0  # px of disparity between four neighbours: beyond, they are not one surface
 
 

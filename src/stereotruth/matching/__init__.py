@@ -1,0 +1,1 @@
+"""Stereo methods. In: epipolar pairs. Out: disparities, scores, surface models."""

@@ -1,5 +1,7 @@
 """The kinds of stereo methods as plain values, so that a workflow can plan with them."""
 
+from __future__ import annotations
+
 from importlib.util import find_spec
 
 from ..errors import InputError
@@ -7,7 +9,7 @@ from ..errors import InputError
 NETWORKS = ("stereonet", "psmnet", "hmsmnet")
 FOLDER = "folder"
 KINDS = ("sgm", *NETWORKS, "function", FOLDER)
-MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks")}
+MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks.inference")}
 LABELS = {"sgm": "SGM", "stereonet": "StereoNet", "psmnet": "PSM-Net", "hmsmnet": "HMSM-Net"}
 
 

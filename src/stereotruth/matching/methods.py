@@ -18,7 +18,6 @@ arguments, and returns the disparity as :class:`Matcher` says. What has ``scalin
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import inspect
 import sys
@@ -34,11 +33,12 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .kinds import FOLDER, KINDS, MODULES, NETWORKS
 
+DisparityRange = tuple[int, int]
+
+
 ENTRY_POINTS = "stereotruth.methods"
 SHOWN = ("kind", "label", "fine_tuned_of")  # keys of an entry that are no settings
 MARGIN_PX = 128  # of a user's function that states none
-
-DisparityRange = tuple[int, int]
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from ..figures import round_length
+from ..products.pictures import round_length
 
 SIDE = 300.0  # longer side of a frame of residuals
 SHARE = 1 / 8  # of the frame, taken by the longest arrow

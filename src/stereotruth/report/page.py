@@ -17,12 +17,13 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from .. import figures
-from ..grid_store import replacing
-from ..runlog import progress
-from ..verification import read_manifest
-from . import drawings, pictures, sections
-from .tables import gate, minus, missed, table, words
+from ..dataset import quick_looks
+from ..dataset.manifest import read_manifest
+from ..job import progress
+from ..products import pictures
+from ..products.files import replacing
+from ..products.html_tables import gate, minus, missed, table, words
+from . import drawings, sections, tile_pictures
 
 PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
 BASE64 = 3 / 4  # bytes of a picture per byte in the page
@@ -112,8 +113,8 @@ def write_report(
     )
     slider = (SLIDER_PX, _allowance("sliders", len(LARGE) * len(large), SLIDER_BYTES))
 
-    def work(row: Mapping[str, str]) -> pictures.TilePictures:
-        return pictures.tile_pictures(
+    def work(row: Mapping[str, str]) -> tile_pictures.TilePictures:
+        return tile_pictures.tile_pictures(
             folder, row, thumbnail=thumbnail, slider=slider if row["tile"] in large else None
         )
 
@@ -143,12 +144,12 @@ def write_report(
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "shares": {row["tile"]: sections.status_shares(row) for row in rows},
         "total": total,
-        "status_colours": pictures.status_colours(statuses),
-        "split_colours": figures.SPLIT_COLOURS,
+        "status_colours": tile_pictures.status_colours(statuses),
+        "split_colours": quick_looks.SPLIT_COLOURS,
         "turbo": pictures.gradient("turbo"),
         "diverging": pictures.gradient("RdBu"),
-        "no_match": f"rgb{pictures.NO_MATCH}",
-        "no_difference": f"rgb{pictures.NO_DIFFERENCE}",
+        "no_match": f"rgb{tile_pictures.NO_MATCH}",
+        "no_difference": f"rgb{tile_pictures.NO_DIFFERENCE}",
         "coverage": embedded(coverage, COVERAGE_PX),
         "index": sections.tile_index(rows),
         "residuals": sections.residuals(

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import figures
-from ..splits import NONE, SPLITS
-from . import drawings
-from .pictures import TilePictures
-from .tables import (
+from ..dataset import quick_looks
+from ..dataset.splits import NONE, SPLITS
+from ..products.html_tables import (
     Table,
     cells_of,
     columns_of,
@@ -25,6 +23,8 @@ from .tables import (
     table,
     words,
 )
+from . import drawings
+from .tile_pictures import TilePictures
 
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
@@ -258,7 +258,7 @@ def histograms(
         "scene": drawings.histograms([(s, colour, counted("scene", s)) for s in scenes]),
         "split": drawings.histograms(
             [
-                (s, figures.SPLIT_COLOURS[s], counted("split", s))
+                (s, quick_looks.SPLIT_COLOURS[s], counted("split", s))
                 for s in splits
                 if any(row.get("split") == s and row.get("disp") for row in rows)
             ]
@@ -293,7 +293,7 @@ def tile_index(rows: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
                 "y": y - top,
                 "size": size,
                 "complete": row["complete"] == "yes",
-                "colour": figures.SPLIT_COLOURS.get(row["split"], "#7f7f7f"),
+                "colour": quick_looks.SPLIT_COLOURS.get(row["split"], "#7f7f7f"),
                 "bad": bool(missed(row)),
             }
             for row, (x, y, size) in zip(here, boxes)

@@ -14,12 +14,13 @@ from pathlib import Path
 
 from ..errors import InputError
 from .cities import CITIES, CitySpec, SceneSpec, lidar_files
+from .control_points import simulate_points, write_gcps
 from .lidar import simulate_lidar_tile
-from .points import simulate_points, write_gcps
 from .render import simulate_image
 from .truth import simulate_truth
 
 log = logging.getLogger("stereotruth")
+
 
 SEED = 1
 

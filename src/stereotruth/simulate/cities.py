@@ -167,9 +167,9 @@ CITIES: dict[str, CitySpec] = {
         ),
     )
 }
+
+
 # fmt: on
-
-
 def _spec(city: CitySpec | str) -> CitySpec:
     return CITIES[city] if isinstance(city, str) else city
 

@@ -13,14 +13,16 @@ import numpy as np
 import pyproj
 
 from ..errors import InputError
-from ..grid_store import replacing
+from ..products.files import replacing
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .kernels import inlined, kernel
+from .layout import frame_of, half_size, image_axes
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
-from .world import build_surfaces, frame_of, half_size, image_axes
+from .world import build_surfaces
 
 log = logging.getLogger("stereotruth")
+
 
 FLYING_HEIGHT_M = 1100.0
 LINE_SPACING_M = 540.0  # ±13.8° off nadir

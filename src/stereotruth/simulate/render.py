@@ -13,18 +13,20 @@ import rasterio
 from rasterio.rpc import RPC as RPCMetadata
 
 from ..errors import InputError
-from ..grid_store import replacing
-from ..runlog import progress
+from ..job import progress
+from ..products.files import replacing
 from .appearance import reflectance
 from .camera import aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
 from .kernels import inlined, kernel
+from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import IN_IMAGES, Surfaces, cast, horizon, terrain_heights
-from .world import build_surfaces, frame_of, half_size, scene_coordinates
+from .world import build_surfaces
 
 log = logging.getLogger("stereotruth")
+
 
 FULL_SCALE = 2047  # 11 bits
 STRIP_ROWS = 128
@@ -44,7 +46,7 @@ class Camera(NamedTuple):
     horizon: np.ndarray
 
 
-class Scene(NamedTuple):
+class ImagedScene(NamedTuple):
     """What every job on a scene starts from."""
 
     city: CitySpec
@@ -55,13 +57,13 @@ class Scene(NamedTuple):
     right: Camera
 
 
-def prepare(city: CitySpec, scene: SceneSpec) -> Scene:
+def prepare(city: CitySpec, scene: SceneSpec) -> ImagedScene:
     """World and cameras of a scene; kept for further calls of the same process."""
     return _prepare(city, scene)
 
 
 @lru_cache(maxsize=4)
-def _prepare(city: CitySpec, scene: SceneSpec) -> Scene:
+def _prepare(city: CitySpec, scene: SceneSpec) -> ImagedScene:
     surfaces = build_surfaces(city)
     frame = frame_of(city)
     # heights of the ground that the left image can show
@@ -106,7 +108,7 @@ def _prepare(city: CitySpec, scene: SceneSpec) -> Scene:
         _, toward = rays(cam, [[(cols - 1) / 2, (rows - 1) / 2]])
         above = horizon(surfaces.cell_top, toward[0, 0], toward[0, 1])
         cameras.append(Camera(view, cam, cols, rows, rpc, above))
-    return Scene(city, scene, frame, surfaces, *cameras)
+    return ImagedScene(city, scene, frame, surfaces, *cameras)
 
 
 @inlined

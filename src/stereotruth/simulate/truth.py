@@ -10,8 +10,8 @@ import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
-from ..grid_store import building
-from ..runlog import progress
+from ..job import progress
+from ..products.grids import building
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
@@ -21,6 +21,7 @@ from .render import in_collar, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
 
 log = logging.getLogger("stereotruth")
+
 
 CHUNK = 512
 SEEN_TOLERANCE_M = 0.02

@@ -1,0 +1,216 @@
+"""Corrections of both RPCs from tie points and control points, by robust least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.fit import fit_epipolar
+from ..epipolar.model import EpipolarModel
+from ..epipolar.rpc import SensorModel
+from .align import RPC_TILT
+from .aligned_pair import Alignment
+from .tie_points import Geometry, TiePoints
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+
+MATCHING = 0.01  # px, what even the best match may be off
+SYSTEMATIC = 0.01  # px that all tie points may have in common, along and across the rows
+FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
+TUKEY = 4.685  # deviations at which an observation has lost all weight
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """n tie points against an alignment, in px of the epipolar grid; [n, 2] is along, across rows.
+
+    ``at``: place in the left grid.
+    ``before``: disparity of LiDAR minus that of the images, and y-parallax (y of the right position
+    found minus that of the left), with the alignment as it came; ``after`` with the refined one.
+    ``used`` bool[n]: not a blunder.
+    """
+
+    ties: TiePoints
+    at: Floats
+    before: Floats
+    after: Floats
+    used: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on.
+
+    ``ratio``, ``site_ratio`` [2]: standard deviation of a match along and across the rows, and the
+    part that a site shares, in units of the match's own. ``statistic``: chi-square of the
+    observations against no change, ``pull``: that of the change against the prior.
+    """
+
+    parameters: Floats
+    covariance: Floats
+    weights: Floats
+    ratio: Floats
+    site_ratio: Floats
+    statistic: float
+    freedom: int
+    pull: float
+    pull_freedom: int
+
+
+def prior_of(alignment: Alignment) -> Floats:
+    """Covariance [12, 12] of both fits; what a simpler model keeps fixed may be off as RPCs are."""
+    prior = alignment.covariance.copy()
+    if alignment.model == "affine":
+        return prior
+    free = np.zeros((6, 6))
+    free[[0, 1, 3, 4], [0, 1, 3, 4]] = 1.0
+    if alignment.model == "similarity":
+        for turn in ([1, 0, 0, 0, 1, 0], [0, -1, 0, 1, 0, 0]):
+            free -= np.outer(turn, turn) / 2.0
+    for k, fit in enumerate(alignment.fits):
+        own = slice(6 * k, 6 * k + 6)
+        prior[own, own] += free * (RPC_TILT * fit.scale) ** 2
+    return prior
+
+
+def _root(covariance: Floats) -> Floats:
+    """[12, r] with covariance = root · rootᵀ, without the directions that are fixed."""
+    values, vectors = np.linalg.eigh(covariance)
+    keep = values > 1e-12 * values.max()
+    return vectors[:, keep] * np.sqrt(values[keep])
+
+
+def robust_scale(residuals: Floats, used: Bools) -> float:
+    """Robust standard deviation about zero."""
+    return max(1.4826 * float(np.median(np.abs(residuals[used]))), 1e-4)
+
+
+def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s: float) -> float:
+    """Standard deviation that the places of a site share, from the scatter of the sites' means."""
+    total = np.bincount(sites, weights)
+    full = total > 1.0
+    mean = np.bincount(sites, weights * residuals)[full] / total[full]
+    own = s**2 * np.bincount(sites, weights**2)[full] / total[full] ** 2
+    return float(
+        np.sqrt(max(robust_scale(mean, np.ones(mean.size, bool)) ** 2 - np.median(own), 0.0))
+    )
+
+
+def estimate(
+    design: Floats, observed: Floats, own: Floats, sites: NDArray[np.int64], prior: Floats
+) -> Estimate:
+    """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
+
+    ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
+    poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
+    is the covariance about zero. Observations of one site, int[n], share errors.
+    """
+    root = _root(prior)
+    sites = np.unique(sites, return_inverse=True)[1]
+    counts = np.bincount(sites)[sites]
+    expected = np.hypot(own, MATCHING)[:, None]
+    inner = design @ root
+    rank = root.shape[1]
+    used = np.ones(len(observed), bool)
+    residuals = observed - np.median(observed, axis=0)
+    z = np.zeros(rank)
+    sigma, site_sigma = np.ones(2), np.zeros(2)
+    weights = np.ones(len(observed))
+    for step in range(40):
+        relative = residuals / expected
+        sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+        length = np.hypot(*(relative / sigma).T)
+        if step < 8:  # first a convex one: Huber's, which any start leads to its minimum
+            weights = np.minimum(1.0, 2.0 / np.maximum(length, 1e-12))
+        else:
+            weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
+            used = weights > 0.0
+            sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+            site_sigma = np.array(
+                [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
+            )
+        variance = expected**2 * (sigma**2 + counts[:, None] * site_sigma**2)
+        information = weights[:, None] / variance
+        weighted = inner * information[:, :, None]
+        normal = np.einsum("nap,naq->pq", weighted, inner)
+        right = np.einsum("nap,na->p", weighted, observed)
+        shared = weighted.sum(axis=0).T  # [r, 2], with what all observations have in common
+        total = information.sum(axis=0) + SYSTEMATIC**-2.0
+        normal -= (shared / total) @ shared.T
+        right -= (shared / total) @ np.sum(information * observed, axis=0)
+        last = z
+        # Weights and scatter are those about what the tie points say by themselves: an alignment
+        # that is far off and sure of itself shall not make them look bad.
+        z = np.linalg.solve(FREE * np.eye(rank) + normal, right)
+        residuals = observed - inner @ z
+        if step > 12 and np.abs(inner @ (z - last)).max() < 1e-5:
+            break
+    z = np.linalg.solve(np.eye(rank) + normal, right)
+    values, vectors = np.linalg.eigh(normal)
+    seen = values > 1e-9 * values.max()
+    statistic = float(np.sum((vectors[:, seen].T @ right) ** 2 / values[seen]))
+    covariance = root @ np.linalg.inv(np.eye(rank) + normal) @ root.T
+    return Estimate(
+        np.round(root @ z, 8),  # so that the count of threads leaves no trace
+        np.round(covariance, 14),
+        weights,
+        sigma,
+        site_sigma,
+        statistic,
+        int(seen.sum()),
+        float(z @ z),
+        rank,
+    )
+
+
+def linearised_at(
+    alignment: Alignment, model: EpipolarModel, ties: TiePoints | Geometry
+) -> tuple[Floats, Floats]:
+    """Change [n, 2, 12] of (along, across) with the parameters, and [n, 2, 2] with the shift."""
+    slopes = model.right_image.slopes(ties.right[:, 0], ties.right[:, 1])
+    left, right = (
+        fit.design(at[:, 0], at[:, 1]) for fit, at in zip(alignment.fits, (ties.left, ties.right))
+    )
+    return np.concatenate([-slopes @ ties.carry @ left, slopes @ right], axis=-1), slopes
+
+
+def with_corrections(alignment: Alignment, parameters: Floats) -> Alignment:
+    """The alignment with both affines moved by parameters [12]."""
+    fits = []
+    for fit, own in zip(alignment.fits, (parameters[:6], parameters[6:])):
+        affine = fit.moved(own)
+        gcps = []
+        for gcp in fit.gcps:
+            after = np.array(gcp.measured) - affine @ (*gcp.predicted, 1.0)
+            gcps.append(replace(gcp, after=tuple(after.tolist())))
+        fits.append(replace(fit, affine=affine, gcps=tuple(gcps)))
+    return replace(
+        alignment,
+        left=SensorModel(alignment.left.rpc, fits[0].affine),
+        right=SensorModel(alignment.right.rpc, fits[1].affine),
+        left_fit=fits[0],
+        right_fit=fits[1],
+    )
+
+
+def epipolar_model(alignment: Alignment) -> EpipolarModel:
+    """The epipolar model of the corrected RPCs."""
+    return fit_epipolar(
+        alignment.left,
+        alignment.right,
+        alignment.left_fit.size,
+        alignment.right_fit.size,
+        alignment.reference_height,
+    )
+
+
+def pull_of(design: Floats, observed: Floats, prior: Floats) -> Floats:
+    """Parameters [12] for places [n] that all together tell one shift, to a pixel."""
+    root = _root(prior)
+    inner = (design @ root).reshape(-1, root.shape[1])
+    normal = np.eye(root.shape[1]) + inner.T @ inner / len(design)
+    return root @ np.linalg.solve(normal, inner.T @ observed.ravel() / len(design))

@@ -1,0 +1,293 @@
+"""The corrected RPCs of a pair, with residuals and covariance: alignment.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..epipolar.model import EpipolarModel
+from ..epipolar.rpc import SensorModel
+from ..errors import InputError
+from ..products.files import replacing
+
+Floats = NDArray[np.float64]
+
+
+UNITS = {
+    "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
+    "lon, lat": "degrees, WGS 84",
+    "height": "m above the WGS 84 ellipsoid",
+    "affine": "(col, row)_image = affine @ (col_rpc, row_rpc, 1); px",
+    "covariance": "px^2, of (a_u, a_v, a_1, b_u, b_v, b_1) in col = … + a_u u + a_v v + a_1, "
+    "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",
+    "cross_covariance": "px^2, of the left image's parameters (rows) with the right's",
+}
+
+
+@dataclass(frozen=True)
+class GcpResidual:
+    """One GCP in one view. Pairs are (col, row) in px, measured minus predicted.
+
+    ``predicted`` by the RPC alone; ``before`` and ``after`` the correction; ``leave_one_out`` by
+    the correction fitted without this point (NaN if that is undetermined). ``reason`` says why a
+    point is not ``used``.
+    """
+
+    id: str
+    lon: float
+    lat: float
+    height: float
+    measured: tuple[float, float]
+    predicted: tuple[float, float]
+    before: tuple[float, float]
+    after: tuple[float, float]
+    leave_one_out: tuple[float, float]
+    used: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFit:
+    """The fit of one view.
+
+    ``size`` (cols, rows) of the image; ``sigma0`` px per coordinate, from the redundancy of the
+    fit (NaN without any); ``covariance`` float64[6, 6] in px² of the affine's parameters in
+    normalised coordinates (u, v) = ((col, row)_rpc − origin) / scale, in the order
+    col: u, v, 1, row: u, v, 1 (few redundant GCPs may agree by chance: see CAREFUL_SIGMA).
+    """
+
+    view: str
+    image: str
+    size: tuple[int, int]
+    affine: Floats
+    gcps: tuple[GcpResidual, ...]
+    sigma0: float
+    redundancy: int
+    origin: tuple[float, float]
+    scale: float
+    covariance: Floats
+
+    @property
+    def left_out(self) -> tuple[GcpResidual, ...]:
+        """The GCPs that did not take part."""
+        return tuple(gcp for gcp in self.gcps if not gcp.used)
+
+    def rms(self, which: str) -> float:
+        """Root mean square length in px over the used GCPs: before, after or leave_one_out.
+
+        NaN without any.
+        """
+        pairs = np.array([getattr(gcp, which) for gcp in self.gcps if gcp.used])
+        if not pairs.size:
+            return math.nan
+        return float(np.sqrt(np.mean(np.sum(pairs**2, axis=1))))
+
+    def covariance_at(self, col: ArrayLike, row: ArrayLike) -> Floats:
+        """Covariance [..., 2, 2] in px² of the corrected (col, row) at image points.
+
+        That is the part of a projected point's error that stems from the GCPs' measurement.
+        """
+        design = self.design(col, row)
+        return design @ self.covariance @ np.swapaxes(design, -1, -2)
+
+    def design(self, col: ArrayLike, row: ArrayLike) -> Floats:
+        """[..., 2, 6]: change of the corrected (col, row) with the parameters of ``covariance``."""
+        col, row = np.broadcast_arrays(np.asarray(col, float), np.asarray(row, float))
+        image = np.stack([col, row], axis=-1) - self.affine[:, 2]
+        rpc = image @ np.linalg.inv(self.affine[:, :2]).T
+        u = (rpc - np.array(self.origin)) / self.scale
+        basis = np.concatenate([u, np.ones((*u.shape[:-1], 1))], axis=-1)
+        design = np.zeros((*basis.shape[:-1], 2, 6))
+        design[..., 0, :3] = design[..., 1, 3:] = basis
+        return design
+
+    def moved(self, parameters: Floats) -> Floats:
+        """The affine float64[2, 3] plus small parameters [6] in the order of ``covariance``."""
+        change = parameters.reshape(2, 3)
+        linear = change[:, :2] / self.scale
+        shift = change[:, 2] - linear @ np.array(self.origin)
+        return self.affine + np.column_stack([linear, shift])
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Aligned sensor models of a pair, with how they were found.
+
+    ``reference_height``: mean of the GCPs that are used in either view (without any: of the RPCs,
+    after refinement of the tie points), ellipsoidal m.
+    ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
+    ``refinement``: what `refine` observed and changed, empty before.
+    """
+
+    scene: str
+    model: str
+    left: SensorModel
+    right: SensorModel
+    left_fit: ViewFit
+    right_fit: ViewFit
+    reference_height: float
+    warnings: tuple[str, ...]
+    provenance: dict[str, Any]
+    cross_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    refinement: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> Floats:
+        """float64[12, 12] px² of the parameters of both fits, left first."""
+        left, right = (fit.covariance for fit in self.fits)
+        return np.block([[left, self.cross_covariance], [self.cross_covariance.T, right]])
+
+    def label_sigma(
+        self, model: EpipolarModel, x: ArrayLike, y: ArrayLike
+    ) -> tuple[Floats, Floats, Floats]:
+        """Standard uncertainty in px that the alignment gives to labels at epipolar (x, y).
+
+        Of the disparity, and of the label's own x and y in the left grid. For points at the
+        reference height; NaN where the model has no ground.
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        height = model.reference_height
+        left = np.stack(model.epipolar_to_left(x, y), axis=-1)
+        ground = model.left.localize(left[..., 0], left[..., 1], height)
+        right = np.stack(model.right.project(*ground, height), axis=-1)
+        effects = [
+            image.slopes(at[..., 0], at[..., 1]) @ fit.design(at[..., 0], at[..., 1])
+            for image, at, fit in zip(
+                (model.left_image, model.right_image), (left, right), self.fits
+            )
+        ]
+        disparity = np.concatenate([effects[0][..., 0, :], -effects[1][..., 0, :]], axis=-1)
+        of_left = self.left_fit.covariance
+        variances = [np.einsum("...i,ij,...j->...", disparity, self.covariance, disparity)]
+        for axis in (0, 1):
+            e = effects[0][..., axis, :]
+            variances.append(np.einsum("...i,ij,...j->...", e, of_left, e))
+        return tuple(np.sqrt(np.maximum(v, 0.0)) for v in variances)
+
+    @property
+    def fits(self) -> tuple[ViewFit, ViewFit]:
+        """Left and right."""
+        return self.left_fit, self.right_fit
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready; what is undetermined is null."""
+        views = {
+            name: sensor.to_dict() | _fit_to_dict(fit)
+            for name, sensor, fit in (
+                ("left", self.left, self.left_fit),
+                ("right", self.right, self.right_fit),
+            )
+        }
+        return {
+            "what": "RPCs of a stereo pair, corrected by ground control points",
+            "units": UNITS,
+            "scene": self.scene,
+            "model": self.model,
+            "reference_height": self.reference_height,
+            **views,
+            "cross_covariance": self.cross_covariance.tolist(),
+            "refinement": self.refinement,
+            "warnings": list(self.warnings),
+            "provenance": self.provenance,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Alignment:
+        """The inverse of :meth:`to_dict`."""
+        return cls(
+            scene=values["scene"],
+            model=values["model"],
+            left=SensorModel.from_dict(values["left"]),
+            right=SensorModel.from_dict(values["right"]),
+            left_fit=_fit_from_dict("left", values["left"]),
+            right_fit=_fit_from_dict("right", values["right"]),
+            reference_height=values["reference_height"],
+            warnings=tuple(values["warnings"]),
+            provenance=values["provenance"],
+            cross_covariance=np.array(values["cross_covariance"]),
+            refinement=values["refinement"],
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON; the file appears when it is whole."""
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+        with replacing(path) as scratch:
+            scratch.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Alignment:
+        """Read what :meth:`save` wrote. Raises InputError if it cannot be used."""
+        try:
+            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        except FileNotFoundError as error:
+            raise InputError(
+                "no such alignment", file=path, remedy="run the align stage"
+            ) from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"not an alignment ({error})", file=path, remedy="run the align stage again"
+            ) from error
+
+
+def _fit_to_dict(fit: ViewFit) -> dict[str, Any]:
+    def pair(values: tuple[float, float]) -> list[float | None]:
+        return [float(v) if math.isfinite(v) else None for v in values]
+
+    gcps = [
+        {
+            "id": g.id,
+            "lon": g.lon,
+            "lat": g.lat,
+            "height": g.height,
+            "measured": pair(g.measured),
+            "predicted": pair(g.predicted),
+            "before": pair(g.before),
+            "after": pair(g.after),
+            "leave_one_out": pair(g.leave_one_out),
+            "used": g.used,
+            "reason": g.reason,
+        }
+        for g in fit.gcps
+    ]
+    rms = {which: fit.rms(which) for which in ("before", "after", "leave_one_out")}
+    return {
+        "image": fit.image,
+        "size": list(fit.size),
+        "gcps": gcps,
+        "left_out": [g.id for g in fit.left_out],
+        "rms": {name: value if math.isfinite(value) else None for name, value in rms.items()},
+        "sigma0": fit.sigma0 if math.isfinite(fit.sigma0) else None,
+        "redundancy": fit.redundancy,
+        "origin": list(fit.origin),
+        "scale": fit.scale,
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def _fit_from_dict(view: str, values: Mapping[str, Any]) -> ViewFit:
+    def gcp(record: Mapping[str, Any]) -> GcpResidual:
+        pairs = {
+            name: tuple(math.nan if v is None else v for v in record[name])
+            for name in ("measured", "predicted", "before", "after", "leave_one_out")
+        }
+        return GcpResidual(**{**record, **pairs})
+
+    return ViewFit(
+        view=view,
+        image=values["image"],
+        size=tuple(values["size"]),
+        affine=np.array(values["affine"]),
+        gcps=tuple(gcp(record) for record in values["gcps"]),
+        sigma0=math.nan if values["sigma0"] is None else values["sigma0"],
+        redundancy=values["redundancy"],
+        origin=tuple(values["origin"]),
+        scale=values["scale"],
+        covariance=np.array(values["covariance"]),
+    )

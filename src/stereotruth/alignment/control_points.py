@@ -1,0 +1,178 @@
+"""Reading of control and check points: ground coordinates with their measured image positions.
+
+A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``: WGS 84 longitude
+and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each original image, pixel
+(0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
+see the point.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
+HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """n points in ascending order of their ids, whatever the order in the file.
+
+    ``lon``, ``lat`` degrees and ``height`` ellipsoidal m, float64[n]; ``left``, ``right``
+    float64[n, 2] measured (col, row) px, NaN where the view does not see the point; ``line``:
+    line of the file.
+    """
+
+    file: Path
+    ids: tuple[str, ...]
+    line: tuple[int, ...]
+    lon: Floats
+    lat: Floats
+    height: Floats
+    left: Floats
+    right: Floats
+
+    @property
+    def in_left(self) -> NDArray[np.bool_]:
+        """bool[n]: measured in the left image."""
+        return np.isfinite(self.left[:, 0])
+
+    @property
+    def in_right(self) -> NDArray[np.bool_]:
+        """bool[n]: measured in the right image."""
+        return np.isfinite(self.right[:, 0])
+
+
+def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
+    """Read and check the ground control points (or check points) of a scene.
+
+    Takes a byte-order mark, CRLF, blank lines, spaces around cells and columns in any order.
+
+    Raises InputError, naming the file and the line, for anything else that is not as it should be.
+    """
+    file = Path(file)
+    of = f" (scene {scene})" if scene else ""
+
+    def fail(problem: str, remedy: str) -> InputError:
+        return InputError(problem + of, file=file, remedy=remedy)
+
+    rows = _rows(file, fail)
+    points: dict[str, tuple[int, list[float]]] = {}
+    for line, cells in rows:
+        name = cells["id"]
+        if not name:
+            raise fail(f"line {line}: the id is empty", "give every point an id of its own")
+        if name in points:
+            raise fail(
+                f"lines {points[name][0]} and {line} both have the id {name!r}",
+                "give every point an id of its own",
+            )
+        points[name] = line, _values(name, line, cells, fail)
+    if not points:
+        raise fail("there are no points in the file", "add one line per point under the header")
+    ids = sorted(points)
+    values = np.array([points[name][1] for name in ids])
+    return ControlPoints(
+        file=file,
+        ids=tuple(ids),
+        line=tuple(points[name][0] for name in ids),
+        lon=values[:, 0].copy(),
+        lat=values[:, 1].copy(),
+        height=values[:, 2].copy(),
+        left=values[:, 3:5].copy(),
+        right=values[:, 5:7].copy(),
+    )
+
+
+def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
+    """(line number, stripped cells by column) of each line that holds anything."""
+    try:
+        text = file.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise fail("no such file", "correct the path in column gcps of the scenes sheet") from None
+    except (UnicodeDecodeError, OSError) as error:
+        raise fail(f"cannot be read as text ({error})", "save it as CSV in UTF-8") from None
+    header: list[str] | None = None
+    rows = []
+    reader = csv.reader(text.splitlines())
+    expected = f"the header is {','.join(COLUMNS)}"
+    for cells in reader:
+        cells = [cell.strip() for cell in cells]
+        if not any(cells):
+            continue
+        if header is None:
+            header = [cell.lower() for cell in cells]
+            if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+                raise fail(
+                    "columns are not separated by commas", "save it with commas, and decimal points"
+                )
+            missing = [c for c in COLUMNS if c not in header]
+            unknown = [c for c in header if c not in COLUMNS]
+            if missing or unknown or len(header) != len(set(header)):
+                wrong = [f"column {c!r} is missing" for c in missing]
+                wrong += [f"column {c!r} is unknown" for c in unknown]
+                raise fail("; ".join(wrong) or "a column occurs twice", expected)
+            continue
+        if len(cells) != len(header):
+            raise fail(
+                f"line {reader.line_num} has {len(cells)} cells for {len(header)} columns",
+                "write one cell per column, empty ones too, and decimal points",
+            )
+        rows.append((reader.line_num, dict(zip(header, cells))))
+    if header is None:
+        raise fail("the file is empty", expected)
+    return rows
+
+
+def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:
+    """The seven numbers of a point, checked; NaN for empty image coordinates."""
+    values = []
+    for column in COLUMNS[1:]:
+        text = cells[column]
+        if not text and column not in COLUMNS[1:4]:
+            values.append(np.nan)
+            continue
+        try:
+            number = float(text)
+        except ValueError:
+            number = np.nan
+        if not np.isfinite(number):
+            what = "is empty" if not text else f"{text!r} is no number"
+            raise fail(f"line {line}, point {name}: {column} {what}", "write a decimal number")
+        values.append(number)
+    lon, lat, height, *image = values
+    if abs(lat) > 90 or not -180 <= lon <= 360:
+        where = f"line {line}, point {name}: lon {lon:g}, lat {lat:g}"
+        if abs(lon) <= 90 and abs(lat) <= 360:
+            raise fail(f"{where}: lon and lat seem to be swapped", "exchange the two columns")
+        raise fail(
+            f"{where} are no degrees",
+            "give WGS 84 longitude and latitude in degrees, not projected coordinates",
+        )
+    if not HEIGHT_RANGE[0] <= height <= HEIGHT_RANGE[1]:
+        raise fail(
+            f"line {line}, point {name}: a height of {height:g} m is not of this Earth",
+            "give ellipsoidal heights in metres",
+        )
+    for view, pair in (("left", image[:2]), ("right", image[2:])):
+        if np.isnan(pair[0]) != np.isnan(pair[1]):
+            raise fail(
+                f"line {line}, point {name}: only one of {view}_col, {view}_row is given",
+                "give both, or leave both empty where the image does not show the point",
+            )
+    if np.isnan(image).all():
+        raise fail(
+            f"line {line}, point {name} is measured in neither image",
+            "give its position in at least one image, or remove it",
+        )
+    return values

@@ -1,0 +1,318 @@
+"""Automatic refinement of an alignment: what is left between LiDAR and the two images is removed.
+
+GCPs of 0.25 px leave 0.1 to 0.25 px of y-parallax and of difference between the disparities of
+LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative error directly. What
+both images have in common they see on slopes only, as LiDAR strips are co-registered by their
+heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
+both affines are estimated together, the GCP fits and their covariance being the prior: tie points
+settle the relative part, and the rest as far as they see it.
+
+Blunders (moved or built since, vegetation, water, repetition) get no weight (Tukey's biweight).
+Thousands of matches do not pretend thousandths of a pixel: neighbours share errors, by an amount
+that is estimated from the scatter between sites, and all share SYSTEMATIC px at least. If the tie
+points do not contradict the alignment, it is left exactly as it is.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ..epipolar.image_reader import CACHE_MB, Source
+from ..error_statistics import median_and_nmad
+from ..errors import InputError
+from ..lidar.point_store import PointStore
+from .adjustment import (
+    SYSTEMATIC,
+    Estimate,
+    Observations,
+    epipolar_model,
+    estimate,
+    linearised_at,
+    prior_of,
+    pull_of,
+    robust_scale,
+    with_corrections,
+)
+from .aligned_pair import Alignment, ViewFit
+from .tie_points import Geometry, TiePoints, common_shift, match
+from .tie_sites import choose_sites, find_places
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+FINE = 6  # px: radius of the first search around every place
+FINEST = 2  # px: of the last
+COARSEST = 48  # px: of a search for the shift that all places have in common
+CLEAR = 8.0  # standard deviations that its peak must rise
+ROUNDS = 5
+SETTLED = 0.01  # px, change of a round after which no other follows
+MOVED = 3.0  # px in the left image after which places are looked for anew
+MIN_PLACES, MIN_SITES = 30, 8
+LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
+MIN_USED = 0.5
+DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
+SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
+
+
+def _spread(values: Floats, ties: TiePoints, size: tuple[int, int]) -> dict[str, float]:
+    """Figures of one component [n] in px; the trend is that of a plane over the left image."""
+    median, nmad = median_and_nmad(values)
+    middle, half = np.array(size) / 2, max(size) / 2
+    design = np.column_stack([(ties.left - middle) / half, np.ones(len(values))])
+    plane = np.linalg.lstsq(design, values, rcond=None)[0]
+    figures = {
+        "median": median,
+        "nmad": nmad,
+        "rms": float(np.sqrt(np.mean(values**2))),
+        "trend_rms": float(np.sqrt(np.mean((design @ plane) ** 2))),
+        "trend_over_half_the_image_col": float(plane[0]),
+        "trend_over_half_the_image_row": float(plane[1]),
+    }
+    return {name: round(value, 4) for name, value in figures.items()}
+
+
+def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:
+    """How far an affine moves the positions of an image from where the fit has them, px."""
+    cols, rows = fit.size
+    col, row = np.meshgrid(np.linspace(0, cols - 1, 9), np.linspace(0, rows - 1, 9))
+    here = np.stack([col.ravel(), row.ravel()])
+    rpc = np.linalg.solve(fit.affine[:, :2], here - fit.affine[:, 2:])
+    moved = affine[:, :2] @ rpc + affine[:, 2:] - here
+    return {
+        "mean_col": round(float(moved[0].mean()), 4),
+        "mean_row": round(float(moved[1].mean()), 4),
+        "largest": round(float(np.hypot(*moved).max()), 4),
+    }
+
+
+def _record(
+    alignment: Alignment,
+    refined: Alignment,
+    observations: Observations,
+    found: Estimate,
+    reason: str,
+) -> dict[str, Any]:
+    """JSON-ready figures of a refinement; ``reason`` why it was not applied, or empty."""
+    used, ties = observations.used, observations.ties
+    size = alignment.left_fit.size
+    spreads = {
+        word: {
+            name: _spread(values[used, k], _subset(ties, used), size)
+            for k, name in enumerate(("disparity", "y_parallax"))
+        }
+        for word, values in (("before", observations.before), ("after", observations.after))
+    }
+    return {
+        "applied": not reason,
+        "reason": reason,
+        "tie_points": len(ties),
+        "used": int(used.sum()),
+        "sites": int(np.unique(ties.site[used]).size),
+        "chi_square": round(found.statistic, 2),
+        "degrees_of_freedom": found.freedom,
+        "probability_by_chance": _chance(found),
+        "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
+        "shared_in_a_site": found.site_ratio.round(3).tolist(),
+        "sigma_shared_by_all_px": SYSTEMATIC,
+        **spreads,
+        "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
+        "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
+        "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
+        "of the images, and y-parallax; changes in px of the original images over the whole image",
+    }
+
+
+def _subset(ties: TiePoints, which: Bools) -> TiePoints:
+    return TiePoints(**{name: values[which] for name, values in vars(ties).items()})
+
+
+def _chance(found: Estimate) -> float:
+    return float(f"{chi2.sf(found.statistic, found.freedom):.3g}")
+
+
+def _search(
+    alignment: Alignment,
+    sources: tuple[Source, Source],
+    stores: Sequence[PointStore],
+    prior: Floats,
+) -> tuple[Observations, Estimate, Alignment] | str:
+    """Tie points, estimate and refined alignment; or why there is none."""
+    sizes = sources[0].size, sources[1].size
+    parameters = np.zeros(12)
+    places, found_at = None, parameters
+    radius = FINE
+    current = alignment
+    for number in range(ROUNDS):
+        if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
+            sites = choose_sites(current.left, current.right, sizes, stores)
+            places = find_places(current.left, current.right, sources[0], stores, sites)
+            found_at = parameters
+            if len(places) < MIN_PLACES:
+                return f"only {len(places)} places of smooth, textured ground"
+        model = epipolar_model(current)
+        geometry = Geometry.of(places, current.left, current.right)
+        if number == 0:
+            design, slopes = linearised_at(current, model, geometry)
+            spread = np.sqrt(np.einsum("nap,pq,naq->na", design, prior, design).max())
+            if 4.0 * spread > FINE:
+                shift, clearness = common_shift(
+                    places, geometry, sources, min(int(4.0 * spread), COARSEST)
+                )
+                log.info("coarse search: %s px at %.1f deviations", shift, clearness)
+                if clearness < CLEAR:
+                    return "no shift at which the images agree with the LiDAR stands out"
+                observed = np.einsum("nab,nbc,c->na", slopes, geometry.carry, shift)
+                step = pull_of(design, observed, prior)
+                parameters = parameters + step
+                current = with_corrections(alignment, parameters)
+                continue
+        ties = match(places, geometry, sources, radius)
+        if len(ties) < MIN_PLACES or np.unique(ties.site).size < MIN_SITES:
+            return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
+        design, slopes = linearised_at(current, model, ties)
+        observed = np.einsum("nab,nb->na", slopes, ties.shift)
+        found = estimate(design, observed + design @ parameters, ties.sigma, ties.site, prior)
+        change = float(np.abs(design @ (found.parameters - parameters)).max())
+        log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
+        last, parameters = parameters, found.parameters
+        current = with_corrections(alignment, parameters)
+        if change < SETTLED and radius == FINEST:
+            break
+        radius = FINEST if change < FINEST / 2 or radius == FINEST else FINE
+    observations = Observations(
+        ties,
+        np.stack(model.left_to_epipolar(*ties.left.T), axis=1),
+        observed + design @ last,
+        observed + design @ (last - parameters),
+        found.weights > 0.0,
+    )
+    scatter = max(robust_scale(observations.after[:, k], found.weights > 0.0) for k in (0, 1))
+    used = float(np.mean(found.weights > 0.0))
+    if scatter > LOOSE or used < MIN_USED:
+        return (
+            f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
+            "blunders): LiDAR and images do not show the same ground, or not at the same height"
+        )
+    return observations, found, current
+
+
+def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
+    """What is odd about a refinement that is applied all the same."""
+    if chi2.sf(found.pull, found.pull_freedom) > DOUBTFUL:
+        return []
+    ratio = abs(epipolar_model(alignment).report["disparity_px_per_m"]["mean"])
+    offset = record["before"]["disparity"]["median"]
+    return [
+        "LiDAR and images differ by more than the ground control points' own scatter explains: "
+        f"{offset:+.2f} px of disparity ({offset / ratio:+.2f} m of height), "
+        f"{record['before']['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
+        "vertical datum and the points' heights"
+    ]
+
+
+def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
+    for text in doubts:
+        log.warning("warning: %s", text)
+    if strict and doubts:
+        raise InputError(
+            f"{doubts[0]}{of}",
+            file=image,
+            remedy="check LiDAR and GCPs, or set strict or alignment.refine to false",
+        )
+
+
+def _moved_left(alignment: Alignment, parameters: Floats) -> float:
+    fit = alignment.left_fit
+    return _changes(fit, fit.moved(parameters[:6]))["largest"]
+
+
+def refine(
+    alignment: Alignment,
+    left_image: str | Path,
+    right_image: str | Path,
+    point_stores: Sequence[str | Path],
+    *,
+    strict: bool = False,
+    provenance: Mapping[str, Any] | None = None,
+) -> tuple[Alignment, Observations | None]:
+    """Refine an alignment by tie points between LiDAR and both images.
+
+    Returns the alignment, with the record of what was done in ``refinement``, and the
+    observations. It is the one that came, affines and all, if the tie points do not contradict
+    it or are too few. Reads a fixed number of places, whatever the scene's size. ``strict`` makes
+    warnings errors.
+
+    Raises InputError if there are neither GCPs nor usable tie points.
+    """
+    of = f" (scene {alignment.scene})" if alignment.scene else ""
+    with (
+        rasterio.Env(GDAL_CACHEMAX=CACHE_MB),
+        Source(left_image) as left,
+        Source(right_image) as right,
+    ):
+        stores = [PointStore(path) for path in sorted(Path(p) for p in point_stores)]
+        prior = prior_of(alignment)
+        result = _search(alignment, (left, right), stores, prior)
+    record_of = dict(provenance or alignment.provenance)
+    if isinstance(result, str):
+        if not any(fit.gcps for fit in alignment.fits):
+            raise InputError(
+                f"no alignment without ground control points: {result}{of}",
+                file=left_image,
+                remedy="measure GCPs, and check that LiDAR and images show the same ground",
+            )
+        _warn([f"not refined: {result}"], strict, left_image, of)
+        record = {"applied": False, "reason": result}
+        return replace(alignment, refinement=record, provenance=record_of), None
+    observations, found, refined = result
+    insignificant = _chance(found) > SIGNIFICANT
+    reason = "the tie points do not contradict the alignment" if insignificant else ""
+    record = _record(alignment, refined, observations, found, reason)
+    covariance = found.covariance
+    if insignificant:  # what is not applied adds to the uncertainty
+        covariance = covariance + np.outer(found.parameters, found.parameters)
+        refined = alignment
+        observations = replace(observations, after=observations.before)
+        record["after"] = record["before"]
+    doubts = [] if insignificant else _doubts(alignment, record, found)
+    _warn(doubts, strict, left_image, of)
+    height = alignment.reference_height
+    if not any(fit.gcps for fit in alignment.fits):  # it was that of the RPCs, far off perhaps
+        height = round(float(observations.ties.height[observations.used].mean()), 3)
+    refined = replace(
+        refined,
+        reference_height=height,
+        warnings=(*alignment.warnings, *doubts),
+        left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
+        right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
+        cross_covariance=covariance[:6, 6:],
+        refinement=record,
+        provenance=record_of,
+    )
+    for name in ("y_parallax", "disparity"):
+        a, b = record["before"][name], record["after"][name]
+        log.info(
+            "%s at %d tie points: median %.3f -> %.3f px, rms %.3f -> %.3f px, trend %.3f -> %.3f",
+            name,
+            record["used"],
+            *(pair[figure] for figure in ("median", "rms", "trend_rms") for pair in (a, b)),
+        )
+    log.info(
+        "refinement %s",
+        f"not applied: {reason}"
+        if reason
+        else f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "
+        f"{record['change_of_right']['largest']:.3f} px",
+    )
+    return refined, observations

@@ -1,0 +1,216 @@
+"""Places where LiDAR and both images show one smooth surface, and by how much they disagree.
+
+The scene is sampled at a fixed number of sites, spread evenly over the ground that both images and
+the LiDAR cover, whatever its size. In a site, places are taken where the points lie on one plane
+(no roof edge, no crown, nothing hidden behind it) and the left image has texture. The plane maps
+the left window to the right image, and least-squares matching (Gruen 1985) finds by how much the
+right image shows the same elsewhere: the tie point's shift.
+
+On a plane a right image position depends on the left one by ``carry``, so that the shift is, to
+first order, (error of the right image's model) − carry · (error of the left's): what both have in
+common is seen on slopes only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.image_reader import Source
+from ..epipolar.resampling import ANTIALIAS, RADIUS
+from ..epipolar.rpc import SensorModel
+from .least_squares_matching import HALF, least_squares_match, warp_patch
+from .tie_sites import SITE, Places
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.float32]
+
+
+STEEPEST = 3.0  # ratio of scales between the images along any direction
+MIN_CORRELATION = 0.6
+POOR_SIGMA = 0.2  # px: a match that is worse by its own residuals is none
+
+
+@dataclass(frozen=True, eq=False)
+class TiePoints:
+    """n tie points; coordinates are (col, row) px of the original images.
+
+    ``site`` int[n]; ``height`` ellipsoidal m; ``left`` [n, 2] the place, ``right`` [n, 2] where
+    plane and sensor models put it in the right image; ``carry`` [n, 2, 2]: d right / d left on the
+    plane; ``shift`` [n, 2]: position found minus ``right``; ``sigma`` px of a left pixel, from the
+    match's own residuals; ``correlation`` of the windows.
+    """
+
+    site: NDArray[np.int64]
+    height: Floats
+    left: Floats
+    right: Floats
+    carry: Floats
+    shift: Floats
+    sigma: Floats
+    correlation: Floats
+
+    def __len__(self) -> int:
+        return self.site.size
+
+
+def _carry(
+    left: SensorModel, right: SensorModel, where: Floats, height: Floats, slope: Floats
+) -> tuple[Floats, Floats]:
+    """Right position [n, 2] of left ones on their planes, and its change [n, 2, 2] with them."""
+    u = np.array([0.0, HALF, -HALF, 0.0, 0.0])
+    v = np.array([0.0, 0.0, 0.0, HALF, -HALF])
+    heights = height[:, None] + slope[:, :1] * u + slope[:, 1:] * v
+    lon, lat = left.localize(where[:, :1] + u, where[:, 1:] + v, heights)
+    at = np.stack(right.project(lon, lat, heights), axis=-1)
+    carry = np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=-1) / (2.0 * HALF)
+    return at[:, 0], carry
+
+
+def _window(source: Source, at: Floats, reach: float) -> tuple[Picture, Floats] | None:
+    """The part of an image around positions [n, 2], and the position of its first pixel."""
+    low = np.maximum(np.floor(at.min(axis=0) - reach).astype(int), 0)
+    high = np.minimum(np.ceil(at.max(axis=0) + reach).astype(int) + 1, source.size)
+    if (low >= high).any():
+        return None
+    return source.read(*low.tolist(), *(high - low).tolist()), low
+
+
+def _widening(carry: Floats) -> tuple[float, float]:
+    """Widening of the kernel along (col, row) where the right image is the finer one."""
+    spans = np.hypot(carry[:, 0], carry[:, 1])
+    return tuple(float(span) if span > ANTIALIAS else 1.0 for span in spans)
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """One place, ready for matching: see :func:`_prepared`."""
+
+    index: int
+    template: Picture
+    pixels: Picture
+    at: Floats
+    carry: Floats
+    scale: tuple[float, float]
+    scores: Picture
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Where the sensor models put places: ``left`` [n, 2] whole px, and as in TiePoints."""
+
+    left: Floats
+    height: Floats
+    right: Floats
+    carry: Floats
+
+    @classmethod
+    def of(cls, places: Places, left: SensorModel, right: SensorModel) -> Geometry:
+        """By the sensor models as they are; a place moves on its plane to the nearest pixel."""
+        exact = np.stack(left.project(places.lon, places.lat, places.height), axis=1)
+        where = np.rint(exact)
+        height = places.height + np.sum((where - exact) * places.slope, axis=1)
+        return cls(where, height, *_carry(left, right, where, height, places.slope))
+
+
+def _prepared(
+    places: Places, geometry: Geometry, sources: tuple[Source, Source], radius: int
+) -> Iterator[_Windows]:
+    """Windows and correlations at whole shifts [row, col] of the places that both images show.
+
+    Read site by site.
+    """
+    scales = np.linalg.svd(np.nan_to_num(geometry.carry), compute_uv=False)
+    usable = (scales[:, 0] < STEEPEST) & (scales[:, 1] > 1.0 / STEEPEST)
+    big = np.empty((2 * (HALF + radius) + 1,) * 2, np.float32)
+    for site in np.unique(places.site[usable]):
+        members = np.flatnonzero(usable & (places.site == site))
+        right = geometry.right[members]
+        members = members[np.abs(right - np.median(right, axis=0)).max(axis=1) < 4 * SITE]
+        left_window = _window(sources[0], geometry.left[members], HALF + 2.0)
+        reach = 1.5 * (HALF + radius + 3) * scales[members, 0].max() + 2 * RADIUS
+        right_window = _window(sources[1], geometry.right[members], reach)
+        if left_window is None or right_window is None:
+            continue
+        picture, first = left_window
+        pixels, origin = right_window
+        for k in members:
+            i, j = (geometry.left[k] - first).astype(int)
+            template = picture[
+                max(j - HALF - 1, 0) : j + HALF + 2, max(i - HALF - 1, 0) : i + HALF + 2
+            ]
+            if template.shape != (2 * HALF + 3,) * 2 or not np.isfinite(template).all():
+                continue
+            carry, scale = geometry.carry[k], _widening(geometry.carry[k])
+            at = geometry.right[k] - origin
+            warp_patch(pixels, *at, carry, scale, big)
+            known = np.isfinite(big)
+            if known.mean() < 0.5:
+                continue
+            inner = template[1:-1, 1:-1]
+            scores = cv2.matchTemplate(
+                np.where(known, big - big[known].mean(), np.float32(0)),
+                inner - inner.mean(),
+                cv2.TM_CCOEFF_NORMED,
+            )
+            scores = np.where(np.abs(scores) <= 1.0, scores, np.float32(0))  # of flat windows: inf
+            yield _Windows(k, template, pixels, at, carry, scale, scores)
+
+
+def common_shift(
+    places: Places,
+    geometry: Geometry,
+    sources: tuple[Source, Source],
+    radius: int,
+) -> tuple[Floats, float]:
+    """The shift [2] in px of the left image at which most places agree, and how clearly.
+
+    For sensor models that are many px off: the places' correlations are added up. The second
+    figure is the peak's height in standard deviations of the sum over all shifts.
+    """
+    total = np.zeros((2 * radius + 1,) * 2)
+    for place in _prepared(places, geometry, sources, radius):
+        total += place.scores
+    # Models may be tilted, so that the places' own shifts lie some px apart.
+    total = cv2.GaussianBlur(total, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT)
+    y, x = np.unravel_index(int(np.argmax(total)), total.shape)
+    spread = 1.4826 * float(np.median(np.abs(total - np.median(total))))
+    height = float(total.max() - np.median(total)) / max(spread, 1e-12)
+    return np.array([x - radius, y - radius], dtype=float), height
+
+
+def match(
+    places: Places,
+    geometry: Geometry,
+    sources: tuple[Source, Source],
+    radius: int,
+) -> TiePoints:
+    """Match every place within ``radius`` px (of the left image); places that fail are left out."""
+    results = np.full((len(places), 4), np.nan)
+    for w in _prepared(places, geometry, sources, radius):
+        y, x = np.unravel_index(int(np.argmax(w.scores)), w.scores.shape)
+        if 0 < x < 2 * radius and 0 < y < 2 * radius:
+            start = np.array([x - radius, y - radius], dtype=np.float64)
+            least_squares_match(
+                w.template, w.pixels, *w.at, w.carry, w.scale, start, results[w.index]
+            )
+    good = (
+        np.isfinite(results).all(axis=1)
+        & (results[:, 3] >= MIN_CORRELATION)
+        & (results[:, 2] <= POOR_SIGMA)
+    )
+    shift = np.einsum("nab,nb->na", geometry.carry, results[:, :2])
+    return TiePoints(
+        site=places.site[good],
+        height=geometry.height[good],
+        left=geometry.left[good],
+        right=geometry.right[good],
+        carry=geometry.carry[good],
+        shift=shift[good],
+        sigma=results[good, 2],
+        correlation=results[good, 3],
+    )

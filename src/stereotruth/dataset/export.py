@@ -1,0 +1,296 @@
+"""Benchmark tiles of a city: windows, crops, labels, manifest (section III-D of the paper).
+
+A tile pair is a square of the left epipolar image and the square of the same rows of the right
+one, moved along x by a whole number of pixels (``right_offset_px``: the mean disparity, rounded,
+so that no image is resampled again). The tile's disparity is that of the scene less the offset.
+
+Rules for a pair, at its window of the scene's grid:
+
+- complete images: no pixel of the left crop is nodata, the right crop lies inside the right grid
+  and at most ``MAX_RIGHT_NODATA`` of it is nodata;
+- labelled: a share of at least ``min_labelled`` of its pixels has a disparity. Other pairs with
+  complete images go under ``unlabelled/``.
+
+Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
+gates of :mod:`gates`, which flag tiles and scenes in the manifest and the summary.
+
+The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
+tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+import shutil
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
+
+from ..errors import InputError
+from ..job import progress
+from ..products.files import replacing
+from ..products.locks import exclusive
+from ..products.provenance import describe, file_sha256, source_digest
+from .manifest import write_manifest
+from .orientation import save
+from .quality_limits import NO_LIMITS, Limits, flag, missed
+from .quick_looks import draw_contact_sheet, draw_coverage
+from .scene_stores import SceneFiles, open_stores
+from .sift_matches import MATCH_COLUMNS, match_rows
+from .splits import NONE, Place, scaled_counts, split_tiles
+from .summary import in_counts, summarise
+from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
+from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
+from .windows import cell_step, choose_windows, scan_scene
+
+log = logging.getLogger("stereotruth")
+
+
+NONE_KIND, IMAGES, LABELLED = 0, 1, 2
+
+
+def _refuse_empty(
+    city: str, outcomes: Mapping[str, Mapping[str, int]], size: int, min_labelled: float
+) -> None:
+    lines = [
+        f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
+        for scene, outcome in outcomes.items()
+    ]
+    raise InputError(
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)})",
+        remedy=f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
+        f"{min_labelled:g}), or LiDAR that covers the overlap of the two images",
+    )
+
+
+def export_city(
+    city: str,
+    prefix: str,
+    scenes: Iterable[SceneFiles | tuple],
+    out_dir: str | Path,
+    *,
+    size: int = 1024,
+    stride: int | None = None,
+    min_labelled: float = 0.6,
+    right_offset: str = "tile",
+    disparity_dtype: str = "float16",
+    nodata: float = -999.0,
+    training: int = 0,
+    validation: int = 0,
+    testing: int = 0,
+    seed: int = 0,
+    strict: bool = False,
+    quality: Limits = NO_LIMITS,
+    building_share: float = 0.02,
+    code: str = "",
+    workers: int = 1,
+    coverage: str | Path | None = None,
+    contact_sheet: str | Path | None = None,
+    matches: str | Path | None = None,
+    work: str | Path | None = None,
+) -> dict[str, Any]:
+    """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
+
+    ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
+    alignment.json (for the record) and the store of the right view's labels. ``stride`` defaults to
+    ``size``, px. ``training``, ``validation``, ``testing`` are the counts of table 3, which are
+    scaled to the tiles there are. ``quality``: the limits beyond which tiles and scenes are
+    flagged. ``building_share``: share of building pixels from which on a tile is of that class.
+    ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
+    matches. ``work``: folder in which finished tiles wait for a later call that would make the
+    same, by default a hidden one beside ``out_dir``. Returns a summary, see :func:`summary_lines`.
+
+    Raises InputError if there is no labelled pair, if the settings cannot work, or if
+    ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
+    """
+    out, stride = Path(out_dir), stride or size
+    half = disparity_dtype == "float16"
+    if float(np.dtype(disparity_dtype).type(nodata)) != float(nodata):
+        raise InputError(
+            f"nodata {nodata:g} cannot be stored in {disparity_dtype}",
+            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
+        )
+    step = cell_step(size, stride)
+    sources, chosen, phases, outcomes, scans = [], [], {}, {}, {}
+    for item in scenes:
+        source = open_stores(SceneFiles(*item))
+        cells = scan_scene(source, step, workers)
+        windows, phase, outcome = choose_windows(cells, size, stride, min_labelled, right_offset)
+        sources.append(source)
+        chosen += [(source, window) for window in windows]
+        phases[source.scene], outcomes[source.scene] = phase, outcome
+        scans[source.scene] = (cells.picture, cells.mask, cells.scale)
+    if not any(window.labelled for _, window in chosen):
+        _refuse_empty(city, outcomes, size, min_labelled)
+    chosen.sort(key=lambda pair: not pair[1].labelled)  # stable: unlabelled pairs get last numbers
+    parameters = {
+        "size": size,
+        "stride": stride,
+        "min_labelled": min_labelled,
+        "right_offset": right_offset,
+        "disparity_dtype": disparity_dtype,
+        "nodata": nodata,
+        "split_counts": {"train": training, "val": validation, "test": testing},
+        "seed": seed,
+        "quality": asdict(quality),
+        "building_share": building_share,
+    }
+    inputs = {name: value for source in sources for name, value in source.inputs.items()}
+    provenance = describe(inputs, parameters, code)
+
+    cut = Cut(
+        city=city,
+        prefix=prefix,
+        size=size,
+        dtype=disparity_dtype,
+        nodata=nodata,
+        building_share=building_share,
+        limits=quality,
+        code=code or source_digest("dataset.export"),
+        work=out.with_name(f".{out.name}.work") if work is None else Path(work),
+        provenance=provenance,
+    )
+    scratch = out.with_name(out.name + ".partial")
+    with ExitStack() as stack:
+        stack.enter_context(exclusive(out))
+        shutil.rmtree(scratch, ignore_errors=True)
+        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
+        # all appear when the tiles do: a job that outlives its run cannot be found halfway
+        matches, coverage, contact_sheet = (
+            None if path is None else stack.enter_context(replacing(path))
+            for path in (matches, coverage, contact_sheet)
+        )
+        kinds = {"left", "right", "disp", "status", "orientation"}
+        if any(source.of_right is not None for source in sources):
+            kinds |= set(RIGHT_FILES)
+        if not all(window.labelled for _, window in chosen):
+            kinds |= {"unlabelled/left", "unlabelled/right"}
+        for kind in kinds:
+            (scratch / kind).mkdir(parents=True)
+
+        def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
+            return write_tile(scratch, *chosen[k], k, cut)
+
+        written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in sources}
+        matches_file = Path(os.devnull) if matches is None else matches
+        with (
+            warnings.catch_warnings(),
+            matches_file.open("w", newline="", encoding="utf-8") as stream,
+            ThreadPoolExecutor(workers) as pool,
+        ):
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            writer = csv.DictWriter(stream, MATCH_COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            numbers = range(len(chosen))
+            done = progress(pool.map(write, numbers), len(chosen), f"{city}: tiles")
+            for row, ring, checks in done:
+                written.append((row, ring))
+                if checks is not None:
+                    head = {key: row[key] for key in ("city", "scene", "tile", "class")}
+                    writer.writerows(match_rows(head, checks.matches))
+                    scene_checks[row["scene"]].add(checks)
+        rows = [row for row, _ in written]
+        splits = _split(written, parameters["split_counts"], seed, strict, city)
+        gates = _gates(city, rows, scene_checks, quality, strict)
+        summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
+        summary["quality"] = gates
+        write_manifest(scratch / "manifest.csv", rows)
+        record = summary | {
+            "manifest_sha256": file_sha256(scratch / "manifest.csv"),
+            "provenance": provenance,
+        }
+        save(scratch / "export.json", record)
+        if coverage is not None:
+            draw_coverage(coverage, city, rows, scans)
+        if contact_sheet is not None:
+            draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
+        shutil.rmtree(out, ignore_errors=True)
+        scratch.rename(out)
+        _forget_others(cut, rows)
+    return summary
+
+
+def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Remove what earlier calls have left for tiles that are no more."""
+    cut.ledger.keep_only({row["tile"] for row in rows})
+    kept = {
+        cut.work / row[kind] for row in rows for kind in (*FILES, *RIGHT_FILES) if row.get(kind)
+    }
+    for file in cut.work.rglob("*.tiff"):
+        if file not in kept:
+            file.unlink()
+
+
+def _split(
+    written: Sequence[tuple[dict[str, Any], NDArray[np.float64]]],
+    weights: Mapping[str, int],
+    seed: int,
+    strict: bool,
+    city: str,
+) -> dict[str, Any]:
+    """Set the split of every labelled row; wanted and realised counts."""
+    labelled = [(row, ring) for row, ring in written if row["complete"] == "yes"]
+    places = [
+        Place(row["scene"], row["row0"], row["col0"], row["size"], ring) for row, ring in labelled
+    ]
+    found = split_tiles(places, weights, seed)
+    for (row, _), split in zip(labelled, found):
+        row["split"] = split
+    wanted = scaled_counts(len(labelled), weights)
+    realised = {name: found.count(name) for name in (*wanted, NONE)}
+    if any(realised[name] != count for name, count in wanted.items()):
+        problem = (
+            f"{city}: splits of {in_counts(realised)} tiles instead of {in_counts(wanted)}, since "
+            "tiles that share ground must not be in two splits"
+        )
+        if strict:
+            raise InputError(problem, remedy="a tiles.stride of tiles.size, or strict: false")
+        log.warning("%s", problem)
+    return {"wanted": wanted, "realised": realised}
+
+
+def _gates(
+    city: str,
+    rows: Sequence[Mapping[str, Any]],
+    scenes: Mapping[str, SceneChecks],
+    limits: Limits,
+    strict: bool,
+) -> dict[str, Any]:
+    """Figures and missed gates of scenes, flagged tiles; logs each miss, or ends a strict run."""
+    found, problems = {}, []
+    for scene, checks in scenes.items():
+        figures = checks.figures()
+        misses = missed(figures, limits)
+        found[scene] = figures | {"quality": flag(misses)}
+        problems += [f"scene {scene}: {miss}" for miss in misses]
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    for row in labelled:
+        figures = {name: float(row[name]) for name in CHECK_COLUMNS if row[name] != ""}
+        problems += [
+            f"tile {row['tile']} of scene {row['scene']}: {miss}"
+            for miss in missed(figures, limits)
+        ]
+    if problems and strict:
+        more = f"; and {len(problems) - 5} more" if len(problems) > 5 else ""
+        raise InputError(
+            f"{city}: beyond the limits of quality: {'; '.join(problems[:5])}{more}",
+            remedy="better control points, images or LiDAR for what is named, another limit "
+            "(null: none) in quality of the configuration, or strict: false to have it flagged",
+        )
+    for problem in problems:
+        log.warning("%s: %s", city, problem)
+    return {
+        "limits": asdict(limits),
+        "scenes": found,
+        "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
+    }

@@ -1,0 +1,135 @@
+"""All cities' tiles in the folder layout of the published WHU-Stereo dataset.
+
+Files are copied, not linked: whoever edits the dataset must not change the tiles behind it.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..job import progress
+from ..products.provenance import file_sha256
+from .manifest import read_manifest, write_manifest
+from .splits import NO_TRUTH, NONE, SPLITS, TRUTH, shared_ground
+
+log = logging.getLogger("stereotruth")
+
+
+README = """Stereo pairs with ground-truth disparity, in the folder layout of WHU-Stereo
+
+  with ground truth/{{train,val,test}}/{{left,right,disp}}
+  without ground truth/{{left,right}}       pairs whose labels are incomplete
+
+{counts}
+
+Conventions
+- left: backward view, the reference; right: forward view. uint16, nodata 0. Rows correspond:
+  the match of left pixel (x, y) is right pixel (x - d, y). (0, 0) is the centre of the
+  upper-left pixel.
+- disp: d = x_left - x_right in px; d increases with height; {nodata}: no label (tagged as nodata).
+  {rounding}
+- The right image of each pair is shifted by a whole number of px (right_offset_px in
+  manifest.csv), which is already inside d: the disparity of the scene is d + right_offset_px.
+- Why a pixel has no label (status), and the way back to heights and to the original images
+  (orientation), are in tiles/<City>/ under the same number; manifest.csv has their checksums there.
+- No ground lies in two splits: tiles of which two overlap are in one split, or in none and then
+  not here. Splits are contiguous regions. {shared}
+- quality in manifest.csv: ok, or the limits that the pair's labels exceed when held against its
+  images (SIFT matches, image warping); class: building or vegetation.
+- manifest.csv: a row per pair with scene, window, offset, counts, split and SHA-256 of each file.
+"""
+
+
+def _rounding(rows: Sequence[dict[str, str]]) -> str:
+    largest = max((float(r["disparity_rounding_px"]) for r in rows), default=0.0)
+    return (
+        f"Stored values are rounded by at most {largest:.4f} px (16-bit float: 1/128 px below\n"
+        "  32 px, 1/64 below 64, 1/32 below 128, 1/16 from 128 px on)."
+    )
+
+
+def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[str, Any]:
+    """Copy the cities' tiles to ``out`` in the published layout, with a manifest and a README.
+
+    Each file is held against its manifest's checksum on the way. Tiles of split ``none`` (they
+    share ground with two splits) stay behind. Returns counts by folder, and the pairs of tiles
+    of different splits that share ground across cities (they are logged as a warning).
+
+    Raises InputError if a city has no manifest, a file was changed, or two cities use one prefix.
+    """
+    folders, out = [Path(folder) for folder in tile_dirs], Path(out)
+    todo, seen, nodata = [], {}, set()
+    for folder in folders:
+        for row in read_manifest(folder):
+            if row["tile"] in seen:
+                raise InputError(
+                    f"tile {row['tile']} is in {seen[row['tile']]} too",
+                    file=folder,
+                    remedy="give each city a prefix of its own in the cities sheet",
+                )
+            seen[row["tile"]] = folder
+            if row["complete"] == "yes":
+                nodata.add(row["disparity_nodata"])
+                if row["split"] == NONE:
+                    continue
+                place, kinds = f"{TRUTH}/{row['split']}", ("left", "right", "disp")
+            else:
+                place, kinds = NO_TRUTH, ("left", "right")
+            todo.append((folder, row, place, kinds))
+    scratch = out.with_name(out.name + ".partial")
+    shutil.rmtree(scratch, ignore_errors=True)
+    try:
+        for split in SPLITS:
+            for kind in ("left", "right", "disp"):
+                (scratch / TRUTH / split / kind).mkdir(parents=True)
+        for kind in ("left", "right"):
+            (scratch / NO_TRUTH / kind).mkdir(parents=True)
+        rows = [_copy(*item, scratch) for item in progress(todo, len(todo), "dataset: pairs")]
+        counts = Counter(place for _, _, place, _ in todo)
+        shared = shared_ground(*(folder / "manifest.csv" for folder in folders))
+        for a, b in shared:
+            log.warning("%s and %s share ground and are in different splits", a, b)
+        if rows:
+            write_manifest(scratch / "manifest.csv", rows)
+        text = README.format(
+            counts="\n".join(f"  {count:5d} pairs  {place}" for place, count in counts.items()),
+            nodata=" or ".join(sorted(nodata)),
+            rounding=_rounding([row for _, row, _, kinds in todo if "disp" in kinds]),
+            shared=f"Except: {shared}." if shared else "",
+        )
+        (scratch / "README.txt").write_text(text, encoding="utf-8")
+        shutil.rmtree(out, ignore_errors=True)
+        scratch.rename(out)
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    for place, count in sorted(counts.items()):
+        log.info("%s/%s: %d pairs", out, place, count)
+    return {"pairs": dict(counts), "shared_ground": shared}
+
+
+def _copy(
+    folder: Path, row: dict[str, str], place: str, kinds: Sequence[str], scratch: Path
+) -> dict[str, Any]:
+    """Copy one pair and return its row of the dataset's manifest."""
+    row = {k: v for k, v in row.items() if k.partition("_")[0] not in ("status", "orientation")}
+    for kind in ("left", "right", "disp"):
+        if kind not in kinds:
+            row[kind] = row[f"{kind}_sha256"] = ""
+            continue
+        source, target = folder / row[kind], f"{place}/{kind}/{Path(row[kind]).name}"
+        if not source.is_file():
+            raise InputError("file is missing", file=source, remedy=f"make {folder} again")
+        shutil.copyfile(source, scratch / target)
+        if file_sha256(scratch / target) != row[f"{kind}_sha256"]:
+            raise InputError(
+                "file is not as in its manifest", file=source, remedy=f"make {folder} again"
+            )
+        row[kind] = target
+    return row

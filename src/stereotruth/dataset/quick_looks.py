@@ -1,0 +1,145 @@
+"""Pictures of a city's tiles: coverage (figure 7 of the paper) and contact sheet."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
+
+from ..products import pictures
+from ..products.pictures import colours, save_figure
+
+Picture = NDArray[np.uint8]
+
+
+CONTACT_TILES = 16  # most tiles on the contact sheet
+
+
+def draw_coverage(
+    path: Path, city: str, rows: Sequence[Mapping[str, Any]], scans: Mapping[str, tuple]
+) -> None:
+    """Where a city's tiles lie; ``scans``: grey picture, mask and scale by scene."""
+    scenes = [
+        (scene, pictures.stretch(picture), mask, float(scale))
+        for scene, (picture, mask, scale) in scans.items()
+    ]
+    tiles = [
+        (r["scene"], r["row0"], r["col0"], r["size"], r["split"], r["complete"] == "yes")
+        for r in rows
+    ]
+    count = sum(tile[5] for tile in tiles)
+    title = f"{city}: {count} labelled pairs, {len(tiles) - count} without complete labels"
+    coverage_figure(path, title, scenes, tiles)
+
+
+def draw_contact_sheet(
+    path: Path, city: str, rows: Sequence[Mapping[str, Any]], folder: Path, nodata: float
+) -> None:
+    """Some of a city's labelled pairs, evenly drawn from all."""
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    picked = np.unique(np.linspace(0, len(labelled) - 1, CONTACT_TILES).round().astype(int))
+    tiles = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        for row in (labelled[k] for k in picked):
+            arrays = {}
+            for kind in ("left", "right", "disp"):
+                with rasterio.open(folder / row[kind]) as dataset:
+                    arrays[kind] = dataset.read(1)
+            step = max(1, row["size"] // 256)
+            disparity = arrays["disp"][::step, ::step].astype(np.float32)
+            disparity = np.where(disparity == nodata, np.nan, disparity)
+            grey = [pictures.shrink(pictures.stretch(arrays[k]), 256) for k in ("left", "right")]
+            tiles.append((row["tile"], *grey, disparity))
+    values = np.concatenate([tile[3][np.isfinite(tile[3])] for tile in tiles])
+    limits = tuple(float(v) for v in np.percentile(values, (1, 99)))
+    title = f"{city}: {len(tiles)} of {len(labelled)} labelled pairs"
+    contact_sheet(path, title, tiles, limits)
+
+
+SPLIT_COLOURS = {"train": "#d62728", "val": "#ff9f1c", "test": "#8e44ad", "none": "#7f7f7f"}
+
+
+def coverage_figure(
+    path: str | Path,
+    title: str,
+    scenes: Sequence[tuple[str, Picture, NDArray[np.bool_], float]],
+    tiles: Sequence[tuple[str, int, int, int, str, bool]],
+) -> None:
+    """Where the tiles of a city lie (figure 7 of the paper), one panel per scene.
+
+    ``scenes``: (scene, grey picture of the rectified left image, labelled mask of the same
+    shape, px of the epipolar grid per px of the picture). ``tiles``: (scene, row0, col0, size in
+    px of the epipolar grid, split, complete).
+    """
+    tallest = max(grey.shape[0] / grey.shape[1] for _, grey, _, _ in scenes)
+    figure = Figure(figsize=(7.0 * len(scenes), 6.2 * tallest + 1.4), layout="constrained")
+    axes = figure.subplots(1, len(scenes), squeeze=False)[0]
+    for axis, (scene, grey, labelled, scale) in zip(axes, scenes):
+        picture = np.repeat(grey[..., None], 3, axis=2)
+        tint = np.array([40, 110, 255], np.float32)
+        picture[labelled] = (0.6 * picture[labelled] + 0.4 * tint).astype(np.uint8)
+        rows, cols = grey.shape
+        axis.imshow(picture, extent=(-0.5, cols * scale - 0.5, rows * scale - 0.5, -0.5))
+        for where, row0, col0, size, split, complete in tiles:
+            if where == scene:
+                inset = size / 80  # neighbours do not hide each other's colour
+                axis.add_patch(
+                    Rectangle(
+                        (col0 - 0.5 + inset, row0 - 0.5 + inset),
+                        size - 2 * inset,
+                        size - 2 * inset,
+                        fill=False,
+                        linewidth=1.8 if complete else 1.0,
+                        linestyle="-" if complete else "--",
+                        edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
+                        zorder=3 if complete else 2,
+                    )
+                )
+        axis.set(title=scene, xlabel="x in px of the epipolar grid", ylabel="y in px")
+    legend = [Patch(fill=False, edgecolor=colour, label=s) for s, colour in SPLIT_COLOURS.items()]
+    legend.append(Patch(fill=False, edgecolor="0.75", linestyle="--", label="incomplete pair"))
+    legend.append(Patch(color=(0.45, 0.62, 1.0), label="labelled"))
+    figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
+    figure.suptitle(title)
+    save_figure(path, figure)
+
+
+def contact_sheet(
+    path: str | Path,
+    title: str,
+    tiles: Sequence[tuple[str, Picture, Picture, NDArray[np.floating]]],
+    limits: tuple[float, float],
+) -> None:
+    """Tiles of a city: left, right and disparity in colour, two tiles to a line.
+
+    ``tiles``: (caption, left, right, disparity in px with NaN), all small already.
+    """
+    lines = -(-len(tiles) // 2)
+    figure = Figure(figsize=(13.0, 2.2 * lines + 0.8), layout="constrained")
+    axes = figure.subplots(lines, 6, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for k, (caption, left, right, disparity) in enumerate(tiles):
+        trio = axes[k // 2][3 * (k % 2) : 3 * (k % 2) + 3]
+        for axis, grey, name in zip(trio, (left, right), ("left", "right")):
+            axis.imshow(grey, cmap="gray", vmin=0, vmax=255)
+            axis.set_title(f"{caption}, {name}" if name == "left" else name, fontsize=8)
+        trio[2].imshow(colours(disparity, limits))
+        trio[2].set_title("disparity", fontsize=8)
+    mappable = ScalarMappable(cmap="turbo")
+    mappable.set_clim(*limits)
+    figure.colorbar(
+        mappable, ax=axes, fraction=0.02, aspect=50, label="disparity, px (offset removed)"
+    )
+    figure.suptitle(title)
+    save_figure(path, figure)

@@ -1,0 +1,105 @@
+"""What export reads of a scene: opened stores, epipolar model, meaning of the status values."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zarr
+
+from ..epipolar.model import EpipolarModel
+from ..errors import InputError
+from ..products.grids import require_complete
+from ..products.provenance import digest, file_sha256
+from .orientation import sensor_record
+
+
+class SceneFiles(NamedTuple):
+    """What export reads of one scene: its id and stores, and where it came from the alignment.
+
+    ``disparity_of_right``: the store of the right view's labels, if they are wanted.
+    """
+
+    scene: str
+    disparity: Path
+    left: Path
+    right: Path
+    alignment: Path | None = None
+    disparity_of_right: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneStores:
+    """Opened stores of a scene, its epipolar model, and the meaning of the status values."""
+
+    scene: str
+    left: zarr.Array
+    right: zarr.Array
+    disparity: zarr.Array
+    status: zarr.Array
+    height: zarr.Array
+    of_right: zarr.Group | None
+    surface_class: zarr.Array | None
+    gcp_rms: float | None
+    model: EpipolarModel
+    sensors: Mapping[str, Mapping[str, Any]]
+    flags: Mapping[int, str]
+    inputs: Mapping[str, str]
+
+
+def open_stores(item: SceneFiles) -> SceneStores:
+    """Open a scene's stores; InputError if their grids do not fit together."""
+    disparity = require_complete(item.disparity)
+    left, right = require_complete(item.left), require_complete(item.right)
+    model = EpipolarModel.from_dict(disparity.attrs["epipolar"])
+    for path, group, name in (
+        (item.disparity, disparity, "disparity"),
+        (item.left, left, "image"),
+        (item.right, right, "image"),
+    ):
+        if group[name].shape != tuple(model.shape):
+            raise InputError(
+                f"grid of {group[name].shape} px, epipolar model of {tuple(model.shape)} "
+                f"(scene {item.scene})",
+                file=path,
+                remedy="run rectify and project of this scene again",
+            )
+    status = disparity["status"]
+    meanings = status.attrs["flag_meanings"]
+    names = meanings.split() if isinstance(meanings, str) else list(meanings)
+    inputs = {
+        f"{item.scene}/{name}": digest(dict(group.attrs.get("provenance", {})))
+        for name, group in (("left", left), ("right", right), ("disparity", disparity))
+    }
+    of_right = None
+    if item.disparity_of_right is not None:
+        of_right = require_complete(item.disparity_of_right)
+        found = digest(dict(of_right.attrs.get("provenance", {})))
+        inputs[f"{item.scene}/disparity_of_right"] = found
+    if item.alignment is not None:
+        inputs[f"{item.scene}/alignment"] = file_sha256(item.alignment)
+    return SceneStores(
+        scene=item.scene,
+        left=left["image"],
+        right=right["image"],
+        disparity=disparity["disparity"],
+        status=status,
+        height=disparity["height"],
+        of_right=of_right,
+        surface_class=disparity.get("surface_class"),
+        gcp_rms=None if item.alignment is None else _gcp_rms(item.alignment),
+        model=model,
+        sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
+        flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
+        inputs=inputs,
+    )
+
+
+def _gcp_rms(alignment: Path) -> float | None:
+    """The larger of both views' residuals of the GCPs, px of the images; None without GCPs."""
+    record = json.loads(Path(alignment).read_text(encoding="utf-8"))
+    found = [record[view]["rms"]["after"] for view in ("left", "right")]
+    return max((value for value in found if value is not None), default=None)

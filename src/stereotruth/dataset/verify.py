@@ -1,0 +1,70 @@
+"""Holding a folder of tiles, or the dataset, against the checksums of its manifest."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+from ..errors import InputError
+from ..products.provenance import file_sha256
+from .manifest import read_manifest
+
+log = logging.getLogger("stereotruth")
+
+
+LOOSE = {"manifest.csv", "export.json", "README.txt"}  # files that the manifest does not list
+
+
+def defects(folder: str | Path) -> list[str]:
+    """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
+
+    Works on ``tiles/<City>`` and on ``dataset``. Raises InputError if there is no manifest.
+    """
+    folder = Path(folder)
+    found = []
+    listed = set()
+    for row in read_manifest(folder):
+        for kind in (key.removesuffix("_sha256") for key in row if key.endswith("_sha256")):
+            if not (name := row[kind]):
+                continue
+            listed.add(name)
+            if not (folder / name).is_file():
+                found.append(f"{name}: missing")
+            elif file_sha256(folder / name) != row[f"{kind}_sha256"]:
+                found.append(f"{name}: changed")
+    files = (p for p in folder.rglob("*") if p.is_file())
+    # a workflow manager may leave a hidden time stamp of its own
+    present = {p.relative_to(folder).as_posix() for p in files if not p.name.startswith(".")}
+    found += [f"{name}: not in the manifest" for name in sorted(present - listed - LOOSE)]
+    if (record := folder / "export.json").is_file():
+        wanted = json.loads(record.read_text(encoding="utf-8"))["manifest_sha256"]
+        if file_sha256(folder / "manifest.csv") != wanted:
+            found.append("manifest.csv: changed")
+    return found
+
+
+def verify(folders: Iterable[str | Path]) -> dict[str, int]:
+    """Check folders; the number of files of each that agree with its manifest.
+
+    Raises InputError, after all were looked at, naming the files that do not.
+    """
+    counts, bad = {}, []
+    for folder in map(Path, folders):
+        found = defects(folder)
+        bad += [f"{folder}/{line}" for line in found]
+        for line in found:
+            log.error("%s/%s", folder, line)
+        rows = read_manifest(folder)
+        files = [1 for row in rows for key in row if key.endswith("_sha256") and row[key]]
+        counts[str(folder)] = len(files)
+        if not found:
+            log.info("%s: %d files as in the manifest", folder, len(files))
+    if bad:
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        raise InputError(
+            f"{len(bad)} files differ from the manifests: {'; '.join(bad[:5])}{more}",
+            remedy="delete the folder and make it again with snakemake",
+        )
+    return counts

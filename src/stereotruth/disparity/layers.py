@@ -1,0 +1,109 @@
+"""The arrays of a disparity store and what their attributes say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..products.grids import Layer
+from .settings import Settings
+from .status import Status
+
+
+def layers(settings: Settings, view: str) -> dict[str, Layer]:
+    """The arrays of a disparity store of the ``view``, left or right."""
+    other = {"left": "right", "right": "left"}[view]
+    match = {"left": "x - disparity", "right": "x + disparity"}[view]
+    condensed, used = (
+        (
+            "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
+            "of its neighbours on the same surface",
+            "points on the surface that the pixel's centre sees",
+        )
+        if settings.representative == "top"
+        else ("disparity of the point at mean longitude and latitude, greatest height", "points")
+    )
+    compared = {
+        "correlation": "mean correlation coefficient of the image windows at the points used",
+        "both": f"correlation coefficient of {view} and warped {other} image over the pixels of "
+        f"the same surface in {settings.window} x {settings.window} px",
+    }
+    return {
+        "disparity": Layer(
+            "float32",
+            np.nan,
+            {
+                "units": "px",
+                "long_name": f"ground-truth disparity x_left - x_right of the {view} view",
+                "nodata": "NaN",
+                "match": f"what the {view} image shows at (x, y), the {other} one shows at "
+                f"({match}, y)",
+                "representative": f"{settings.representative}: {condensed}",
+            },
+        ),
+        "status": Layer(
+            "uint8",
+            0,
+            {
+                "units": "1",
+                "long_name": "why a pixel has a label or none",
+                "flag_values": [int(status) for status in Status],
+                "flag_meanings": " ".join(status.name.lower() for status in Status),
+                f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre "
+                "sees",
+                "changed": "LiDAR and images show different surfaces there, or water",
+                "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other "
+                "surfaces",
+                "precedence": f"frame, {view} view, correlation of points; {other} view, edge, "
+                "change, number of points of pixels",
+            },
+        ),
+        "height": Layer(
+            "float32",
+            np.nan,
+            {
+                "units": "m",
+                "long_name": "greatest height above the WGS 84 ellipsoid of the points used",
+                "nodata": "NaN",
+            },
+        ),
+        "point_count": Layer(
+            "uint16",
+            0,
+            {
+                "units": "1",
+                "long_name": f"number of points used: {used}",
+                "comment": "counts above 65535 are stored as 65535",
+            },
+        ),
+        "correlation": Layer(
+            "float32",
+            np.nan,
+            {
+                "units": "1",
+                "long_name": compared.get(settings.method, "none: no windows are compared"),
+                "nodata": "NaN",
+            },
+        ),
+        "uncertainty": Layer(
+            "float32",
+            np.nan,
+            {
+                "units": "px",
+                "long_name": "standard uncertainty of the disparity",
+                "nodata": "NaN",
+                "formula": "sqrt(v / n + p + a^2 + (gx ax)^2 + (gy ay)^2): v variance of the "
+                "points' disparities about their surface, pooled over 3 x 3 pixels; n point_count; "
+                "p variance of the plane to the centre; g slope of the disparity; a standard "
+                "uncertainty of disparity and of place (ax, ay) by the alignment",
+            },
+        ),
+        "surface_class": Layer(
+            "uint8",
+            0,
+            {
+                "units": "1",
+                "long_name": "LAS class (ASPRS) of the highest point used",
+                "comment": "0: never classified, or no label",
+            },
+        ),
+    }

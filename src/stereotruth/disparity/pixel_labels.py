@@ -1,0 +1,311 @@
+"""One label per pixel from the points that passed: exact sums, then a plane to the pixel's centre.
+
+- ``top``: mean longitude, latitude and height of the points on the surface that the pixel's centre
+  sees. The mean lies beside the centre; a plane through the means of the pixel and those of its
+  neighbours on the same surface takes the disparity there. No bias by the largest of several noisy
+  heights, by slopes, or by mixture where a roof's edge and the ground share a pixel.
+- ``paper``: mean longitude and latitude of all points, height of the highest (section III-C).
+
+Sums are of integers, so that the order of the points leaves no trace; what is computed from
+neighbours takes them in a fixed order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..epipolar.model import EpipolarModel
+from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from .local_projection import LocalProjection
+from .one_surface import SURFACE_PX
+from .pixel_points import PX, PixelPoints
+from .right_view import MirroredModel
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+Records = NDArray[np.void]
+
+
+# What airborne LiDAR has at least (m): floor of the points' noise, however few and alike they are.
+HEIGHT_NOISE_M = 0.02
+FEW = 3  # degrees of freedom below which the points' own spread says nothing:
+FEW_NOISE_M = 0.05  # then this is taken
+_PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
+RIDGE = 0.1  # px², keeps planes through places in a line level across it
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """What the points of each pixel come to; arrays [h, w], NaN (0) where a pixel has none.
+
+    ``sums`` int64[h * w, 4]: number of points, exact sums of their lattice coordinates; ``count``;
+    ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the representative point;
+    ``highest`` (m); ``correlation`` mean of the points'; ``surface_class`` ASPRS class of the
+    highest point; ``moments`` [h, w, 6]: sums over the points, about their mean, of uu, uv, vv, uz,
+    vz, zz, with (u, v) the place in the left grid and z the disparity, px².
+    """
+
+    sums: NDArray[np.int64]
+    count: NDArray[np.int64]
+    x: Floats
+    y: Floats
+    disparity: Floats
+    highest: Floats
+    correlation: Floats
+    surface_class: NDArray[np.uint8]
+    moments: Floats
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _collect(
+    points: Records,
+    start: Ints,
+    use: Bools,
+    origin: tuple[int, int],
+    correlation: NDArray[np.float32],
+    sums: Ints,
+    highest: Floats,
+    surface_class: NDArray[np.uint8],
+    mean_correlation: Floats,
+    moments: Floats,
+) -> None:
+    """Per pixel from its points in ``use``; sums of products are of steps about known places."""
+    square = float(PX) * PX
+    for p in range(start.size - 1):
+        n = lon = lat = height = 0
+        top = np.int32(-(1 << 31))
+        top_class = np.uint8(0)
+        least = np.int32((1 << 31) - 1)
+        for k in range(start[p], start[p + 1]):
+            if not use[k]:
+                continue
+            point = points[k]
+            n += 1
+            lon += point.lon
+            lat += point.lat
+            height += point.height
+            least = min(least, point.disparity)
+            if point.height > top or (point.height == top and point.surface_class > top_class):
+                top, top_class = point.height, point.surface_class
+        sums[p, 0], sums[p, 3] = n, height
+        sums[p, 1], sums[p, 2] = lon + n * origin[0], lat + n * origin[1]
+        surface_class[p] = top_class
+        highest[p] = top / _PER_M if n else np.nan
+        mean_correlation[p] = np.nan
+        moments[p] = 0.0
+        if n == 0:
+            continue
+        su = sv = sz = suu = suv = svv = suz = svz = szz = together = 0
+        for k in range(start[p], start[p + 1]):
+            if not use[k]:
+                continue
+            u, v = np.int64(points[k].u), np.int64(points[k].v)
+            z = np.int64(points[k].disparity) - least
+            su += u
+            sv += v
+            sz += z
+            suu += u * u
+            suv += u * v
+            svv += v * v
+            suz += u * z
+            svz += v * z
+            szz += z * z
+            if correlation.size:
+                together += np.int64(np.rint(np.float64(correlation[k]) * PX))
+        if correlation.size:
+            mean_correlation[p] = together / n / PX
+        u, v, z = float(su), float(sv), float(sz)
+        moments[p, 0] = (suu - u * u / n) / square
+        moments[p, 1] = (suv - u * v / n) / square
+        moments[p, 2] = (svv - v * v / n) / square
+        moments[p, 3] = (suz - u * z / n) / square
+        moments[p, 4] = (svz - v * z / n) / square
+        moments[p, 5] = (szz - z * z / n) / square
+
+
+def condense(
+    model: EpipolarModel | MirroredModel,
+    local: LocalProjection,
+    window: PixelPoints,
+    use: Bools,
+    correlation: NDArray[np.float32] | None,
+    representative: str,
+) -> Pixels:
+    """The pixels of a window from its points in ``use`` [n].
+
+    ``local`` is that of the ``model`` for a box with all points; ``correlation`` [n] of the points
+    or None.
+    """
+    size, shape = window.start.size - 1, window.shape
+    sums = np.empty((size, 4), dtype=np.int64)
+    highest, mean, moments = np.empty(size), np.empty(size), np.empty((size, 6))
+    surface_class = np.empty(size, dtype=np.uint8)
+    _collect(
+        window.points,
+        window.start,
+        use,
+        window.origin,
+        np.empty(0, dtype=np.float32) if correlation is None else correlation,
+        sums,
+        highest,
+        surface_class,
+        mean,
+        moments,
+    )
+    place = local.at_means(sums)
+    if representative == "paper":
+        found = np.flatnonzero(sums[:, 0])
+        lon, lat = (sums[found, axis] / sums[found, 0] / _PER_DEG for axis in (1, 2))
+        place[:, found] = model.ground_to_epipolar(lon, lat, highest[found])
+    return Pixels(
+        sums=sums,
+        count=sums[:, 0].reshape(shape),
+        x=place[0].reshape(shape),
+        y=place[1].reshape(shape),
+        disparity=(place[0] - place[2]).reshape(shape),
+        highest=highest.reshape(shape),
+        correlation=mean.reshape(shape),
+        surface_class=surface_class.reshape(shape),
+        moments=moments.reshape(*shape, 6),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Disparities (px) at the centres of pixels, arrays [h, w], NaN where there is none.
+
+    ``slope`` [2, h, w]: of the disparity along x and y; ``variance`` (px²) of the disparity from
+    the points alone.
+    """
+
+    disparity: Floats
+    slope: Floats
+    variance: Floats
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plane(
+    disparity: Floats,
+    x: Floats,
+    y: Floats,
+    first_row: int,
+    first_col: int,
+    label: Floats,
+    slope: Floats,
+    spread: Floats,
+) -> None:
+    """``spread``: variance (px²) that the slopes' uncertainty brings to the label."""
+    rows, cols = disparity.shape
+    for j in range(rows):
+        for i in range(cols):
+            here = disparity[j, i]
+            label[j, i] = here
+            if not np.isfinite(here):
+                continue
+            n = 0
+            su = sv = sz = suu = suv = svv = suz = svz = szz = 0.0
+            for b in range(max(j - 1, 0), min(j + 2, rows)):
+                for a in range(max(i - 1, 0), min(i + 2, cols)):
+                    z = disparity[b, a] - here
+                    if abs(z) <= SURFACE_PX:  # also false for NaN
+                        u, v = x[b, a] - x[j, i], y[b, a] - y[j, i]
+                        n += 1
+                        su += u
+                        sv += v
+                        sz += z
+                        suu += u * u
+                        suv += u * v
+                        svv += v * v
+                        suz += u * z
+                        svz += v * z
+                        szz += z * z
+            if n < 5:
+                continue
+            suu += RIDGE - su * su / n
+            svv += RIDGE - sv * sv / n
+            suv -= su * sv / n
+            suz -= su * sz / n
+            svz -= sv * sz / n
+            szz -= sz * sz / n
+            det = suu * svv - suv * suv
+            gx = (suz * svv - svz * suv) / det
+            gy = (svz * suu - suz * suv) / det
+            u, v = first_col + i - x[j, i], first_row + j - y[j, i]
+            label[j, i] = here + gx * u + gy * v
+            slope[0, j, i] = gx
+            slope[1, j, i] = gy
+            rest = max(szz - gx * suz - gy * svz, 0.0) / (n - 3)
+            spread[j, i] = rest * (u * u * svv - 2.0 * u * v * suv + v * v * suu) / det
+
+
+def at_centres(pixels: Pixels, valid: Bools, first: tuple[int, int], px_per_m: float) -> Labels:
+    """Labels of the ``valid`` pixels of a window whose first pixel is (row, col) ``first``.
+
+    Pixels with fewer than four neighbours on their surface keep the disparity of their point. The
+    outermost ring of pixels lacks neighbours. ``px_per_m``: disparity of a metre of height.
+    """
+    disparity = np.where(valid, pixels.disparity, np.nan)
+    label = np.empty(disparity.shape)
+    slope, spread = np.zeros((2, *disparity.shape)), np.zeros(disparity.shape)
+    _plane(disparity, pixels.x, pixels.y, *first, label, slope, spread)
+    variance = _noise(pixels, valid, slope, px_per_m) / np.maximum(pixels.count, 1) + spread
+    return Labels(label, slope, variance)
+
+
+def at_points(pixels: Pixels, valid: Bools, px_per_m: float) -> Labels:
+    """As :func:`at_centres`, with the disparity of each pixel's representative point."""
+    level = np.zeros((2, *valid.shape))
+    variance = _noise(pixels, valid, level, px_per_m) / np.maximum(pixels.count, 1)
+    return Labels(np.where(valid, pixels.disparity, np.nan), level, variance)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rests(
+    moments: Floats, count: Ints, valid: Bools, slope: Floats, squares: Floats, freedom: Floats
+) -> None:
+    """Sums of squares about the surface's slope, and degrees of freedom; 0 where not ``valid``."""
+    for j in range(valid.shape[0]):
+        for i in range(valid.shape[1]):
+            squares[j, i] = freedom[j, i] = 0.0
+            if not valid[j, i]:
+                continue
+            uu, uv, vv = moments[j, i, 0], moments[j, i, 1], moments[j, i, 2]
+            uz, vz, zz = moments[j, i, 3], moments[j, i, 4], moments[j, i, 5]
+            gx, gy = slope[0, j, i], slope[1, j, i]
+            rest = zz - 2.0 * (gx * uz + gy * vz)
+            rest = rest + gx * gx * uu + 2.0 * gx * gy * uv + gy * gy * vv
+            squares[j, i] = max(rest, 0.0)
+            freedom[j, i] = count[j, i] - 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pooled(
+    squares: Floats, freedom: Floats, valid: Bools, few: float, least: float, out: Floats
+) -> None:
+    """Variances over 3 x 3 pixels, added in one order; NaN where not ``valid``."""
+    rows, cols = valid.shape
+    for j in range(rows):
+        for i in range(cols):
+            out[j, i] = np.nan
+            if not valid[j, i]:
+                continue
+            total = n = 0.0
+            for b in range(max(j - 1, 0), min(j + 2, rows)):
+                for a in range(max(i - 1, 0), min(i + 2, cols)):
+                    total += squares[b, a]
+                    n += freedom[b, a]
+            out[j, i] = max(total / n if n >= FEW else few, least)
+
+
+def _noise(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float) -> Floats:
+    """Variance (px²) of a point's disparity about its surface, pooled over 3 x 3 pixels."""
+    squares, freedom, out = (np.empty(valid.shape) for _ in range(3))
+    _rests(pixels.moments, pixels.count, valid, slope, squares, freedom)
+    floors = (FEW_NOISE_M * px_per_m) ** 2, (HEIGHT_NOISE_M * px_per_m) ** 2
+    _pooled(squares, freedom, valid, *floors, out)
+    return out

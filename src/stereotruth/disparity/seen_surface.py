@@ -1,0 +1,371 @@
+"""Which surface a pixel's centre sees.
+
+Points that others, nearer to the left camera (of larger disparity), surround in the left image are
+covered; the uncovered point nearest to the centre tells the surface.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .one_surface import SURFACE_PX
+from .pixel_points import PX, PixelPoints
+
+Ints = NDArray[np.int64]
+Records = NDArray[np.void]
+Steps = NDArray[np.int32]
+
+
+EDGE = 5  # px; see seen_surface
+# A point is covered if the higher ones around it leave no gap of more than EMPTY_OCTANTS; looked
+# for within COVER_PX, or further where points are sparse. Outside a straight edge the gap is 180°.
+COVER_PX = 1.0
+MAX_COVER_PX = 2.5
+EMPTY_OCTANTS = 3
+MANY = 12  # points in 3 x 3 pixels from which on a gap of four octants is no chance
+_FINE = 4  # parts of a pixel along each axis
+
+_NOTHING = np.int32(-(1 << 30))  # disparity (steps) below all that occur
+_SURFACE = round(SURFACE_PX * PX)
+_PART = PX // _FINE
+_UNCOVERED, _ON_SURFACE = np.uint8(1), np.uint8(2)
+
+
+def _surrounded(limit: int) -> NDArray[np.bool_]:
+    """[256] by bit mask of octants: no more than ``limit`` octants in a row are empty."""
+    table = np.zeros(256, dtype=np.bool_)
+    for mask in range(1, 256):
+        ring = "".join(str(mask >> (k % 8) & 1) for k in range(16))
+        table[mask] = max(len(run) for run in ring.split("1")) <= limit
+    return table
+
+
+_SURROUNDED = _surrounded(EMPTY_OCTANTS)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _octant(du: float, dv: float) -> int:
+    """0 … 7 in the order of the angle: quadrant, then its first or second half."""
+    mixed = (du < 0) != (dv < 0)
+    quadrant = (4 if dv < 0 else 0) + (2 if mixed else 0)
+    return quadrant + (1 if (abs(dv) > abs(du)) != mixed else 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _range(
+    points: Records, start: Ints, p: int, flags: NDArray[np.uint8], low: Steps, high: Steps
+) -> int:
+    """Least and greatest disparity of a pixel's uncovered points, and how many there are."""
+    least, greatest, n = -_NOTHING, _NOTHING, 0
+    for k in range(start[p], start[p + 1]):
+        if flags[k] & _UNCOVERED:
+            least = min(least, points[k].disparity)
+            greatest = max(greatest, points[k].disparity)
+            n += 1
+    low[p], high[p] = least, greatest
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ranges(
+    points: Records,
+    start: Ints,
+    flags: NDArray[np.uint8],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+) -> None:
+    for p in range(count.size):
+        count[p] = _range(points, start, p, flags, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
+    """Greatest disparity in each of the _FINE² parts of a pixel."""
+    first = p * _FINE * _FINE
+    tops[first : first + _FINE * _FINE] = _NOTHING
+    for k in range(start[p], start[p + 1]):
+        i, j = (points[k].u + PX // 2) // _PART, (points[k].v + PX // 2) // _PART
+        at = first + j * _FINE + i
+        tops[at] = max(tops[at], points[k].disparity)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _possible(across: int, down: int) -> int:
+    """Octants that a pixel so many px off can lie in."""
+    octants = 255
+    if across:
+        octants &= 195 if across > 0 else 60
+    if down:
+        octants &= 15 if down > 0 else 240
+    return octants
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _uncovered(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    near: NDArray[np.int32],
+    top: Steps,
+    ceilings: Steps,
+    surrounded: NDArray[np.bool_],
+    flags: NDArray[np.uint8],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+) -> None:
+    """Takes _UNCOVERED from the points that parts of higher disparity surround.
+
+    ``near``: points in 3 x 3 pixels; ``top`` of each pixel; ``ceilings`` [k]: the greatest ``top``
+    no more than k + 1 px off. ``low``, ``high``, ``count`` (see _range) are brought up to date.
+    """
+    tops = np.empty(top.size * _FINE * _FINE, np.int32)  # only what is needed is written
+    known = np.zeros(top.size, np.bool_)
+    rows, cols = shape
+    for p in range(top.size):
+        if ceilings[-1, p] <= low[p] + _SURFACE:
+            continue
+        distance = 3.0 / np.sqrt(max(near[p], 1))
+        reach = min(max(1.7 * distance, COVER_PX), MAX_COVER_PX)
+        n = int(reach + 0.875)  # the parts' centres reach to 3 / 8 px, places to 1 / 2 px
+        far = (reach * PX) ** 2
+        row, col = p // cols, p % cols
+        first_row, end_row = max(row - n, 0), min(row + n + 1, rows)
+        first_col, end_col = max(col - n, 0), min(col + n + 1, cols)
+        covered = False
+        for k in range(start[p], start[p + 1]):
+            limit = points[k].disparity + _SURFACE
+            if ceilings[n - 1, p] <= limit:
+                continue
+            # Beside a wall, what is higher lies to one side: no need to look closer.
+            octants = 0
+            for b in range(first_row, end_row):
+                for a in range(first_col, end_col):
+                    if top[b * cols + a] > limit:
+                        octants |= _possible(a - col, b - row)
+            if not surrounded[octants]:
+                continue
+            octants = 0
+            for b in range(first_row, end_row):
+                for a in range(first_col, end_col):
+                    q = b * cols + a
+                    if top[q] <= limit:
+                        continue
+                    if not known[q]:
+                        known[q] = True
+                        _fine_tops(points, start, q, tops)
+                    du = (a - col) * PX - PX // 2 + _PART // 2 - points[k].u
+                    dv = (b - row) * PX - PX // 2 + _PART // 2 - points[k].v
+                    for part in range(_FINE * _FINE):
+                        if tops[q * _FINE * _FINE + part] > limit:
+                            s = du + part % _FINE * _PART
+                            t = dv + part // _FINE * _PART
+                            if s * s + t * t <= far:
+                                octants |= 1 << _octant(s, t)
+                if surrounded[octants]:
+                    flags[k] = 0
+                    covered = True
+                    break
+        if covered:
+            count[p] = _range(points, start, p, flags, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(
+    points: Records, start: Ints, q: int, across: int, down: int, flags: NDArray[np.uint8], best
+) -> tuple[int, int]:
+    """(Squared distance to the centre, disparity) of the nearest: ``best``, or a point of pixel q.
+
+    q lies ``across``, ``down`` px from the centre; of equals, the greater disparity.
+    """
+    distance, disparity = best
+    for k in range(start[q], start[q + 1]):
+        if flags[k] & _UNCOVERED:
+            u, v = across * PX + points[k].u, down * PX + points[k].v
+            r, d = u * u + v * v, np.int64(points[k].disparity)
+            if r < distance or (r == distance and d > disparity):
+                distance, disparity = r, d
+    return distance, disparity
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _on_edge(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    p: int,
+    flags: NDArray[np.uint8],
+    distance: int,
+    disparity: int,
+    many: bool,
+    margin: float,
+    surrounded: NDArray[np.bool_],
+) -> bool:
+    """See :func:`seen_surface`; ``distance`` (squared) and ``disparity`` by _nearest."""
+    rows, cols = shape
+    row, col = p // cols, p % cols
+    other = np.inf
+    octants = 0
+    for b in range(max(row - 1, 0), min(row + 2, rows)):
+        for a in range(max(col - 1, 0), min(col + 2, cols)):
+            q = b * cols + a
+            for k in range(start[q], start[q + 1]):
+                if flags[k] & _UNCOVERED:
+                    u, v = (a - col) * PX + points[k].u, (b - row) * PX + points[k].v
+                    if abs(points[k].disparity - disparity) <= _SURFACE:
+                        octants |= 1 << _octant(u, v)
+                    else:
+                        other = min(other, float(u * u + v * v))
+            if margin == 0.0 and surrounded[octants]:  # no other point is nearer than the nearest
+                return False
+    if many and not surrounded[octants]:
+        return True
+    return np.sqrt(other) < np.sqrt(float(distance)) + 2.0 * margin * PX
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen(
+    points: Records,
+    start: Ints,
+    shape: tuple[int, int],
+    low: Steps,
+    high: Steps,
+    count: NDArray[np.int32],
+    around: NDArray[np.int32],
+    lowest: Steps,
+    highest: Steps,
+    margin: float,
+    surrounded: NDArray[np.bool_],
+    flags: NDArray[np.uint8],
+    seen: NDArray[np.int32],
+    edge: NDArray[np.bool_],
+) -> None:
+    """``around``, ``lowest``, ``highest``: of ``count``, ``low``, ``high`` in 3 x 3 pixels."""
+    rows, cols = shape
+    quarter = PX * PX // 4  # squared; points of other pixels are no nearer
+    none = (np.int64(1 << 62), np.int64(_NOTHING))
+    for p in range(count.size):
+        seen[p] = 0
+        edge[p] = False
+        if count[p] == 0:
+            continue
+        row, col = p // cols, p % cols
+        distance, disparity = _nearest(points, start, p, 0, 0, flags, none)
+        if distance >= quarter:
+            for b in range(max(row - 1, 0), min(row + 2, rows)):
+                for a in range(max(col - 1, 0), min(col + 2, cols)):
+                    if a != col or b != row:
+                        distance, disparity = _nearest(
+                            points,
+                            start,
+                            b * cols + a,
+                            a - col,
+                            b - row,
+                            flags,
+                            (distance, disparity),
+                        )
+        least, greatest = disparity - _SURFACE, disparity + _SURFACE
+        flat = lowest[p] >= least and highest[p] <= greatest
+        many = around[p] >= MANY
+        if (many or not flat) and (many or margin > 0.0):
+            # Four sides or corners with nothing but this surface leave no gap of three octants.
+            sides = corners = 0
+            if (flat or margin == 0.0) and 0 < row < rows - 1 and 0 < col < cols - 1:
+                for b in range(-1, 2):
+                    for a in range(-1, 2):
+                        q = p + b * cols + a
+                        if count[q] > 0 and low[q] >= least and high[q] <= greatest:
+                            sides += (a == 0) != (b == 0)
+                            corners += a != 0 and b != 0
+            if sides < 4 and corners < 4:
+                edge[p] = _on_edge(
+                    points,
+                    start,
+                    shape,
+                    p,
+                    flags,
+                    distance,
+                    disparity,
+                    many,
+                    margin,
+                    surrounded,
+                )
+        one = low[p] >= least and high[p] <= greatest
+        for k in range(start[p], start[p + 1]):
+            on_surface = one or abs(points[k].disparity - disparity) <= _SURFACE
+            if flags[k] & _UNCOVERED and on_surface:
+                flags[k] |= _ON_SURFACE
+                seen[p] += 1
+
+
+def box_sum(values: NDArray) -> NDArray:
+    """Sum over 3 x 3 pixels, always added in one order; zero beyond the edges."""
+    padded = np.pad(values, 1)
+    rows, cols = values.shape
+    return sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
+
+
+def _box_max(values: Steps, reach: int) -> Steps:
+    """Maximum over squares of 2 * reach + 1 px, cut off at the edges."""
+    for axis in (0, 1):
+        out = values.copy()
+        near, far = np.moveaxis(values, axis, 0), np.moveaxis(out, axis, 0)
+        for step in range(1, reach + 1):
+            np.maximum(far[step:], near[:-step], out=far[step:])
+            np.maximum(far[:-step], near[step:], out=far[:-step])
+        values = out
+    return values
+
+
+def seen_surface(
+    window: PixelPoints, edge_margin_px: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which points [n] lie on the surface that their pixel's centre sees; pixels [h, w] on edges.
+
+    A point is covered if points of another surface, nearer to the left camera by more than
+    SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
+    distance of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
+    beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
+    within SURFACE_PX. There are none if the pixel only holds points of another surface.
+
+    On an edge: either the points of its surface do not surround the centre: they leave a gap of
+    more than EMPTY_OCTANTS, as beside a wall that no point tells of (not where points are so sparse
+    that gaps come by chance). Or, half-way between the nearest points of its surface and of another
+    one, the edge passes within ``edge_margin_px`` of the centre, so that it may as well see the
+    other one.
+
+    The outermost EDGE rings of pixels lack neighbours.
+    """
+    points, start, shape = window.points, window.start, window.shape
+    size = start.size - 1
+    low, high = np.empty(size, np.int32), np.empty(size, np.int32)
+    count, seen = np.empty(size, np.int32), np.empty(size, np.int32)
+    flags = np.full(points.size, _UNCOVERED)
+    _ranges(points, start, flags, low, high, count)
+    top = high.copy()
+    reach = range(1, int(np.ceil(MAX_COVER_PX)) + 1)
+    ceilings = np.stack([_box_max(top.reshape(shape), px).reshape(-1) for px in reach])
+    near = box_sum(count.reshape(shape)).reshape(-1)
+    _uncovered(points, start, shape, near, top, ceilings, _SURROUNDED, flags, low, high, count)
+    edge = np.empty(size, dtype=np.bool_)
+    _seen(
+        points,
+        start,
+        shape,
+        low,
+        high,
+        count,
+        box_sum(count.reshape(shape)).reshape(-1),
+        -_box_max(-low.reshape(shape), 1).reshape(-1),
+        _box_max(high.reshape(shape), 1).reshape(-1),
+        edge_margin_px,
+        _SURROUNDED,
+        flags,
+        seen,
+        edge,
+    )
+    edge &= seen > 0
+    return (flags & _ON_SURFACE) != 0, edge.reshape(shape)

@@ -1,0 +1,134 @@
+"""Where the two rays of a match meet: from epipolar pixels and disparities to the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .model import EpipolarModel
+from .rpc import project_point
+from .spline_kernels import inverse_point
+
+Floats = NDArray[np.float64]
+
+
+TOLERANCE_M = 1e-5
+FRESH = 64  # px along a row after which the derivatives are taken anew
+DEG = 1.0 / 111_000.0  # per metre, about
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_both(sensors: Floats, lon: float, lat: float, h: float, out: Floats) -> None:
+    out[0], out[1] = project_point(sensors[0], lon, lat, h)
+    out[2], out[3] = project_point(sensors[1], lon, lat, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solver(sensors: Floats, lon: float, lat: float, h: float, out: Floats) -> None:
+    """Fill ``out`` [3, 4]: (d lon, d lat, d h) by which 4 image residuals (px) are taken out."""
+    ahead, behind, jacobian = np.empty(4), np.empty(4), np.empty((4, 3))
+    for k in range(3):
+        a, b, c = (DEG if k == 0 else 0.0), (DEG if k == 1 else 0.0), (1.0 if k == 2 else 0.0)
+        _project_both(sensors, lon + a, lat + b, h + c, ahead)
+        _project_both(sensors, lon - a, lat - b, h - c, behind)
+        for i in range(4):
+            jacobian[i, k] = (ahead[i] - behind[i]) / 2.0  # px per metre
+    inverse = np.linalg.inv(jacobian.T @ jacobian) @ jacobian.T
+    out[0] = inverse[0] * DEG
+    out[1] = inverse[1] * DEG
+    out[2] = inverse[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refine(
+    sensors: Floats, solver: Floats, image: Floats, ground: Floats, steps: int, there: Floats
+) -> bool:
+    """Move ``ground`` [lon, lat, h] to where both rays meet; whether it came to rest."""
+    for _ in range(steps):
+        _project_both(sensors, ground[0], ground[1], ground[2], there)
+        largest = 0.0
+        for k in range(3):
+            step = 0.0
+            for i in range(4):
+                step += solver[k, i] * (image[i] - there[i])
+            ground[k] += step
+            largest = max(largest, abs(step) / (DEG if k < 2 else 1.0))
+        if largest < TOLERANCE_M:
+            return True
+        if not largest < 1e6:
+            return False
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _intersect(
+    sensors: Floats,
+    left: Floats,
+    right: Floats,
+    row0: int,
+    col0: int,
+    disparity: NDArray[np.float32],
+    start: Floats,
+    out: Floats,
+) -> None:
+    """Fill ``out`` [3, h, w] with lon, lat, h of a window of disparities, NaN where there is none.
+
+    ``left`` and ``right`` are packed image models. A pixel starts where its neighbour ended: the
+    derivatives change so little that two or three steps do.
+    """
+    solver, image, there = np.empty((3, 4)), np.empty(4), np.empty(4)
+    ground, of_row = start.copy(), start.copy()
+    for i in range(disparity.shape[0]):
+        ground[:] = of_row
+        since = FRESH
+        first = True
+        for j in range(disparity.shape[1]):
+            d = disparity[i, j]
+            x, y = float(col0 + j), float(row0 + i)
+            if np.isfinite(d):
+                image[0], image[1] = inverse_point(left, x, y)
+                image[2], image[3] = inverse_point(right, x - d, y)
+            if not (np.isfinite(d) and np.isfinite(image[0]) and np.isfinite(image[2])):
+                out[:, i, j] = np.nan
+                continue
+            if since >= FRESH:
+                _solver(sensors, ground[0], ground[1], ground[2], solver)
+                since = 0
+            good = _refine(sensors, solver, image, ground, 8, there)
+            tries = 0
+            while not good and tries < 10:  # far from the last one: derivatives of the place itself
+                ground[:] = start if tries == 0 else ground
+                _solver(sensors, ground[0], ground[1], ground[2], solver)
+                good = _refine(sensors, solver, image, ground, 4, there)
+                tries += 1
+            if good:
+                out[0, i, j], out[1, i, j], out[2, i, j] = ground[0], ground[1], ground[2]
+                since += 1
+                if first:
+                    of_row[:] = ground
+                    first = False
+            else:
+                out[:, i, j] = np.nan
+                ground[:] = start
+                since = FRESH
+
+
+def intersect(
+    model: EpipolarModel, disparity: NDArray[np.float32], row: int = 0, col: int = 0
+) -> Floats:
+    """float64[3, h, w]: longitude, latitude (degrees) and ellipsoidal height (m) of left pixels.
+
+    ``disparity`` float32[h, w] px of the window of the epipolar grid whose first pixel is (row,
+    col). NaN where it is NaN, and where the rays do not meet.
+    """
+    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
+    centre = col + disparity.shape[1] / 2, row + disparity.shape[0] / 2
+    lon, lat = model.epipolar_to_ground(*centre, model.reference_height)
+    start = np.array([float(lon), float(lat), model.reference_height])
+    out = np.empty((3, *disparity.shape))
+    sensors = np.stack([model.left.packed(), model.right.packed()])
+    _intersect(
+        sensors, model.left_image.packed, model.right_image.packed, row, col, disparity, start, out
+    )
+    return out

@@ -1,0 +1,259 @@
+"""Resampling of a stereo pair into epipolar images: [y, x] Zarr grids of uint16, nodata 0.
+
+Both images of a pair get the same grid and pixel size, so that rows correspond and
+d = x_left - x_right is in px of that grid. The geometry is :mod:`stereotruth.epipolar.fit`'s.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from ..alignment.label_uncertainty import sigma_nodes
+from ..errors import InputError
+from ..job import BlockProgress
+from ..products.grids import Layer, Strip, blocks
+from ..products.provenance import digest, file_sha256, source_digest
+from ..products.resumable_grids import BlockStore, making
+from .fit import fit_epipolar
+from .image_reader import CACHE_MB, Source
+from .model import EpipolarModel, ImageModel
+from .resampling import ANTIALIAS, KERNEL, RADIUS, resample
+from .rpc import SensorModel
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+LabelSigma = Callable[[EpipolarModel, Any, Any], tuple[Floats, Floats, Floats]]
+
+
+SHARD = 1024  # px; one task writes one shard file
+CHUNK = 256
+LATTICE = 16  # px between exact source coordinates; in between they are bilinear
+LATTICE_ERROR = 0.002  # px, accepted error of that
+
+
+def _lattice(model: ImageModel, rows: slice, cols: slice, step: int) -> Floats:
+    """Source (col, row) [2, k, l] at every ``step``-th epipolar pixel of a block and past it."""
+    y = np.arange(rows.start, rows.stop + step, step, dtype=np.float64)
+    x = np.arange(cols.start, cols.stop + step, step, dtype=np.float64)
+    return np.stack(model.inverse(x[None, :], y[:, None]))
+
+
+def _lattice_step(model: ImageModel, shape: tuple[int, int]) -> tuple[int, float]:
+    """Lattice spacing in px that keeps the error of bilinear coordinates small, and that error.
+
+    The error, in source px, is taken at the middle of lattice cells all over the grid.
+    """
+    for step in (LATTICE, LATTICE // 2, LATTICE // 4, 1):
+        y = np.linspace(0, shape[0] - 1, 33)[:, None]
+        x = np.linspace(0, shape[1] - 1, 33)[None, :]
+        corners = [
+            np.stack(model.inverse(x + a * step, y + b * step)) for a in (0, 1) for b in (0, 1)
+        ]
+        exact = np.stack(model.inverse(x + step / 2, y + step / 2))
+        error = float(np.nanmax(np.abs(sum(corners) / 4 - exact)))
+        if error <= LATTICE_ERROR or step == 1:
+            break
+    return step, error
+
+
+def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
+    """Source px per epipolar px along (col, row), mid-grid, if above ANTIALIAS; else 1."""
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    col, row = model.inverse([x - 1, x + 1, x, x], [y, y, y - 1, y + 1])
+    spans = [float(np.hypot(c[1] - c[0], c[3] - c[2]) / 2) for c in (col, row)]
+    return tuple(span if span > ANTIALIAS else 1.0 for span in spans)
+
+
+def rectify_image(
+    source: Source,
+    model: ImageModel,
+    target: BlockStore,
+    shape: tuple[int, int],
+    *,
+    key: str,
+    workers: int,
+    what: str = "rectified image",
+    strip: Strip | None = None,
+) -> dict[str, Any]:
+    """Resample one image into its epipolar grid, block by block; returns facts for the attributes.
+
+    A task reads the window of the source that its block needs; the result does not depend on
+    ``workers`` or on the order of the tasks. Blocks that are there with the same ``key`` are taken
+    over. ``strip``: only its blocks.
+
+    Raises InputError if no pixel of the whole grid gets a value.
+    """
+    step, error = _lattice_step(model, shape)
+    scale = _widening(model, shape)
+    reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
+
+    def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
+        lattice = _lattice(model, rows, cols, step)
+        bounds = []
+        for axis in range(2):
+            if not np.isfinite(lattice[axis]).any():
+                return None
+            low = int(np.floor(np.nanmin(lattice[axis]))) - reach[axis]
+            high = int(np.ceil(np.nanmax(lattice[axis]))) + reach[axis] + 1
+            low, high = max(low, 0), min(high, source.size[axis])
+            if low >= high:
+                return None
+            bounds += [low, high - low]
+        return lattice, bounds
+
+    def run(rows: slice, cols: slice) -> None:
+        found = window(rows, cols)
+        if found is None:
+            target.write((rows, cols), key, {}, 0)
+            return
+        lattice, (col, width, row, height) = found
+        pixels = source.read(col, row, width, height)
+        lattice[0] -= col
+        lattice[1] -= row
+        out = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=np.uint16)
+        valid = resample(pixels, lattice, step, scale, out)
+        target.write((rows, cols), key, {"image": out}, valid)
+
+    every = blocks(shape, SHARD)
+    part = every if strip is None else strip.of(every)
+    # In the order of source rows, so that GDAL's cache serves neighbours in files of strips.
+    todo = []
+    for number in target.missing(part, [key] * len(part), workers):
+        rows, cols = part[number]
+        middle = model.inverse((cols.start + cols.stop) / 2, (rows.start + rows.stop) / 2)
+        todo.append((float(np.nan_to_num(middle[1])) // SHARD, rows, cols))
+    todo.sort(key=lambda item: item[0])
+    tasks = [
+        dask.delayed(run)(rows, cols, dask_key_name=f"block-{i:07d}")
+        for i, (_, rows, cols) in enumerate(todo)
+    ]
+    with BlockProgress(len(tasks), what):
+        dask.compute(*tasks, scheduler="threads", num_workers=workers)
+    if strip is not None:
+        return {}
+    valid = int(sum(target.results(every)))
+    if valid == 0:
+        raise InputError(
+            "image has nothing but nodata where the two images overlap",
+            file=source.path,
+            remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
+        )
+    log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
+    return {
+        "source": source.path.name,
+        "source_nodata": source.nodata,
+        "value_gain": source.gain,
+        "kernel": KERNEL,
+        "kernel_widening_col_row": list(scale),
+        "coordinate_error_px": round(error, 7),
+        "valid_pixels": valid,
+    }
+
+
+def rectify(
+    left_image: str | Path,
+    right_image: str | Path,
+    left_sensor: SensorModel,
+    right_sensor: SensorModel,
+    reference_height: float,
+    epipolar_json: str | Path | None,
+    left_store: str | Path,
+    right_store: str | Path,
+    *,
+    workers: int = 1,
+    height_range: tuple[float, float] | None = None,
+    label_sigma: LabelSigma | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    strip: Strip | None = None,
+) -> EpipolarModel:
+    """Fit the epipolar model of an aligned pair and resample both images into Zarr grids.
+
+    Heights are ellipsoidal m; ``height_range`` defaults to the RPCs'. ``label_sigma`` is
+    ``Alignment.label_sigma``, for the attribute ``alignment_sigma`` of the left grid. Grids hold
+    ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model and
+    ``provenance``. All three products appear when they are whole, or not at all.
+
+    Blocks that an earlier call has left, made of the same images by the same model and code, are
+    taken over (see :mod:`stereotruth.products.resumable_grids`). ``strip``: make its blocks only,
+    for a later call without it.
+
+    Raises InputError for images that cannot be read, do not overlap, are one view, or hold nothing
+    but nodata.
+    """
+    code = source_digest("epipolar.rectify")
+    with ExitStack() as stack:
+        # GDAL's default, 5 % of the machine's memory, can be more than a job may use
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=CACHE_MB))
+        left, right = (stack.enter_context(Source(path)) for path in (left_image, right_image))
+        model = fit_epipolar(
+            left_sensor,
+            right_sensor,
+            left.size,
+            right.size,
+            reference_height,
+            height_range=height_range,
+            names=(str(left_image), str(right_image)),
+        )
+        finished = []
+        for view, source, image, store in (
+            ("left", left, model.left_image, left_store),
+            ("right", right, model.right_image, right_store),
+        ):
+            layer = Layer(
+                dtype="uint16",
+                fill=0,
+                attrs={
+                    "units": "1",
+                    "long_name": f"digital numbers of the {view} epipolar image",
+                    "nodata": 0,
+                },
+            )
+            attrs = {
+                "view": view,
+                "epipolar": model.to_dict(),
+                "provenance": dict(provenance or {}),
+            }
+            if label_sigma is not None and view == "left":
+                attrs["alignment_sigma"] = sigma_nodes(model, label_sigma)
+            grid = stack.enter_context(
+                making(
+                    store,
+                    model.shape,
+                    {"image": layer},
+                    chunk=CHUNK,
+                    shard=SHARD,
+                    shared=strip is not None,
+                )
+            )
+            made_of = {
+                "image": file_sha256(source.path),
+                "size": source.size,
+                "model": image.to_dict(),
+                "code": code,
+            }
+            attrs["resampling"] = rectify_image(
+                source,
+                image,
+                grid,
+                model.shape,
+                key=digest(made_of),
+                workers=workers,
+                what=f"{view} epipolar image",
+                strip=strip,
+            )
+            finished.append((grid, store, attrs))
+        if strip is None:
+            for grid, store, attrs in finished:
+                grid.publish(store, blocks(model.shape, SHARD), attrs)
+            if epipolar_json is not None:
+                model.save(epipolar_json, provenance)
+    return model

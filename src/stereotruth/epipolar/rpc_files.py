@@ -1,0 +1,131 @@
+"""RPCs as they come: in the TIFF, as _RPC.TXT, .RPB or GaoFen-7's .rpb."""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from ..errors import InputError
+from .rpc import RPC, SCALARS, VECTORS
+
+log = logging.getLogger("stereotruth")
+
+
+_RPB_NAMES = {
+    "lineoffset": "line_off",
+    "sampoffset": "samp_off",
+    "latoffset": "lat_off",
+    "longoffset": "long_off",
+    "heightoffset": "height_off",
+    "linescale": "line_scale",
+    "sampscale": "samp_scale",
+    "latscale": "lat_scale",
+    "longscale": "long_scale",
+    "heightscale": "height_scale",
+    "linenumcoef": "line_num_coeff",
+    "linedencoef": "line_den_coeff",
+    "sampnumcoef": "samp_num_coeff",
+    "sampdencoef": "samp_den_coeff",
+}
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.replace(",", " ").split()]
+
+
+def _parse_rpc_text(text: str) -> dict[str, Any]:
+    """Fields of a ``_RPC.TXT``: ``LINE_OFF: 123.0 pixels``, ``LINE_NUM_COEFF_1: 1.0E-3``."""
+    found: dict[str, Any] = {}
+    numbered: dict[str, dict[int, float]] = {}
+    for key, value in re.findall(r"^\s*([A-Za-z_]+\w*)\s*[:=]\s*(.*?)\s*$", text, re.MULTILINE):
+        name = key.lower()
+        if name in SCALARS:
+            found[name] = _numbers(value.split()[0])[0] if value else float("nan")
+        elif name in VECTORS:
+            found[name] = _numbers(value)
+        elif match := re.fullmatch(r"(\w+_coeff)_(\d+)", name):
+            numbered.setdefault(match[1], {})[int(match[2])] = _numbers(value.split()[0])[0]
+    for name, values in numbered.items():
+        missing = sorted(set(range(1, 21)) - set(values))
+        if missing:
+            raise ValueError(f"{name}_{missing[0]} missing")
+        found[name] = [values[i] for i in range(1, 21)]
+    return found
+
+
+def _parse_rpb(text: str) -> dict[str, Any]:
+    """Fields of an ``.RPB`` (DigitalGlobe, GF-7): ``lineOffset = 1;``, ``lineNumCoef = (…);``."""
+    found: dict[str, Any] = {}
+    for key, group, value in re.findall(r"(\w+)\s*=\s*(?:\(([^)]*)\)|\"?([^;\n\"(]*))", text):
+        if key.lower() == "specid" and value.strip().upper() == "RPC00A":
+            raise ValueError("SpecId is RPC00A, whose terms have another order than RPC00B's")
+        name = _RPB_NAMES.get(key.lower())
+        if name in VECTORS:
+            found[name] = _numbers(group)
+        elif name:
+            found[name] = _numbers(value.strip())[0]
+    return found
+
+
+def _sidecar(image: Path) -> Path | None:
+    """The RPC file beside an image, in GDAL's order of preference; any case of the letters."""
+    names = {path.name.lower(): path for path in sorted(image.parent.iterdir(), reverse=True)}
+    for ending in (".rpb", "_rpc.txt"):
+        if path := names.get((image.stem + ending).lower()):
+            return path
+    return None
+
+
+def read_rpc(image: str | Path) -> RPC:
+    """The RPC of an image file: from ``.RPB``/``.rpb`` or ``_RPC.TXT`` beside it, or its metadata.
+
+    Metadata are those that GDAL reads, above all the TIFF tag RPCCoefficientTag (50844). A file
+    beside the image goes before the tag, as in GDAL, so that a better RPC can be put there.
+
+    Raises InputError, naming the file, if there is none or it cannot be used.
+    """
+    image = Path(image)
+    if not image.is_file():
+        raise InputError("no such image", file=image, remedy="correct the path in the scene sheet")
+    source = _sidecar(image)
+    try:
+        if source is not None:
+            text = source.read_text(encoding="utf-8", errors="replace")
+            parse = _parse_rpb if source.suffix.lower() == ".rpb" else _parse_rpc_text
+            rpc = RPC.from_dict(parse(text))
+        else:
+            source = image
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                dataset = rasterio.open(image)
+            with dataset:
+                tags = {key.lower(): value for key, value in dataset.tags(ns="RPC").items()}
+            if not tags:
+                raise InputError(
+                    "image has no RPC metadata",
+                    file=image,
+                    remedy=f"put {image.stem}_RPC.TXT or {image.stem}.rpb beside it, or an RPC "
+                    "tag into the TIFF",
+                )
+            rpc = RPC.from_dict(_parse_rpc_text("\n".join(f"{k}: {v}" for k, v in tags.items())))
+    except InputError:
+        raise
+    except RasterioError as error:
+        raise InputError(
+            f"not a raster that GDAL can read ({error})", file=image, remedy="check the file"
+        ) from error
+    except (ValueError, OSError, IndexError) as error:
+        raise InputError(
+            f"malformed RPC ({error})",
+            file=source,
+            remedy="get the RPC again from the image's supplier; 10 offsets and scales and four "
+            "times 20 coefficients in RPC00B order are needed",
+        ) from error
+    log.info("RPC of %s from %s", image.name, "its tags" if source == image else source.name)
+    return rpc

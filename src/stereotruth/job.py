@@ -1,0 +1,123 @@
+"""Logging and error reporting of one job: the same lines on the terminal and in its log file."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+from dask.callbacks import Callback
+
+from .errors import InputError
+
+log = logging.getLogger("stereotruth")
+
+
+@contextmanager
+def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
+    """Run one job: log to terminal and file; end with one clear line where the input is at fault.
+
+    ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1,
+    and so does a full disk; anything else is a defect and keeps its traceback.
+    """
+    cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
+    path = Path(log_file)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, mode="w")
+    terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
+    file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
+    handlers = (terminal, file)
+    for handler in handlers:
+        log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield log
+    except InputError as error:
+        log.error("error: %s", error)
+        raise SystemExit(1) from None
+    except Exception as error:
+        if (full := _disk_full(error)) is None:
+            log.exception("unexpected failure")
+            raise
+        log.error(
+            "error: %s: no space left on the disk. Remedy: make space there, and run again: "
+            "what is done is kept",
+            full.filename or Path.cwd(),
+        )
+        raise SystemExit(1) from None
+    finally:
+        for handler in handlers:
+            log.removeHandler(handler)
+            handler.close()
+
+
+def _disk_full(error: BaseException | None) -> OSError | None:
+    """The error of a full disk or quota behind an exception, if that is what it is."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return error
+        if isinstance(error, BaseExceptionGroup):
+            return next(filter(None, map(_disk_full, error.exceptions)), None)
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def progress(items: Iterable, total: int, what: str) -> Iterator:
+    """Pass items through and log about every tenth part done."""
+    last = -1
+    for done, item in enumerate(items, start=1):
+        yield item
+        tenth = done * 10 // max(total, 1)
+        if tenth > last:
+            last = tenth
+            log.info("%s: %d of %d", what, done, total)
+
+
+class BlockProgress(Callback):
+    """Logs about every tenth of the blocks done while Dask computes (local schedulers only)."""
+
+    def __init__(self, total: int, what: str) -> None:
+        super().__init__()
+        self.done, self.total, self.what = 0, total, what
+
+    def _posttask(self, *_: object) -> None:
+        self.done += 1
+        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
+            log.info("%s: %d of %d blocks", self.what, self.done, self.total)
+
+
+@contextmanager
+def dask_scheduler(address: str | None, seconds: float = 30.0) -> Iterator[Any]:
+    """What Dask's compute takes as its scheduler; it is waited for so many ``seconds``.
+
+    ``address`` of a running Dask scheduler (``tcp://host:8786``), or None for threads. Its workers
+    need this package and must see the files under the same paths.
+
+    Raises InputError if nothing answers there, or if `distributed` is not installed.
+    """
+    if not address:
+        yield "threads"
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(
+            f"dask.scheduler_address is {address}, but distributed is not installed",
+            remedy="pip install 'stereotruth[cluster]', or set it to null",
+        ) from error
+    try:
+        client = Client(address, timeout=seconds)
+    except OSError as error:
+        raise InputError(
+            f"no Dask scheduler answers ({error})",
+            file=address,
+            remedy="start it, correct dask.scheduler_address, or set it to null",
+        ) from error
+    with client:
+        log.info("blocks go to the Dask workers of %s", address)
+        yield client

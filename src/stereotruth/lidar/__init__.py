@@ -1,0 +1,1 @@
+"""Stage ingest. In: LAS, LAZ or COPC files, their CRS, a geoid. Out: point stores."""

@@ -1,0 +1,309 @@
+"""The coordinate system that a LiDAR file declares, or that the sheet gives it."""
+
+from __future__ import annotations
+
+import re
+import struct
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+import rasterio
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+from rasterio.io import MemoryFile
+
+from ..errors import InputError
+from .lattice import DEGREE_M
+
+VERTICAL_UNITS_KEY = 4099
+LINEAR_UNITS = {  # EPSG code: (name, metres)
+    9001: ("metre", 1.0),
+    9002: ("foot", 0.3048),
+    9003: ("US survey foot", 1200 / 3937),
+}
+_NO_DATUM = {"", "unknown", "unnamed", "not specified", "unspecified"}
+# Names of vertical datums that producers put into file names; delimited, so that no word hides one.
+DATUM_IN_NAME = re.compile(
+    r"(?<![A-Za-z0-9])(IGN69|IGN78|NAVD88|NGVD29|EGM84|EGM96|EGM08|EGM2008|DHHN92|DHHN2016|NN2000"
+    r"|RH2000|EVRF2000|EVRF2007|EVRF2019|LN02)(?![A-Za-z0-9])",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class LidarCRS:
+    """What the coordinates of a LiDAR file mean.
+
+    ``horizontal`` is a 2-D geographic or projected system; ``vertical_datum`` names the orthometric
+    datum (None: none declared); ``ellipsoidal`` says that heights are declared ellipsoidal;
+    ``vertical_unit_m`` is the length of the height unit in metres (None: not declared).
+    ``notes`` are remarks for the user.
+    """
+
+    horizontal: CRS
+    vertical_datum: str | None = None
+    ellipsoidal: bool = False
+    vertical_unit_m: float | None = None
+    vertical_unit: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name with EPSG codes where they are known."""
+        code = self.horizontal.to_epsg()
+        text = self.horizontal.name + (f" (EPSG:{code})" if code else "")
+        if self.vertical_datum:
+            text += f" + {self.vertical_datum}"
+        elif self.ellipsoidal:
+            text += " + ellipsoidal height"
+        return text
+
+    @property
+    def horizontal_unit_m(self) -> float:
+        """Metres per horizontal unit; for degrees those along a meridian."""
+        axis = self.horizontal.axis_info[0]
+        if self.horizontal.is_geographic:
+            return float(np.degrees(axis.unit_conversion_factor)) * DEGREE_M
+        return axis.unit_conversion_factor
+
+    @property
+    def height_unit_m(self) -> float:
+        """Metres per unit of height: declared, else as LAS has it by custom."""
+        if self.vertical_unit_m is not None:
+            return self.vertical_unit_m
+        return 1.0 if self.horizontal.is_geographic else self.horizontal_unit_m
+
+    @property
+    def has_vertical(self) -> bool:
+        """Whether the surface of the heights is declared."""
+        return self.ellipsoidal or self.vertical_datum is not None
+
+
+def _source(crs: CRS) -> CRS:
+    """The system itself where it comes bound to a transformation (TOWGS84, grid files)."""
+    return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+
+
+def interpret(crs: CRS) -> LidarCRS:
+    """Split a system into its horizontal and vertical meaning.
+
+    Raises ValueError for systems that are not geographic or projected (local, geocentric) and for
+    vertical axes that point down.
+    """
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    first = _source(parts[0])
+    if not (first.is_geographic or first.is_projected):
+        raise ValueError(f"'{crs.name}' is a {first.type_name}, neither geographic nor projected")
+    if crs.is_compound:
+        vertical = _source(parts[1])
+        axis = vertical.axis_info[0]
+        if axis.direction.lower() != "up":
+            raise ValueError(f"the heights of '{crs.name}' point {axis.direction}")
+        datum = vertical.datum.name if vertical.datum is not None else vertical.name
+        unnamed = {datum.lower(), vertical.name.lower()} <= _NO_DATUM
+        return LidarCRS(
+            parts[0],
+            vertical_datum=None if unnamed else (vertical.name or datum),
+            vertical_unit_m=axis.unit_conversion_factor,
+            vertical_unit=axis.unit_name,
+        )
+    if len(first.axis_info) == 3:
+        axis = first.axis_info[2]
+        return LidarCRS(
+            crs.to_2d(),
+            ellipsoidal=True,
+            vertical_unit_m=axis.unit_conversion_factor,
+            vertical_unit=axis.unit_name,
+        )
+    return LidarCRS(crs)
+
+
+def parse_crs(text: str) -> LidarCRS:
+    """Read ``lidar_crs``: "2154", "EPSG:2154", "EPSG:2154+5720" or WKT.
+
+    Raises InputError.
+    """
+    text = text.strip()
+    user = f"EPSG:{text}" if re.fullmatch(r"\d+(\+\d+)?", text) else text
+    try:
+        return interpret(CRS.from_user_input(user))
+    except (CRSError, ValueError) as error:
+        raise InputError(
+            f"lidar_crs '{text}' cannot be used: {error}",
+            remedy="give an EPSG code such as EPSG:32650, a compound such as EPSG:2154+5720, "
+            "or WKT of a geographic or projected system",
+        ) from error
+
+
+def _geokeys_tiff(shorts: np.ndarray, doubles: bytes, text: bytes) -> bytes:
+    """A TIFF of one pixel that carries the GeoKeys of a LAS file, for GDAL to interpret."""
+    blobs = {
+        33550: (12, 3, struct.pack("<3d", 1, 1, 0)),
+        33922: (12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),
+        34735: (3, shorts.size, shorts.astype("<u2").tobytes()),
+        34736: (12, len(doubles) // 8, doubles[: len(doubles) // 8 * 8]),
+        34737: (2, len(text), text),
+    }
+    blobs = {tag: blob for tag, blob in blobs.items() if blob[1]}
+    plain = {256: 1, 257: 1, 258: 8, 259: 1, 262: 1, 277: 1, 278: 1, 279: 1}
+    end = 8 + 2 + 12 * (len(plain) + 1 + len(blobs)) + 4
+    entries = [(tag, 4, 1, value) for tag, value in plain.items()] + [(273, 4, 1, end)]
+    data = bytes(8)
+    for tag, (kind, count, blob) in blobs.items():
+        entries.append((tag, kind, count, end + len(data)))
+        data += blob + bytes(8 - len(blob) % 8)
+    directory = b"".join(struct.pack("<HHII", *entry) for entry in sorted(entries))
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
+
+
+def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS | None:
+    """The system of GeoKeys, user-defined projections and vertical keys included.
+
+    GDAL does the reading, but passes over the vertical unit (key 4099) where the vertical system
+    has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
+    key is honoured here.
+    """
+    keys = shorts[4:].reshape(-1, 4)
+    keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
+    keys = keys[np.argsort(keys[:, 0], kind="stable")]
+    shorts = np.concatenate([[1, 1, 0, len(keys)], keys.ravel()])
+    with (
+        rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
+        MemoryFile(_geokeys_tiff(shorts, doubles, text)) as memory,
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")  # "not georeferenced"
+        with memory.open() as tiff:
+            wkt = tiff.crs.to_wkt() if tiff.crs else ""
+    if not wkt:
+        return None
+    meaning = interpret(CRS.from_wkt(wkt))
+    for key, location, _, value in keys.tolist():
+        if key == VERTICAL_UNITS_KEY and location == 0 and value in LINEAR_UNITS:
+            name, metres = LINEAR_UNITS[value]
+            if abs(meaning.height_unit_m - metres) > 1e-9:
+                note = (
+                    f"GeoTIFF key 4099 gives heights in {name}, unlike '{meaning.name}': "
+                    "the key is believed"
+                )
+                meaning = replace(meaning, notes=(note,))
+            meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
+    return meaning
+
+
+def _wkt_text(data: bytes) -> str:
+    return data.split(b"\0")[0].decode("utf-8", errors="replace").strip()
+
+
+def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
+    """What the header of a LAS file says about its coordinates, and why not, if nothing usable.
+
+    WKT and GeoTIFF keys are both read. The one that the global encoding bit points to wins (LAS 1.4
+    R16, table 4), unless only the other one declares a vertical part.
+    """
+    records: dict[int, bytes] = {}
+    for record in [*header.vlrs, *(header.evlrs or [])]:
+        if record.user_id == "LASF_Projection":
+            records.setdefault(record.record_id, record.record_data_bytes())
+    found: list[LidarCRS] = []
+    problems: list[str] = []
+
+    def attempt(what: str, read) -> None:
+        try:
+            meaning = read()
+        except (CRSError, ValueError, rasterio.errors.RasterioError) as error:
+            problems.append(f"its {what} cannot be used ({error})")
+        else:
+            if meaning is not None:
+                found.append(meaning)
+
+    def wkt() -> None:
+        if text := _wkt_text(records.get(2112, b"")):
+            attempt("WKT", lambda: interpret(CRS.from_wkt(text)))
+
+    def geokeys() -> None:
+        data = records.get(34735, b"")
+        if len(data) >= 16:
+            shorts = np.frombuffer(data[: 8 + (len(data) - 8) // 8 * 8], "<u2")
+            shorts = shorts[: 4 + 4 * int(shorts[3])]
+            attempt(
+                "GeoTIFF keys",
+                lambda: _from_geokeys(shorts, records.get(34736, b""), records.get(34737, b"")),
+            )
+
+    order = (wkt, geokeys) if header.global_encoding.wkt else (geokeys, wkt)
+    for read in order:
+        read()
+    if not found:
+        return None, problems
+    return max(found, key=lambda meaning: meaning.has_vertical), problems  # max keeps the first
+
+
+def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
+    """Whether two systems put the same coordinates at the same place (to 1 mm) on their datum.
+
+    Names and codes do not decide that: a WKT without authority is often the same system.
+    """
+    if one.equals(other, ignore_axis_order=True):
+        return True
+    places = []
+    for crs in (one, other):
+        crs = _source(crs)
+        geographic = crs.geodetic_crs
+        if geographic is None:
+            return False
+        lon, lat = pyproj.Transformer.from_crs(crs, geographic, always_xy=True).transform(x, y)
+        places.append((lon, lat, geographic.ellipsoid.semi_major_metre))
+    difference = np.abs(np.subtract(*places))
+    same_datum = np.isfinite(difference).all() and difference[2] < 0.01
+    return bool(same_datum and max(difference[:2]) * DEGREE_M < 1e-3)
+
+
+def resolve(
+    header: laspy.LasHeader, lidar_crs: str | None, file: str | Path
+) -> tuple[LidarCRS, list[str]]:
+    """The system that applies to a file, and remarks for the user.
+
+    Raises InputError if the file declares none and ``lidar_crs`` is empty.
+    """
+    own, problems = header_crs(header)
+    given = parse_crs(lidar_crs) if lidar_crs else None
+    notes: list[str] = []
+    if own is None:
+        if given is None:
+            reason = "; ".join(problems) if problems else "the file declares none"
+            raise InputError(
+                f"no coordinate reference system: {reason}",
+                file=file,
+                remedy="set lidar_crs (EPSG code, compound EPSG code or WKT) for this scene",
+            )
+        notes += [f"lidar_crs is used, since {problem}" for problem in problems]
+        return given, notes
+    notes += own.notes
+    if given is None:
+        return own, notes
+    x, y = header.mins[0], header.mins[1]
+    if not _same_horizontal(own.horizontal, given.horizontal, float(x), float(y)):
+        notes.append(
+            f"the file's own system '{own.name}' is used, not lidar_crs '{given.name}', "
+            "which serves files that declare none"
+        )
+    elif given.has_vertical and not own.has_vertical:
+        unit_m, unit = own.vertical_unit_m, own.vertical_unit
+        own = replace(
+            own,
+            vertical_datum=given.vertical_datum,
+            ellipsoidal=given.ellipsoidal,
+            vertical_unit_m=given.vertical_unit_m if unit_m is None else unit_m,
+            vertical_unit=given.vertical_unit if unit_m is None else unit,
+        )
+        notes.append(f"heights as lidar_crs says ('{own.name}'), the file declares none")
+    elif given.has_vertical and (
+        (own.ellipsoidal, own.vertical_datum) != (given.ellipsoidal, given.vertical_datum)
+    ):
+        notes.append(f"heights as the file declares ('{own.name}'), not as '{given.name}'")
+    return own, notes

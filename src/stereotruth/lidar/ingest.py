@@ -1,0 +1,232 @@
+"""LiDAR files to spatially ordered point stores, and exact box queries on these.
+
+Every point lies on one global lattice: longitude and latitude in steps of 1e-9° (0.1 mm), height in
+steps of 1e-4 m. Sums over lattice integers are exact, so that nothing later depends on the order
+of files or points. Points are stored by square cells of 2**20 steps (0.00105°, 117 m along a
+meridian), cells in row-major order (south to north, west to east), inside a cell in the order of
+the file. The store of a file is the same to the byte whatever the size of the reading chunks.
+
+Layout of a store (Zarr v3, sharded; n points, m cells):
+
+===========================  =============  ==================================================
+``position``                 int32 [3, n]   lon, lat: steps from the cell's south-west corner;
+                                            height: steps above the WGS 84 ellipsoid
+``attributes``               uint8 [3, n]   classification, return_number, number_of_returns
+``cell_row``, ``cell_col``   int32 [m]      lattice latitude, longitude >> 20
+``cell_start``               int64 [m]      first point of the cell
+``cell_min``, ``cell_max``   int32 [m]      lowest and highest height in the cell
+===========================  =============  ==================================================
+
+One array for all that is read together: queries are nearly twice as fast as with one each.
+
+What ingest does to a point costs less than half of decoding it: kernels take the records apart,
+bring them to the lattice and sort them by cell without an intermediate copy of the points.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import laspy
+import numpy as np
+import zarr
+from numba import njit
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..job import progress
+from ..products.grids import building
+from .cell_sort import SCRATCH_POINTS, SortedRuns
+from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
+from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
+from .to_wgs84 import ToWGS84, check_area, to_wgs84
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
+COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
+FARTHEST_M = 2e5  # heights beyond are no heights
+
+
+def _refuse_coarse(header: laspy.LasHeader, transform: ToWGS84, file: Path) -> None:
+    step = float(max(header.scales[:2])) * transform.system.horizontal_unit_m
+    if step > COARSEST_STEP_M:
+        raise InputError(
+            f"coordinates are stored in steps of {max(header.scales[:2]):g}, "
+            f"{step:.4g} m on the ground",
+            file=file,
+            remedy="write the file again with a finer scale (0.01 m, or 1e-7 degree)",
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _round(lon: Floats, lat: Floats, height: Floats, out: Integers, limits: Integers) -> bool:
+    """Fill ``out`` [3, n] with lattice coordinates and widen ``limits`` [2, 3] by them.
+
+    False if there is a point that has no place on Earth; then ``out`` is not whole.
+    """
+    for k, (values, steps, farthest) in enumerate(
+        ((lon, PER_DEG, np.inf), (lat, PER_DEG, np.inf), (height, PER_M, FARTHEST_M))
+    ):
+        good = True
+        low, high = limits[0, k], limits[1, k]
+        for i in range(values.size):
+            good &= abs(values[i]) < farthest
+            q = np.int64(np.rint(values[i] * steps))
+            low, high = min(low, q), max(high, q)
+            out[k, i] = q
+        if not good:
+            return False
+        limits[0, k], limits[1, k] = low, high
+    return True
+
+
+def _to_lattice(transform: ToWGS84, xyz: Floats, limits: Integers, file: Path) -> NDArray[np.int64]:
+    """Lattice longitude, latitude, height (int64[3, n]) of file coordinates; widens ``limits``."""
+    try:
+        lon, lat, height = transform(*xyz)
+    except InputError as error:  # of the geoid grid, which does not know the file
+        raise InputError(error.problem, file=file, remedy=error.remedy) from error
+    out = np.empty(xyz.shape, np.int64)
+    if not _round(lon, lat, height, out, limits):
+        good = np.isfinite(lon) & np.isfinite(lat) & (np.abs(height) < FARTHEST_M)
+        bad = np.flatnonzero(~good)
+        raise InputError(
+            f"{bad.size} points have no place on Earth in '{transform.system.name}', the first at "
+            "({:.3f}, {:.3f}, {:.3f})".format(*xyz[:, bad[0]]),
+            file=file,
+            remedy="correct lidar_crs or the file's coordinate system, or remove these points",
+        )
+    return out
+
+
+def _bounds(low: np.ndarray, high: np.ndarray) -> list[float]:
+    return [
+        *(float(value) / PER_DEG for value in (low[0], low[1], high[0], high[1])),
+        float(low[2]) / PER_M,
+        float(high[2]) / PER_M,
+    ]
+
+
+def ingest(
+    lidar_file: str | Path,
+    store: str | Path,
+    *,
+    lidar_crs: str | None = None,
+    geoid: str | Path | None = None,
+    drop_classes: Sequence[int] = (7, 18),
+    scene: str = "",
+    provenance: Mapping[str, Any] | None = None,
+    chunk_points: int = 100_000,
+    workers: int = 1,
+) -> dict[str, Any]:
+    """Bring one LAS, LAZ or COPC file (1.0 to 1.4, any point format) into a point store.
+
+    Memory is that of one reading chunk, one shard and :data:`SCRATCH_POINTS`, whatever the size of
+    the file; where it has more points, they pass through a scratch file without a name, 16 bytes
+    each, on the disk of the store.
+
+    Withheld points are dropped, and those of ``drop_classes``: by default noise, 7 (low) and 18
+    (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
+    IGN's files) are kept unless listed. Coordinates: see :mod:`stereotruth.lidar.to_wgs84`.
+    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where not needed.
+    With ``workers`` > 1 a thread decodes ahead (the result is the same).
+
+    Returns what is also in the store's attributes: ``points`` (header, read, kept, dropped by
+    reason), ``classes`` (kept points by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
+    degrees, h_min, h_max in m), ``crs`` and ``notes`` (remarks for the user, which are logged too).
+
+    Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
+    orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
+    area of the coordinate system; coordinates quantised too coarsely; no point left.
+    """
+    file = Path(lidar_file)
+    header = read_header(file)
+    transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
+    _refuse_coarse(header, transform, file)
+    notes = list(transform.notes)
+    if remark := surplus_of(header, file):
+        notes.append(remark)
+    tally = PointTally()
+    with (
+        building(store) as unfinished,
+        TemporaryFile(dir=unfinished.parent) as disk,
+    ):
+        group = zarr.open_group(unfinished, mode="w", zarr_format=3)
+        room = max(min(SCRATCH_POINTS, header.point_count), chunk_points)
+        runs = SortedRuns(np.empty((room, 4), np.int32), disk)
+        chunks = read_chunks(file, header, chunk_points)
+        if workers > 1:
+            chunks = read_ahead(chunks)
+        total = -(-header.point_count // chunk_points)
+        for points in progress(chunks, total, f"{file.name}: chunks of points read"):
+            xyz, attributes = tally.take(points, header, drop_classes)
+            tally.compare_bounds(header, file)
+            lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
+            tally.look(lattice)
+            runs.add(lattice, attributes)
+        if remark := tally.compare_bounds(header, file):
+            notes.append(remark)
+        if runs.written == 0:
+            raise InputError(
+                f"no point is left of {tally.read}: {_listed(tally.dropped(drop_classes))}",
+                file=file,
+                remedy="remove the file, or drop fewer classes",
+            )
+        tally.refuse_quantised(file)
+        bounds = _bounds(*tally.lattice_limits)
+        lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
+        if remark := check_area(transform.system, lon, lat, file):
+            notes.append(remark)
+        if bounds[4] < -600 or bounds[5] > 9500:
+            notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
+        runs.write(group)
+        summary = {
+            "points": {
+                "header": header.point_count,
+                "read": tally.read,
+                "kept": runs.written,
+                "dropped": tally.dropped(drop_classes),
+            },
+            "classes": {str(c): int(n) for c, n in enumerate(tally.counts[0]) if n},
+            "bounds": bounds,
+            "crs": transform.describe(),
+            "notes": notes,
+        }
+        group.attrs.update(
+            {
+                "kind": "points",
+                "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
+                f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
+                "row-major; the order of the file inside a cell",
+                "scene": scene,
+                "source": file.name,
+                "cell_bits": CELL_BITS,
+                **summary,
+                "provenance": dict(provenance or {}),
+            }
+        )
+    for note in notes:
+        log.warning("%s: %s", file.name, note)
+    log.info(
+        "%s: %d of %d points kept (%s); heights %.2f to %.2f m",
+        file.name,
+        runs.written,
+        tally.read,
+        _listed(tally.dropped(drop_classes)),
+        *bounds[4:],
+    )
+    return summary
+
+
+def _listed(dropped: Mapping[str, int]) -> str:
+    return "dropped: " + (
+        ", ".join(f"{n} {reason}" for reason, n in dropped.items() if n) or "none"
+    )

@@ -1,0 +1,247 @@
+"""From the coordinates of a LiDAR file to WGS 84 longitude, latitude and ellipsoidal height.
+
+Three things decide what a LAS coordinate means, and each is settled here or refused by name:
+the horizontal system with its unit, the unit of the heights, and the surface that the heights
+count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1;
+PROJ's promotion of 2-D systems to 3-D.
+
+Rules
+- The file's own declaration wins over ``lidar_crs``, which serves files that declare none, or
+  supplies the vertical part where a file declares the same horizontal system only.
+- Heights without a unit of their own are in the unit of a projected horizontal system (the custom
+  of LAS), in metres in a geographic one.
+- Orthometric heights H need a geoid grid: h = H + N. Grids give N above the GRS 80 or WGS 84
+  ellipsoid. Nothing is ever downloaded.
+- Map projections are undone by polynomials that are checked against PROJ at run time, see
+  :mod:`stereotruth.lidar.projection_polynomials`; a coordinate may come out one step of 1e-9
+  degree beside PROJ's.
+- Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
+  but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+from pyproj import CRS
+from pyproj.aoi import AreaOfInterest
+from pyproj.exceptions import ProjError
+from pyproj.transformer import TransformerGroup
+
+from ..errors import InputError
+from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
+from .geoid import GeoidGrid
+from .projection_polynomials import PatchedTransform
+
+WGS84_3D = "EPSG:4979"
+
+
+@dataclass(frozen=True)
+class ToWGS84:
+    """Maps coordinates of one LiDAR file to WGS 84; made by :func:`to_wgs84`.
+
+    ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
+    ``heights`` what was done with the heights, ``notes`` are remarks for the user.
+    """
+
+    system: LidarCRS
+    operation: str
+    accuracy_m: float | None
+    heights: str
+    notes: tuple[str, ...]
+    _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
+    _geoid: GeoidGrid | None = field(repr=False)
+    _heights_follow_datum: bool = field(repr=False)
+
+    def __call__(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lon, lat (degrees) and ellipsoidal height (m) of file coordinates, each float64[n].
+
+        Coordinates that PROJ cannot transform come out as inf. Raises InputError if the geoid grid
+        does not cover them.
+        """
+        metres = np.asarray(z, np.float64) * self.system.height_unit_m
+        lon, lat, height = self._transform(x, y, metres)
+        if self._geoid is not None:
+            good = np.isfinite(lon) & np.isfinite(lat)
+            base = height if self._heights_follow_datum else metres
+            height = np.full(metres.shape, np.inf)
+            height[good] = base[good] + self._geoid(lon[good], lat[good])
+        return lon, lat, height
+
+    def describe(self) -> dict[str, object]:
+        """Record for the attributes of a product."""
+        horizontal = self.system.horizontal
+        return {
+            "name": self.system.name,
+            "wkt": horizontal.to_wkt("WKT2_2019"),
+            "height_unit_m": self.system.height_unit_m,
+            "heights": self.heights,
+            "operation": self.operation,
+            "accuracy_m": self.accuracy_m,
+            "geoid": None if self._geoid is None else self._geoid.path.name,
+        }
+
+
+def _best_operation(
+    source: CRS, area: Sequence[float] | None
+) -> tuple[pyproj.Transformer, list[str]]:
+    """One fixed operation for a whole file (PROJ would choose anew for each point), and remarks."""
+    pyproj.network.set_network_enabled(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is missing is said below, by name
+        group = TransformerGroup(
+            source.to_3d(),
+            WGS84_3D,
+            always_xy=True,
+            area_of_interest=None if area is None else AreaOfInterest(*area),
+        )
+    if not group.transformers:
+        raise ProjError("PROJ knows no transformation to WGS 84 that needs no grid")
+    best = group.transformers[0]
+    notes = []
+    accuracy = f"{best.accuracy:g} m" if best.accuracy >= 0 else "unknown"
+    if not group.best_available and group.unavailable_operations:
+        grids = sorted(
+            {g.short_name for o in group.unavailable_operations for g in o.grids if g.short_name}
+        )
+        notes.append(
+            f"better datum transformations need grids that are not installed ({', '.join(grids)}); "
+            f"used: {best.description} (accuracy {accuracy})"
+        )
+    if "ballpark" in best.description.lower():
+        notes.append(
+            f"no datum transformation to WGS 84 is known for '{source.name}': "
+            "its geodetic coordinates are taken as WGS 84 (accuracy unknown)"
+        )
+    return best, notes
+
+
+def _area(horizontal: CRS, header: laspy.LasHeader) -> tuple[float, float, float, float] | None:
+    """Longitude and latitude box of the header's bounds, padded; None where it makes no sense."""
+    geographic = _source(horizontal).geodetic_crs
+    if geographic is None:
+        return None
+    x = np.array([header.mins[0], header.maxs[0]])[[0, 0, 1, 1]]
+    y = np.array([header.mins[1], header.maxs[1]])[[0, 1, 0, 1]]
+    degrees = pyproj.Transformer.from_crs(_source(horizontal), geographic.to_2d(), always_xy=True)
+    lon, lat = degrees.transform(x, y)
+    box = (lon.min() - 0.01, lat.min() - 0.01, lon.max() + 0.01, lat.max() + 0.01)
+    sensible = np.isfinite(box).all() and np.abs(lon).max() < 179.9 and np.abs(lat).max() < 89.9
+    return tuple(map(float, box)) if sensible else None
+
+
+def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: str | Path) -> None:
+    corners = np.abs([header.mins[:2], header.maxs[:2]]).max(axis=0)
+    if system.horizontal.is_projected and corners[0] <= 360 and corners[1] <= 90:
+        raise InputError(
+            f"coordinates up to ({corners[0]:g}, {corners[1]:g}) are no coordinates of "
+            f"'{system.name}'; they look like degrees",
+            file=file,
+            remedy="correct lidar_crs or the file's header (longitude/latitude is EPSG:4979)",
+        )
+
+
+def to_wgs84(
+    header: laspy.LasHeader,
+    file: str | Path,
+    *,
+    lidar_crs: str | None = None,
+    geoid: str | Path | None = None,
+) -> ToWGS84:
+    """The transformation that a LiDAR file needs.
+
+    ``lidar_crs``: see :func:`parse_crs`; ``geoid``: path of a grid for orthometric heights.
+    Raises InputError: no or unusable coordinate system, orthometric heights without a geoid.
+    """
+    system, notes = resolve(header, lidar_crs or None, file)
+    _refuse_degrees_as_metres(system, header, file)
+    hint = DATUM_IN_NAME.search(Path(file).stem)
+    remedy = "set geoid to a grid (GTX or GeoTIFF) of that datum for this scene"
+    if system.vertical_datum and not geoid:
+        raise InputError(
+            f"heights are orthometric ('{system.vertical_datum}'), not ellipsoidal",
+            file=file,
+            remedy=remedy,
+        )
+    if not system.has_vertical and hint and not geoid:
+        raise InputError(
+            f"declares no vertical datum, but its name says orthometric heights ({hint[1]})",
+            file=file,
+            remedy=f"{remedy}, or name the file otherwise if its heights are ellipsoidal",
+        )
+    if system.ellipsoidal and geoid:
+        notes.append("the file declares ellipsoidal heights: the geoid is not applied to it")
+        geoid = None
+    unit = system.vertical_unit or (
+        "metre" if system.horizontal.is_geographic else system.horizontal.axis_info[0].unit_name
+    )
+    if not system.has_vertical:
+        taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
+        notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
+    try:
+        transformer, remarks = _best_operation(system.horizontal, _area(system.horizontal, header))
+    except ProjError as error:
+        raise InputError(
+            f"'{system.name}' cannot be transformed to WGS 84: {error}",
+            file=file,
+            remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
+        ) from error
+    transform = transformer.transform
+    if system.horizontal.is_projected:
+        transform = PatchedTransform(transform, system.horizontal_unit_m)
+    grid = GeoidGrid(Path(geoid)) if geoid else None
+    ellipsoid = system.horizontal.ellipsoid
+    modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
+    if geoid:
+        heights = f"orthometric ({system.vertical_datum or 'datum not declared'}), in {unit}"
+    else:
+        heights = f"ellipsoidal ({'declared' if system.ellipsoidal else 'assumed'}), in {unit}"
+    return ToWGS84(
+        system=system,
+        operation=transformer.description,
+        accuracy_m=float(transformer.accuracy) if transformer.accuracy >= 0 else None,
+        heights=heights,
+        notes=tuple(notes + remarks),
+        _transform=transform,
+        _geoid=grid,
+        # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
+        # and goes through the datum transformation; above WGS 84 it is final.
+        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
+    )
+
+
+def check_area(
+    system: LidarCRS, lon: tuple[float, float], lat: tuple[float, float], file: str | Path
+) -> str | None:
+    """Compare where the points of a file have landed with where its system is used.
+
+    Returns a remark if they lie more than 0.5° outside of that area. Raises InputError if they lie
+    more than 8° outside: neighbouring UTM zones (6°) are still in use, another system is not.
+    """
+    area = system.horizontal.area_of_use
+    if area is None and (code := system.horizontal.to_epsg()):
+        area = CRS.from_epsg(code).area_of_use
+    if area is None:
+        return None
+    beyond = max(area.south - lat[0], lat[1] - area.north)
+    if area.west <= area.east:
+        beyond = max(beyond, area.west - lon[0], lon[1] - area.east)
+    if beyond <= 0.5:
+        return None
+    where = (
+        f"points lie at longitude {lon[0]:.4f} to {lon[1]:.4f}, latitude {lat[0]:.4f} to "
+        f"{lat[1]:.4f}, outside of the area of '{system.name}' ({area.name})"
+    )
+    if beyond > 8:
+        raise InputError(
+            where, file=file, remedy="correct lidar_crs or the file's coordinate system"
+        )
+    return where

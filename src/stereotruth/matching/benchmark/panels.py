@@ -1,0 +1,148 @@
+"""Pictures of disparity maps beside each other, after figure 10 of the paper.
+
+All disparities of a figure have one colour scale, all errors another. What has no value is dark
+grey; in maps of errors, a labelled pixel without a disparity has a colour of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from ...products.pictures import NO_VALUE, colours, save_figure, shrink, stretch
+
+Disparity = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+
+
+SIDE_PX = 400  # of a picture
+INCHES, DPI = 3.2, 120
+ERROR_PX = 6.0  # end of the scale of errors: twice the threshold of D1
+INVALID = (60, 190, 255)
+ERRORS = "inferno"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A pair with its truth (NaN: none) and the disparities of methods by their labels."""
+
+    title: str
+    left: NDArray[Any]
+    right: NDArray[Any]
+    truth: Disparity | None
+    found: Mapping[str, Disparity]
+
+
+def grey(image: NDArray[Any]) -> Picture:
+    """An image to look at: stretched to 8 bits, colour as it is."""
+    return image if image.ndim == 3 else stretch(image)
+
+
+def error_picture(found: Disparity, truth: Disparity) -> Picture:
+    """Absolute errors in colour; unlabelled and invalid pixels in theirs."""
+    picture = colours(np.abs(found - truth), (0.0, ERROR_PX), ERRORS)
+    picture[np.isfinite(truth) & ~np.isfinite(found)] = INVALID
+    return picture
+
+
+def disparity_limits(columns: Sequence[Column]) -> tuple[float, float]:
+    """A colour scale for the disparities of a figure: all but half a percent at either end."""
+    values = []
+    for column in columns:
+        maps = list(column.found.values()) if column.truth is None else [column.truth]
+        values += [of[np.isfinite(of)] for of in maps]
+    pooled = np.concatenate(values) if values else np.zeros(0)
+    if not pooled.size:
+        return 0.0, 1.0
+    low, high = np.percentile(pooled, (0.5, 99.5))
+    return float(low), float(max(high, low + 1.0))
+
+
+def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = False) -> None:
+    """PNG of pairs side by side: left, right, truth, every method, and the errors of every method.
+
+    ``across``: pairs one below the other, and what belongs to a pair side by side.
+    """
+    limits = disparity_limits(columns)
+    cells = [_cells(column, limits) for column in columns]
+    names = sorted({name for of in cells for name in of}, key=_order(columns).index)
+    grid = (len(columns), len(names)) if across else (len(names), len(columns))
+    aspect = columns[0].left.shape[0] / columns[0].left.shape[1]
+    size = INCHES if across else INCHES * 0.8
+    figure = Figure(
+        figsize=(size * grid[1] + 0.9, size * aspect * grid[0] + 1.2), layout="constrained"
+    )
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
+    axes = figure.subplots(*grid, squeeze=False)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
+    by_name = axes.T if across else axes
+    for c, (column, of) in enumerate(zip(columns, cells)):
+        for n, name in enumerate(names):
+            axis = by_name[n, c]
+            if name in of:
+                axis.imshow(shrink(of[name], SIDE_PX), cmap="gray", vmin=0, vmax=255)
+            if c == 0:
+                (axis.set_title if across else axis.set_ylabel)(name, fontsize=9)
+            if n == 0:
+                (axis.set_ylabel if across else axis.set_title)(column.title, fontsize=9)
+    _legend(figure, dict(zip(names, by_name)), limits, "bottom" if across else "right")
+    save_figure(path, figure, dpi=DPI)
+
+
+def _cells(column: Column, limits: tuple[float, float]) -> dict[str, Picture]:
+    """Pictures of a pair by name, in the order of figure 10."""
+    found = {"left": grey(column.left), "right": grey(column.right)}
+    if column.truth is not None:
+        found["truth"] = colours(column.truth, limits)
+    found |= {name: colours(of, limits) for name, of in column.found.items()}
+    if column.truth is not None:
+        for name, of in column.found.items():
+            found[f"error of {name}"] = error_picture(of, column.truth)
+    return found
+
+
+def _order(columns: Sequence[Column]) -> list[str]:
+    """Names of the pictures of all pairs, in the order of figure 10."""
+    methods = list(dict.fromkeys(name for column in columns for name in column.found))
+    return ["left", "right", "truth", *methods, *(f"error of {name}" for name in methods)]
+
+
+def _legend(
+    figure: Figure, axes: Mapping[str, Any], limits: tuple[float, float], where: str
+) -> None:
+    """Both scales, each beside its pictures, and what the other colours mean."""
+    errors = [of for name, of in axes.items() if name.startswith("error of ")]
+    shown = [of for name, of in axes.items() if name not in ("left", "right")]
+    shown = shown[: len(shown) - len(errors)]
+    patches = [Patch(color=np.array(NO_VALUE) / 255, label="no value")]
+    if errors:
+        patches.append(Patch(color=np.array(INVALID) / 255, label="labelled, without disparity"))
+    for cmap, ends, label, of in (
+        ("turbo", limits, "disparity, px", shown),
+        (ERRORS, (0.0, ERROR_PX), "absolute error, px", errors),
+    ):
+        if of:
+            mappable = ScalarMappable(cmap=cmap)
+            mappable.set_clim(*ends)
+            extend = "max" if cmap == ERRORS else "both"
+            figure.colorbar(
+                mappable,
+                ax=list(np.concatenate(of)),
+                location=where,
+                label=label,
+                extend=extend,
+                fraction=0.06,
+                aspect=30,
+                pad=0.02,
+            )
+    figure.legend(handles=patches, loc="outside lower left", ncols=2, frameon=False, fontsize=8)

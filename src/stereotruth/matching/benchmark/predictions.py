@@ -1,0 +1,238 @@
+"""A method over the pairs of a dataset: a folder of disparity maps, with the time of each.
+
+``<pair>.tiff`` is float32, NaN where the method gives no disparity. ``predictions.json`` says how
+they were made, the seconds of each pair (the first pair that a process works on is matched twice,
+and only the second time counts), and the memory of the process at its peak.
+
+Pairs stay in a work folder (hard links) with a record of what they were made of, images and
+method, so that a later call carries on where one was killed, and takes over what it would make the
+same: labels may change without any pair being matched again.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...dataset.stereo_dataset import Pair, StereoDataset
+from ...errors import InputError
+from ...job import progress
+from ...products.files import link
+from ...products.finished_pieces import Ledger
+from ...products.provenance import digest, file_sha256
+from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
+from ..kinds import FOLDER
+from ..methods import Matcher, make_method
+
+RECORD = "predictions.json"
+SUFFIXES = (".tif", ".tiff", ".npy", ".pfm")  # of a folder of results
+MB = 1 << 20
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One pair: seconds it took (None if it was not run here), peak memory of the process in MB."""
+
+    seconds: float | None
+    memory_mb: float | None
+
+
+def predict(
+    dataset: StereoDataset,
+    split: str | None,
+    name: str,
+    settings: Mapping[str, Any],
+    out: str | Path,
+    *,
+    work: str | Path,
+    files: Sequence[str | Path] = (),
+    workers: int = 1,
+    code: str = "",
+) -> dict[str, Any]:
+    """Match the pairs of a split (None: all), or take a folder's results; returns the record.
+
+    ``settings``: the method's entry of the configuration; ``files``: what else the method is made
+    of (weights, the user's code). ``work``: where finished pairs stay.
+
+    Raises InputError if a pair, the method or one of its results cannot be used.
+    """
+    pairs = dataset.pairs(split)
+    out, work = Path(out), Path(work)
+    made_of = {
+        "method": dict(settings),
+        "files": [file_sha256(file) for file in files if Path(file).is_file()],
+        "range": list(dataset.disparity_range),
+        "code": code,
+    }
+    if settings["kind"] == FOLDER:
+        made_of["nodata"] = dataset.nodata
+        maker: _Results | _Runs = _Results(name, Path(settings["folder"]), dataset.nodata)
+    else:
+        maker = _Runs(name, settings, dataset.disparity_range, workers)
+    ledger = Ledger(work / "done")
+    found = {}
+    for pair in progress(pairs, len(pairs), f"{name}: pairs matched"):
+        file = work / f"{pair.name}.tiff"
+        key = digest(made_of | {"images": maker.sources(pair)})
+        piece = ledger.find(pair.name, key, {"disparity": file})
+        if piece is None:
+            disparity, made = maker(pair)
+            _check(disparity, pair, name)
+            write_disparity(file, disparity)
+            piece = ledger.put(pair.name, key, {"disparity": file}, vars(made))
+        found[pair.name] = Prediction(**piece.result)
+    record = {
+        "dataset": dataset.name,
+        "split": split,
+        "method": name,
+        "settings": dict(settings),
+        "disparity_range": list(dataset.disparity_range),
+        "device": maker.device,
+        "threads": workers,
+        **_summary(found),
+        "pairs": {pair: vars(of) for pair, of in found.items()},
+    }
+    scratch = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(scratch, ignore_errors=True)
+    for pair in pairs:
+        link(work / f"{pair.name}.tiff", scratch / f"{pair.name}.tiff")
+    (scratch / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    shutil.rmtree(out, ignore_errors=True)
+    scratch.rename(out)
+    ledger.keep_only(set(found))
+    for file in work.glob("*.tiff"):
+        if file.stem not in found:
+            file.unlink()
+    return record
+
+
+def read_record(folder: str | Path) -> dict[str, Any]:
+    """The record of a folder of predictions. Raises InputError if there is none."""
+    file = Path(folder) / RECORD
+    if not file.is_file():
+        raise InputError("no predictions", file=file, remedy="run rule match")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def read_prediction(folder: str | Path, pair: Pair) -> NDArray[np.float32]:
+    """A pair's prediction, float32[h, w] px, NaN where there is none."""
+    return read_disparity(Path(folder) / f"{pair.name}.tiff", np.nan)
+
+
+class _Runs:
+    """Makes the disparity of pairs by a method; the method is made when the first is asked for."""
+
+    def __init__(
+        self, name: str, settings: Mapping[str, Any], range_px: tuple[int, int], workers: int
+    ) -> None:
+        self._range = range_px
+        self._matcher: Matcher = make_method(name, settings, workers)
+        self._warm = False
+        self.device = str(getattr(self._matcher, "device", f"CPU, {platform.machine()}"))
+
+    def sources(self, pair: Pair) -> list[str]:
+        """Checksums of what the disparity of a pair follows from."""
+        return [file_sha256(pair.left), file_sha256(pair.right)]
+
+    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
+        """Disparity of a pair, and what it took."""
+        left, right = read_image(pair.left), read_image(pair.right)
+        if left.shape != right.shape or left.dtype != right.dtype:
+            raise InputError(
+                f"left image is {left.shape} {left.dtype}, right one {right.shape} {right.dtype}",
+                file=pair.right,
+                remedy="give images of one size and type",
+            )
+        for _ in range(1 if self._warm else 2):
+            start = time.perf_counter()
+            disparity = self._matcher(left, right, self._range)
+            seconds = time.perf_counter() - start
+        self._warm = True
+        return disparity, Prediction(round(seconds, 6), round(peak_memory_mb(), 1))
+
+
+class _Results:
+    """Takes the disparity of pairs from a folder."""
+
+    device = ""
+
+    def __init__(self, name: str, folder: Path, nodata: float) -> None:
+        self._name, self._folder, self._nodata = name, folder, nodata
+        if not folder.is_dir():
+            raise InputError(
+                f"method {name!r}: no such folder", file=folder, remedy="name a folder of results"
+            )
+
+    def _file(self, pair: Pair) -> Path:
+        candidates = (self._folder / f"{pair.name}{end}" for end in SUFFIXES)
+        file = next(filter(Path.is_file, candidates), None)
+        if file is None:
+            raise InputError(
+                f"method {self._name!r}: no result for pair {pair.name} ({' or '.join(SUFFIXES)})",
+                file=self._folder,
+                remedy=f"put {pair.name}.tif there",
+            )
+        return file
+
+    def sources(self, pair: Pair) -> list[str]:
+        """Checksum of the result of a pair."""
+        return [file_sha256(self._file(pair))]
+
+    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
+        """Disparity of a pair."""
+        file = self._file(pair)
+        if file.suffix in (".tif", ".tiff"):
+            return read_disparity(file, self._nodata), Prediction(None, None)
+        values = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), -1)
+        if values is None:
+            raise InputError("no image that can be read", file=file, remedy="write it anew")
+        values = values.astype(np.float32)
+        values[~np.isfinite(values) | (values == np.float32(self._nodata))] = np.nan
+        return values, Prediction(None, None)
+
+
+def _check(disparity: NDArray[np.float32], pair: Pair, name: str) -> None:
+    shape = image_shape(pair.left)
+    if disparity.shape != shape:
+        raise InputError(
+            f"method {name!r}: disparity of pair {pair.name} is {disparity.shape}, "
+            f"its image {shape}",
+            file=pair.left,
+            remedy="give the disparity of each pixel of the left image",
+        )
+
+
+def _summary(found: Mapping[str, Prediction]) -> dict[str, float | None]:
+    """Median time of a pair, largest memory."""
+    seconds = [of.seconds for of in found.values() if of.seconds is not None]
+    memory = [of.memory_mb for of in found.values() if of.memory_mb is not None]
+    return {
+        "median_seconds": round(median(seconds), 6) if seconds else None,
+        "peak_memory_mb": max(memory, default=None),
+    }
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process ever held, in MB (2^20 bytes).
+
+    Linux's ``ru_maxrss`` begins with that of the process that started this one, ``VmHWM`` does not.
+    """
+    status = Path("/proc/self/status")
+    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+) kB", status.read_text())):
+        return int(found[1]) / 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MB

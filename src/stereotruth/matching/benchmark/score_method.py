@@ -1,0 +1,180 @@
+"""A method's predictions of a dataset against its labels: a folder of scores and pictures.
+
+scores.csv   a row per tile
+cities.csv   a row per city, and one of all, with 95 % confidence intervals
+strata.csv   a row per stratum (see :mod:`strata`), with confidence intervals
+scores.json  all of it but the tiles, with settings, time and memory
+panels/      pictures of tiles: left, right, truth, disparity, error
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...dataset.stereo_dataset import Pair, StereoDataset
+from ...job import progress
+from ...products.rasters import read_image
+from .panels import Column, draw_columns
+from .predictions import read_prediction, read_record
+from .scores import ALL, Collector, Scorer, Scores
+from .strata import Products, exact_truth, label_strata
+
+log = logging.getLogger("stereotruth")
+Rows = list[dict[str, Any]]
+
+
+def score(
+    dataset: StereoDataset,
+    split: str | None,
+    label: str,
+    predictions: str | Path,
+    out: str | Path,
+    *,
+    thresholds_px: Sequence[float],
+    bootstrap: int,
+    seed: int,
+    panels: int,
+    fine_tuned_of: str | None = None,
+    products: Products | None = None,
+) -> dict[str, Any]:
+    """Score the predictions of rule match; returns what scores.json holds.
+
+    ``label``: how the method is called in pictures and tables; ``fine_tuned_of``: the method whose
+    training it carried on; ``panels``: most tiles that are drawn; ``products``: where the strata of
+    the workflow's own dataset come from.
+
+    Raises InputError if there are no labelled pairs, or files are missing.
+    """
+    pairs = dataset.pairs(split, labelled=True)
+    out, products = Path(out), products or Products()
+    record = read_record(predictions)
+    scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
+    collector = Collector(thresholds_px)
+    scratch = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(scratch, ignore_errors=True)
+    drawn = {pair.name for pair in choose(pairs, panels)}
+    for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
+        found, truth = read_prediction(predictions, pair), dataset.labels(pair)
+        sums = scorer.sums(found, truth, label_strata(pair, truth, products))
+        for stratum, exact in exact_truth(pair, products).items():
+            sums[stratum] = scorer.sums(found, exact)[ALL]
+        collector.add(pair.name, pair.city, sums)
+        if pair.name in drawn:
+            shown = np.where(scorer.counted(truth), truth, np.float32(np.nan))
+            column = Column(
+                pair.name, read_image(pair.left), read_image(pair.right), shown, {label: found}
+            )
+            draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
+    scores = collector.scores()
+    sampling = {"times": bootstrap, "seed": seed}
+    cities = [
+        _row(scores, {"city": city}, sampling, scores.in_city(city)) for city in _cities(scores)
+    ]
+    total = _row(scores, {"city": ALL}, sampling)
+    strata = [
+        _row(scores, {"stratum": name}, sampling, stratum=name)
+        for name in scores.strata
+        if scores.row(stratum=name)["labelled"]
+    ]
+    summary = {
+        "label": label,
+        "fine_tuned_of": fine_tuned_of,
+        **{key: record[key] for key in record if key != "pairs"},
+        "tiles": len(pairs),
+        "thresholds_px": list(scores.thresholds_px),
+        "bootstrap": bootstrap,
+        "all": total,
+        "cities": cities,
+        "strata": strata,
+    }
+    tiles = [
+        {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
+        for n, pair in enumerate(pairs)
+    ]
+    scratch.mkdir(exist_ok=True, parents=True)
+    _write(scratch / "scores.csv", tiles)
+    _write(scratch / "cities.csv", [*cities, total])
+    _write(scratch / "strata.csv", strata)
+    (scratch / "scores.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    shutil.rmtree(out, ignore_errors=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scratch.rename(out)
+    log.info("%s: %s", label, describe(summary))
+    return summary
+
+
+def describe(summary: Mapping[str, Any]) -> str:
+    """The scores of a method in one line."""
+    total, limit = summary["all"], summary["thresholds_px"][0]
+    d1 = f"d1_{limit:g}_px_share"
+    if not total["labelled"]:
+        return "no label in the disparity range"
+    if not total["valid_share"]:
+        return "no valid disparity"
+    text = f"EPE {total['epe_px']:.3f} px, D1 ({limit:g} px) {100 * total[d1]:.2f} %"
+    if total["valid_share"] < 1:
+        text += (
+            f" of the {100 * total['valid_share']:.1f} % of pixels that are valid; holes filled: "
+            f"EPE {total['filled_epe_px']:.3f} px, D1 {100 * total[f'filled_{d1}']:.2f} %"
+        )
+    return f"{text}; {summary['tiles']} pairs"
+
+
+def choose(pairs: Sequence[Pair], most: int) -> list[Pair]:
+    """At most so many of the pairs, of as many cities as possible, evenly chosen in each."""
+    by_city: dict[str, list[Pair]] = {}
+    for pair in pairs:
+        by_city.setdefault(pair.city, []).append(pair)
+    count = dict.fromkeys(by_city, 0)
+    for _ in range(min(most, len(pairs))):
+        city = min((c for c in by_city if count[c] < len(by_city[c])), key=count.__getitem__)
+        count[city] += 1
+    chosen = []
+    for city, of in by_city.items():
+        index = np.linspace(0, len(of) - 1, count[city] + 2)[1:-1] if count[city] < len(of) else ()
+        chosen += [of[round(k)] for k in index] if len(index) else (of if count[city] else [])
+    return chosen
+
+
+def _cities(scores: Scores) -> list[str]:
+    return list(dict.fromkeys(sorted(scores.cities)))
+
+
+def _only(count: int, index: int) -> np.ndarray:
+    return np.arange(count) == index
+
+
+def _row(
+    scores: Scores,
+    name: Mapping[str, str],
+    sampling: Mapping[str, int],
+    where: Any = None,
+    stratum: str = ALL,
+) -> dict[str, Any]:
+    """Figures and intervals (``…_low``, ``…_high``) of the chosen tiles."""
+    figures = scores.row(where, stratum)
+    row: dict[str, Any] = {
+        **name,
+        "tiles": int(len(scores.tiles) if where is None else where.sum()),
+    }
+    intervals = scores.intervals(**sampling, where=where, stratum=stratum)
+    for key, value in figures.items():
+        row[key] = value
+        if key in intervals:
+            row[f"{key}_low"], row[f"{key}_high"] = intervals[key] or (None, None)
+    return row
+
+
+def _write(path: Path, rows: Rows) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]) if rows else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,123 @@
+"""Where methods differ: the labelled pixels of a tile, divided by what they show.
+
+==================  ================================================================================
+near_step           labels within ``NEAR_PX`` differ by more than ``STEP_PX`` (any dataset)
+match_inside,       whether the right tile holds the pixel's match, by its label; where it does not,
+match_outside       a method can but guess (any dataset)
+near_occlusion      a pixel that only one view sees lies within ``NEAR_PX`` (by the tile's status)
+ground, vegetation,
+building, other     by the class of the LiDAR point that gave the label
+exact_visible       against a synthetic city's exact truth: all pixels that both views see and that
+                    are unchanged and no water, labelled or not
+exact_hidden        likewise, pixels behind something in the right view
+==================  ================================================================================
+
+All but the first three come from products of the workflow, of which the dataset's manifest names
+the tile, scene and window; what is missing is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from ...dataset.stereo_dataset import Pair, match_inside
+from ...disparity.status import Status
+from ...products.grids import require_complete
+from ...products.rasters import read_image
+
+Bools = NDArray[np.bool_]
+
+
+NEAR_PX = 5
+STEP_PX = 3.0
+FAR_PX = np.float32(1e6)  # beyond any disparity
+WATER = 5  # of the layer surface of the exact truth
+CLASSES = {"ground": (2,), "vegetation": (3, 4, 5), "building": (6,)}  # ASPRS
+
+
+@dataclass(frozen=True)
+class Products:
+    """Folders of the workflow that a dataset was made of: tiles, results/project, results/truth."""
+
+    tiles: Path | None = None
+    project: Path | None = None
+    truth: Path | None = None
+
+    def status(self, pair: Pair) -> NDArray[np.uint8] | None:
+        """Why pixels of a tile have no label."""
+        if self.tiles is None or not pair.row:
+            return None
+        prefix, _, number = pair.row["tile"].rpartition("_")
+        file = self.tiles / pair.city / "status" / f"{prefix}_status_{number}.tiff"
+        return read_image(file) if file.is_file() else None
+
+    def grid(self, folder: Path | None, pair: Pair) -> zarr.Group | None:
+        """The store of a pair's scene in one of the folders."""
+        if folder is None or not pair.row:
+            return None
+        store = folder / pair.city / f"{pair.row['scene']}.zarr"
+        return require_complete(store) if store.is_dir() else None
+
+
+def label_strata(pair: Pair, labels: NDArray[np.float32], products: Products) -> dict[str, Bools]:
+    """Masks [h, w] of the strata of a pair's labels (float32, NaN unlabelled)."""
+    found = {"near_step": near_step(labels), **match_in_tile(labels)}
+    status = products.status(pair)
+    if status is not None:
+        hidden = np.isin(status, (Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT))
+        found["near_occlusion"] = cv2.dilate(hidden.astype(np.uint8), _square()) > 0
+    grid = products.grid(products.project, pair)
+    if grid is not None:
+        classes = grid["surface_class"][window(pair)]
+        for name, codes in CLASSES.items():
+            found[name] = np.isin(classes, codes)
+        found["other"] = ~np.any([found[name] for name in CLASSES], axis=0)
+    return found
+
+
+def exact_truth(pair: Pair, products: Products) -> dict[str, NDArray[np.float32]]:
+    """Exact disparity of a synthetic pair by stratum, NaN elsewhere; empty without the truth."""
+    grid = products.grid(products.truth, pair)
+    if grid is None:
+        return {}
+    here = window(pair)
+    layer: dict[str, Any] = {name: grid[name][here] for name in ("changed", "changed_right")}
+    same = (
+        (layer["changed"] == 0) & (layer["changed_right"] == 0) & (grid["surface"][here] != WATER)
+    )
+    disparity = grid["disparity"][here] - np.float32(pair.row["right_offset_px"])
+    return {
+        f"exact_{name}": np.where(same & (grid[name][here] == 1), disparity, np.nan)
+        for name in ("visible", "hidden")
+    }
+
+
+def window(pair: Pair) -> tuple[slice, slice]:
+    """Rows and columns of a tile in its scene."""
+    row, col, size = (int(pair.row[key]) for key in ("row0", "col0", "size"))
+    return slice(row, row + size), slice(col, col + size)
+
+
+def match_in_tile(labels: NDArray[np.float32]) -> dict[str, Bools]:
+    """Whether the right tile, of the same width, holds the match of each labelled pixel."""
+    inside = match_inside(labels)
+    return {"match_inside": inside, "match_outside": np.isfinite(labels) & ~inside}
+
+
+def near_step(labels: NDArray[np.float32]) -> Bools:
+    """Whether the labels around each pixel differ by a step."""
+    known = np.isfinite(labels)
+    high = cv2.dilate(np.where(known, labels, -FAR_PX), _square())
+    low = cv2.erode(np.where(known, labels, FAR_PX), _square())
+    return known & (high - low > STEP_PX)
+
+
+def _square() -> NDArray[np.uint8]:
+    return np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8)

@@ -1,0 +1,1 @@
+"""StereoNet, PSM-Net and HMSM-Net: structure, weights, training, inference (PyTorch)."""

@@ -1,0 +1,140 @@
+"""The stereo networks as methods of the benchmark: scaling of images, weight files, inference.
+
+A weight file (``.pt``) holds a network's weights and what is needed to use them: kind, disparity
+range, channels, scaling of the images, and where they come from.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ...errors import InputError
+from .image_scaling import Scaling, image_statistics, scaled
+from .layers import channels_last
+from .weights import SavedNetwork, covering, is_keras, load_weights
+
+log = logging.getLogger("stereotruth")
+
+
+def padding(height: int, width: int, divisor: int) -> tuple[int, int]:
+    """Rows and columns to add so that both sides are multiples of ``divisor``."""
+    return -height % divisor, -width % divisor
+
+
+def choose_device(wanted: str | None) -> torch.device:
+    """The device of that name; None: a GPU if there is one.
+
+    Raises InputError if it is not to be had.
+    """
+    name = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.zeros(1, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"device {name}: {str(error).splitlines()[0]}", remedy="set device to null, or cpu"
+        ) from error
+
+
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+def precision_of(wanted: str | None, device: torch.device) -> str:
+    """The name of a precision; None: float32 on a CPU, mixed with bfloat16 on a GPU."""
+    return wanted or ("bfloat16" if device.type == "cuda" else "float32")
+
+
+def mixed(precision: str, device: torch.device) -> Any:
+    """The context in which a network computes at that precision."""
+    kind = PRECISIONS[precision]
+    return nullcontext() if kind is None else torch.autocast(device.type, kind)
+
+
+class NetworkMethod:
+    """A network with its weights as a method; see :class:`methods.Matcher`."""
+
+    def __init__(
+        self, model: SavedNetwork, network: nn.Module, device: torch.device, precision: str
+    ) -> None:
+        self.model, self.device, self.precision = model, device, precision
+        self.network = channels_last(network.eval().to(device))
+        self.margin_px = network.margin_px
+        self._range = model.disparity_range
+
+    def _look_for(self, wanted: tuple[int, int]) -> None:
+        """Set the network's range."""
+        span = covering(self.model.kind, wanted)
+        if span != self._range:
+            if span != self.model.disparity_range:
+                log.info(
+                    "%s was trained for disparities of %d to %d px, and looks for %d to %d px",
+                    self.model.kind,
+                    *self.model.disparity_range,
+                    *span,
+                )
+            self.network.set_range(span)
+            self._range = span
+
+    def scaling(self, left: Any, right: Any) -> Scaling:
+        """Statistics of whole images (NumPy or Dask) that all their parts must share."""
+        return Scaling(*(image_statistics(image, self.model.scaling) for image in (left, right)))
+
+    def __call__(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: tuple[int, int],
+        scaling: Scaling | None = None,
+    ) -> NDArray[np.float32]:
+        """Disparity [H, W] of the left image, px; NaN where the left pixel is nodata.
+
+        A ``disparity_range`` other than that of the training is taken, widened to the
+        network's planes.
+        """
+        self._look_for(disparity_range)
+        height, width = left.shape[:2]
+        rows, cols = padding(height, width, self.network.divisor)
+        both = []
+        for image, statistics in zip((left, right), scaling or (None, None)):
+            tensor = torch.from_numpy(scaled(image, self.model, statistics))[None]
+            both.append(F.pad(tensor, (0, cols, 0, rows)).to(self.device))
+        with torch.inference_mode(), mixed(self.precision, self.device):
+            found: Tensor = self.network(*both)[-1]
+        disparity = found[0, :height, :width].float().cpu().numpy()
+        seen = (left if left.ndim == 2 else left.any(axis=2)) != 0
+        return np.where(seen, disparity, np.float32(np.nan))
+
+
+def network_method(kind: str, settings: Mapping[str, Any], workers: int = 0) -> NetworkMethod:
+    """The method of a configuration entry: ``weights`` (a .pt, or Keras' .h5), ``device``,
+    ``precision``, and for .h5 ``scaling``; ``workers`` threads on a CPU (0: all cores).
+
+    Raises InputError if the weights are missing or those of another network.
+    """
+    path = settings.get("weights")
+    if path is None:
+        raise InputError(
+            f"{kind}: no weights", remedy="train it, or name a file in benchmark.methods"
+        )
+    if is_keras(path):
+        from .keras_weights import read_keras
+
+        model, network = read_keras(path, kind, settings.get("scaling"))
+    else:
+        model, network, _ = load_weights(path)
+        if model.kind != kind:
+            raise InputError(
+                f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
+            )
+    device = choose_device(settings.get("device"))
+    if device.type == "cpu" and workers:
+        torch.set_num_threads(workers)
+    return NetworkMethod(model, network, device, precision_of(settings.get("precision"), device))

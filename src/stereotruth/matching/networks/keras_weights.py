@@ -1,0 +1,167 @@
+"""Weights that were trained and saved with Keras (``.h5``), for the networks here.
+
+Keras' names number the layers in the order of their making, which differs from file to file; what
+is stable is the order in which a network calls them. So weights are taken by order: for each part
+of the network first the trainable ones (kernel, then bias or scale and shift), then the statistics
+of batch normalisation. Every shape must fit.
+
+    python -m stereotruth.matching.networks.keras_weights StereoNet.h5 stereonet.pt \\
+        --kind stereonet --disparity-range -128 64
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from ...errors import InputError
+from .image_scaling import SCALINGS
+from .weights import KINDS, SavedNetwork, save_weights
+
+Arrays = list[NDArray[np.float32]]
+
+
+def read_weights(path: str | Path) -> list[Arrays]:
+    """The weight arrays of each layer of the network that has any, in the file's order.
+
+    Raises InputError if h5py is missing or the file is none of Keras' weight files.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise InputError(
+            "h5py is needed to read Keras weights",
+            file=path,
+            remedy="pip install '.[networks]'",
+        ) from error
+    try:
+        with h5py.File(path) as file:
+            group = file.get("model_weights", file)
+            layers = [group[_text(name)] for name in group.attrs["layer_names"]]
+            return [
+                [np.asarray(layer[_text(name)]) for name in layer.attrs["weight_names"]]
+                for layer in layers
+                if len(layer.attrs["weight_names"])
+            ]
+    except (OSError, KeyError) as error:
+        raise InputError(
+            f"not a weight file of Keras ({error})", file=path, remedy="name an .h5 file"
+        ) from error
+
+
+def _text(name: Any) -> str:
+    return name.decode() if isinstance(name, bytes) else str(name)
+
+
+def _parts(network: nn.Module) -> Iterator[nn.Module]:
+    """What Keras counts as the network's layers: lists of parts are taken one by one."""
+    for child in network.children():
+        if isinstance(child, nn.ModuleList):
+            yield from child
+        else:
+            yield child
+
+
+def _slots(part: nn.Module) -> list[tuple[torch.Tensor, tuple[int, ...]]]:
+    """The tensors of a part in Keras' order, with the axes of Keras that make up theirs."""
+    trained: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+    statistics: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+    for module in part.modules():
+        if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.ConvTranspose3d, nn.Linear)):
+            n = module.weight.dim()
+            # kernels are [space..., in, out] there; transposed ones [space..., out, in], so that
+            # the same axes serve both
+            trained.append((module.weight, (n - 1, n - 2, *range(n - 2))))
+            if module.bias is not None:
+                trained.append((module.bias, (0,)))
+        elif isinstance(module, (nn.BatchNorm2d, nn.BatchNorm3d)):
+            trained += [(module.weight, (0,)), (module.bias, (0,))]
+            statistics += [(module.running_mean, (0,)), (module.running_var, (0,))]
+    return trained + statistics
+
+
+def load_keras(network: nn.Module, path: str | Path) -> None:
+    """Set a network's weights to those of a Keras file.
+
+    Raises InputError, naming the place, if the file does not hold this network's weights.
+    """
+    parts, layers = list(_parts(network)), read_weights(path)
+    remedy = "check the kind of network and the number of its channels"
+    if len(parts) != len(layers):
+        raise InputError(
+            f"{len(layers)} layers with weights, {type(network).__name__} has {len(parts)}",
+            file=path,
+            remedy=remedy,
+        )
+    for number, (part, arrays) in enumerate(zip(parts, layers)):
+        slots = _slots(part)
+        found = [array.shape for array in arrays]
+        wanted = []
+        for tensor, axes in slots:
+            shape = [0] * len(axes)
+            for axis, size in zip(axes, tensor.shape):
+                shape[axis] = size
+            wanted.append(tuple(shape))
+        if found != wanted:
+            where = next((k for k, pair in enumerate(zip(found, wanted)) if pair[0] != pair[1]), -1)
+            raise InputError(
+                f"layer {number}: {len(found)} arrays where {type(network).__name__} has "
+                f"{len(wanted)}; the first that differs is number {where}",
+                file=path,
+                remedy=remedy,
+            )
+        with torch.no_grad():
+            for (tensor, axes), array in zip(slots, arrays):
+                tensor.copy_(torch.from_numpy(np.ascontiguousarray(array.transpose(axes))))
+
+
+def read_keras(
+    path: str | Path,
+    kind: str,
+    scaling: str | None = None,
+    disparity_range: tuple[int, int] = (-128, 64),
+) -> tuple[SavedNetwork, nn.Module]:
+    """A network with the weights of a Keras file, whose first kernel says how many channels.
+
+    ``scaling``: None: that of US3D for three channels, else that of WHU-Stereo.
+    Raises InputError as :func:`load_keras` does.
+    """
+    first = read_weights(path)[0][0]
+    channels = first.shape[2] if first.ndim == 4 and first.shape[2] == 3 else 1
+    scaling = scaling or ("us3d" if channels == 3 else "standardise")
+    model = SavedNetwork(kind, disparity_range, channels, scaling)
+    network = model.build()
+    load_keras(network, path)
+    return model, network
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command of the module's docstring."""
+    parser = argparse.ArgumentParser(description="Keras weights (.h5) to a weight file (.pt)")
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--kind", choices=sorted(KINDS), default="stereonet")
+    parser.add_argument("--disparity-range", type=int, nargs=2, default=(-128, 64), metavar="PX")
+    parser.add_argument("--scaling", choices=SCALINGS, default=None)
+    given = parser.parse_args(arguments)
+    span = tuple(given.disparity_range)
+    try:
+        model, network = read_keras(given.weights, given.kind, given.scaling, span)
+    except InputError as error:
+        parser.exit(1, f"error: {error}\n")
+    save_weights(given.out, model, network, {"source": given.weights.name})
+    print(
+        f"{given.out}: {model.kind}, {model.channels} channels, "
+        f"{sum(p.numel() for p in network.parameters())} parameters"
+    )
+
+
+if __name__ == "__main__":
+    main()

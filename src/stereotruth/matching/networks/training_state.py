@@ -1,0 +1,162 @@
+"""The state of a training between steps: start, file, what is frozen, learning rate."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from ...dataset.stereo_dataset import StereoDataset
+from ...errors import InputError
+from ...products.files import replacing
+from ...products.provenance import digest, file_sha256
+from ...products.rasters import read_image
+from .keras_weights import load_keras, read_keras
+from .training_pairs import LabelledPairs
+from .training_settings import TrainingSettings
+from .weights import SavedNetwork, covering, is_keras, load_weights
+
+log = logging.getLogger("stereotruth")
+
+
+FORMAT = 1  # of the state
+BETAS = (0.9, 0.999)
+
+
+@dataclass
+class TrainingState:
+    """Where a training is: ``step`` batches of ``epoch`` are done."""
+
+    epoch: int = 0
+    step: int = 0
+    loss: float = 0.0  # summed over the epoch's steps
+    seconds: float = 0.0
+    best: float = float("inf")
+    curve: list[dict[str, Any]] = field(default_factory=list)
+
+
+def read_state(path: Path, key: str) -> dict[str, Any] | None:
+    """The record of a training of this ``key``; None if there is none to go on from."""
+    try:
+        record = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        return None
+    except Exception:  # another version's, or a damaged disk's: begin anew
+        log.warning("%s: cannot be read, the training starts anew", path)
+        return None
+    if record.get("format") != FORMAT or record.get("key") != key:
+        log.info("settings or data are others than before: the training starts anew")
+        return None
+    return record
+
+
+def learning_rate_of(training: TrainingSettings, epoch: int) -> float:
+    """Of an epoch: halved every ``halve_every_epochs``."""
+    return training.learning_rate * 0.5 ** (epoch // training.halve_every_epochs)
+
+
+def freeze_parts(network: nn.Module, frozen: Sequence[str]) -> list[nn.Module]:
+    """Stop gradients of these parts, and return them."""
+    parts = dict(network.named_children())
+    if unknown := [name for name in frozen if name not in parts]:
+        raise InputError(
+            f"training.frozen: {type(network).__name__} has no part {unknown[0]!r}",
+            remedy=f"take of {', '.join(parts)}",
+        )
+    for name in frozen:
+        parts[name].requires_grad_(False)
+    return [parts[name] for name in frozen]
+
+
+def make_optimiser(network: nn.Module, learning_rate: float) -> torch.optim.Optimizer:
+    """Adam; the squared norm of all kernels counts in the loss, as Keras' regularisers do it."""
+    kernels = [p for p in network.parameters() if p.requires_grad and p.dim() > 1]
+    others = [p for p in network.parameters() if p.requires_grad and p.dim() <= 1]
+    groups = [
+        {"params": kernels, "weight_decay": 2 * network.regularisation},
+        {"params": others, "weight_decay": 0.0},
+    ]
+    return torch.optim.Adam(groups, lr=learning_rate, betas=BETAS)
+
+
+def model_of(kind: str, dataset: StereoDataset, training: TrainingSettings) -> SavedNetwork:
+    """The network for a dataset: its range, its number of bands; else that of the first weights."""
+    span = covering(kind, dataset.disparity_range)
+    if training.initial_weights is None:
+        image = read_image(dataset.pairs("train")[0].left)
+        colour = image.ndim == 3
+        return SavedNetwork(kind, span, 3 if colour else 1, "us3d" if colour else "standardise")
+    if is_keras(training.initial_weights):
+        there, _ = read_keras(training.initial_weights, kind)
+    else:
+        there, _, _ = load_weights(training.initial_weights)
+    return replace(there, kind=kind, disparity_range=span)
+
+
+def start(model: SavedNetwork, training: TrainingSettings) -> nn.Module:
+    """The network that a training starts with: initial weights, or random ones from the seed."""
+    torch.manual_seed(training.seed)
+    network = model.build()
+    path = training.initial_weights
+    if path is None:
+        return network
+    if is_keras(path):
+        load_keras(network, path)
+        return network
+    there, other, _ = load_weights(path)
+    if (there.kind, there.channels) != (model.kind, model.channels):
+        raise InputError(
+            f"weights of {there.kind} with {there.channels} channels, "
+            f"not of {model.kind} with {model.channels}",
+            file=path,
+            remedy="name weights of the same network in training.initial_weights",
+        )
+    network.load_state_dict(other.state_dict())
+    return network
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """What every process of a training needs to know."""
+
+    model: SavedNetwork
+    training: TrainingSettings
+    data: LabelledPairs
+    held: LabelledPairs
+    out: Path
+    work: Path
+    device: str
+    processes: int
+
+    @cached_property
+    def key(self) -> str:
+        """Digest of all that the weights follow from, as it was when the training began."""
+        files = {
+            pair.name: [str(pair.left), str(pair.right), str(pair.disparity)]
+            for pair in (*self.data.pairs, *self.held.pairs)
+        }
+        initial = self.training.initial_weights
+        return digest(
+            {
+                "model": asdict(self.model),
+                "training": self.training.content(),
+                "initial": file_sha256(initial) if initial else None,
+                "files": files,
+                "processes": self.processes,
+            }
+        )
+
+
+def save_state(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a training's record, whole or not at all, on the disk itself."""
+    with replacing(path) as scratch:
+        torch.save(dict(record), scratch)
+        with scratch.open("rb") as stream:
+            os.fsync(stream.fileno())

@@ -1,0 +1,1 @@
+"""Stereo methods over whole scenes, in blended blocks, and their surface models."""

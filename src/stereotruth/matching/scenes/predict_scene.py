@@ -1,0 +1,333 @@
+"""A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
+
+Work goes in two rounds over the grid, both kept as :mod:`stereotruth.products.resumable_grids`
+keeps blocks: the method makes the tiles (:mod:`stereotruth.matching.scenes.scene_tiles`), side by side in a grid of their own, one to a file; then the
+blocks are blended from the tiles that reach into them. Memory is that of the tiles at work. A job
+that was killed goes on with the tiles that lack; the result has the same bytes for any number of
+workers and kills, as far as the method itself gives the same for the same tile (SGM does; PyTorch
+does on one machine).
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+import zarr
+
+from ...errors import InputError
+from ...job import BlockProgress
+from ...products.grids import Layer, require_complete
+from ...products.provenance import describe, digest, file_sha256
+from ...products.resumable_grids import BlockStore, making
+from ..methods import Matcher, make_method
+from .offsets import Offsets, find_offsets
+from .scene_tiles import blend, predict_tile
+from .tiling import Tiling, inside, view_of
+
+log = logging.getLogger("stereotruth")
+DisparityRange = tuple[int, int]
+Place = tuple[int, int]
+Window = tuple[slice, slice]
+
+
+CHUNK = 256  # px of the result
+LAYERS = {
+    "disparity": Layer(
+        "float32",
+        float("nan"),
+        {
+            "units": "px",
+            "long_name": "disparity x_left - x_right by a stereo method",
+            "nodata": "NaN",
+        },
+    )
+}
+
+
+def method_files(settings: Mapping[str, Any]) -> list[Path]:
+    """The files that a method of a configuration entry is made of: weights, the user's module."""
+    named = [settings.get("weights"), str(settings.get("function", "")).rpartition(":")[0]]
+    return [Path(name) for name in named if name and Path(name).is_file()]
+
+
+def identity(settings: Mapping[str, Any]) -> str:
+    """Digest of a method's configuration entry and of its files' content."""
+    files = [file_sha256(path) for path in method_files(settings)]
+    return digest({"settings": dict(settings), "files": files})
+
+
+def _image_content(attrs: Mapping[str, Any]) -> str:
+    return attrs.get("content") or digest(dict(attrs.get("provenance", {})))
+
+
+@dataclass(frozen=True, eq=False)
+class _ImagePair:
+    """What every tile needs: plain values, so that it can go to another process."""
+
+    left_store: Path
+    right_store: Path
+    method: str
+    settings: Mapping[str, Any]
+    threads: int  # of the method
+    disparity_range: DisparityRange
+    tiling: Tiling
+    margin: int | None
+    scaling: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
+
+    @cached_property
+    def images(self) -> tuple[zarr.Array, zarr.Array]:
+        stores = (self.left_store, self.right_store)
+        left, right = (require_complete(path)["image"] for path in stores)
+        if left.shape != right.shape:
+            raise InputError(
+                f"left image of {left.shape} px, right image of {right.shape}",
+                file=self.right_store,
+                remedy="run rectify again",
+            )
+        return left, right
+
+    @cached_property
+    def matcher(self) -> Matcher:
+        return make_method(self.method, self.settings, self.threads)
+
+    def tile(self, out: BlockStore, key: str, place: Place, offset: int) -> None:
+        """Predict one tile and write it to its place in the grid of tiles."""
+        window = self.tiling.tile_window(place)
+        matcher, shape = self.matcher, self.tiling.shape
+        margin = matcher.margin_px if self.margin is None else self.margin
+        view = view_of(shape, window, margin, self.disparity_range, offset)
+        left, right = self.images
+        found = predict_tile(
+            matcher,
+            inside(left, view.left),
+            inside(right, view.right),
+            view,
+            self.tiling,
+            place,
+            self.disparity_range,
+            offset,
+            self.scaling,
+        )
+        arrays = {"disparity": found} if np.isfinite(found).any() else {}
+        out.write(self._stored(place), key, arrays, None)
+
+    def block(self, tiles: BlockStore, out: BlockStore, key: str, place: Place) -> None:
+        """Blend one block; its result: count of valid pixels, least and greatest disparity."""
+        stored = zarr.open_group(tiles.store, mode="r")["disparity"]
+        around = {other: stored[self._stored(other)] for other in self.tiling.around(place)}
+        found = blend(self.tiling, place, around)
+        valid = np.isfinite(found)
+        arrays, result = {}, [0, None, None]
+        if valid.any():
+            arrays = {"disparity": found}
+            result = [int(valid.sum()), *(float(f(found[valid])) for f in (np.min, np.max))]
+        out.write(self.tiling.block_window(place), key, arrays, result)
+
+    def _stored(self, place: Place) -> Window:
+        side = self.tiling.side
+        return tuple(slice(k * side, (k + 1) * side) for k in place)
+
+
+def _fixed(offset: Any, tiling: Tiling) -> Offsets:
+    offsets = np.full(tiling.count, int(offset), dtype=np.int64)
+    return Offsets(offsets, np.ones(tiling.count, np.bool_), 1.0, np.ones(tiling.count))
+
+
+def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
+    """The disparities of the heights for which the scene's RPCs are made, with some reserve."""
+    try:
+        low, high = attrs["epipolar"]["report"]["disparity_range_px"]
+    except (KeyError, TypeError):
+        return None
+    reserve = 0.1 * (high - low) + 64.0
+    return int(np.floor(low - reserve)), int(np.ceil(high + reserve))
+
+
+def _run(
+    work: Callable[..., None],
+    arguments: Sequence[tuple[Any, ...]],
+    what: str,
+    scheduler: Any,
+    workers: int,
+) -> None:
+    """Do the work with each of the arguments, by Dask; ``what`` names it in the log."""
+    tasks = [
+        dask.delayed(work, pure=False)(*given, dask_key_name=f"{what}-{number:07d}")
+        for number, given in enumerate(arguments)
+    ]
+    with BlockProgress(len(tasks), what):
+        dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
+
+
+def predict_scene(
+    left_store: str | Path,
+    right_store: str | Path,
+    out: str | Path,
+    *,
+    method: str,
+    settings: Mapping[str, Any],
+    disparity_range: DisparityRange,
+    block_px: int = 1024,
+    overlap_px: int = 64,
+    offset: int | str = "auto",
+    margin_px: int | None = None,
+    workers: int = 1,
+    scheduler: Any = "threads",
+    code: str = "",
+    scene: str = "",
+) -> dict[str, Any]:
+    """Write the disparity of a scene by a method as a Zarr grid; returns its summary.
+
+    ``left_store``, ``right_store``: rectified images as `rectify` makes them. ``method``: a name
+    for messages; ``settings``: its configuration entry (:func:`methods.make_method`).
+    ``disparity_range``: px, of one tile; ``offset``: of the right image, px, or "auto"
+    (:mod:`offsets`). ``block_px``: a multiple of 256. ``margin_px``: None is the method's own.
+    ``workers`` tiles are worked on at once by SGM, while networks and functions get that many
+    threads. ``scheduler`` is what Dask's compute takes. ``code``: digest of the source, for the
+    provenance.
+
+    The store [y, x] on the left epipolar grid: ``disparity`` (:data:`LAYERS`); attributes
+    ``epipolar`` (the model), ``block_offsets_px`` [n][m], ``summary`` (valid share, least and
+    greatest disparity, px), ``settings``, ``provenance``.
+
+    Raises InputError for images that nowhere match, and settings that the method does not take.
+    """
+    left_store, right_store, out = (Path(p).absolute() for p in (left_store, right_store, out))
+    if block_px % CHUNK or not 0 <= 2 * overlap_px <= block_px:
+        raise InputError(
+            f"blocks of {block_px} px with an overlap of {overlap_px} px",
+            remedy=f"take a multiple of {CHUNK}, and an overlap of half of it at most",
+        )
+    by_tiles = settings.get("kind") == "sgm"
+    low, high = (int(d) for d in disparity_range)
+    left_attrs, right_attrs = (
+        dict(require_complete(path).attrs) for path in (left_store, right_store)
+    )
+    shape = require_complete(left_store)["image"].shape
+    tiling = Tiling(shape, block_px, overlap_px)
+    given = {
+        "left_store": left_store,
+        "right_store": right_store,
+        "method": method,
+        "settings": dict(settings),
+        "threads": 1 if by_tiles else workers,
+        "disparity_range": (low, high),
+        "tiling": tiling,
+        "margin": margin_px,
+    }
+    start = _ImagePair(**given)
+    left, right = start.images
+    if offset == "auto":
+        moved = find_offsets(left, right, tiling, (low, high), _search(left_attrs))
+    else:
+        moved = _fixed(offset, tiling)
+    job = _ImagePair(**given, scaling=start.matcher.scaling(*_lazy(left, right)))
+
+    parameters = {
+        "method": method,
+        "method_settings": dict(settings),
+        "disparity_range": [low, high],
+        "block_px": block_px,
+        "overlap_px": overlap_px,
+        "offset": offset,
+        "margin_px": job.matcher.margin_px if margin_px is None else margin_px,
+    }
+    content = digest(
+        {
+            "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
+            "method": identity(settings),
+            "range": [low, high],
+            "margin": parameters["margin_px"],
+            "tiling": [block_px, overlap_px],
+            "code": code,
+        }
+    )
+    places = list(tiling.places())
+    tile_keys = {p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places}
+    keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
+    every = [tiling.block_window(place) for place in places]
+    width = workers if by_tiles else 1
+    tile_shape = tuple(n * tiling.side for n in tiling.count)
+    tile_store = out.with_name(f"{out.name}.tiles")
+    sizes = {"chunk": tiling.side, "shard": tiling.side}
+    with making(out, shape, LAYERS, chunk=CHUNK, shard=block_px) as unfinished:
+        missing = unfinished.missing(every, keys, workers)
+        with making(tile_store, tile_shape, LAYERS, **sizes) as tiles:
+            wanted = sorted({p for k in missing for p in tiling.around(places[k])})
+            wanted_keys = [tile_keys[p] for p in wanted]
+            stored = [job._stored(p) for p in wanted]
+            todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
+            _run(
+                job.tile,
+                [(tiles, tile_keys[p], p, int(moved.offsets[p])) for p in todo],
+                f"tiles by {method}",
+                scheduler,
+                width,
+            )
+            _run(
+                job.block,
+                [(tiles, unfinished, keys[k], places[k]) for k in missing],
+                "blending",
+                scheduler,
+                workers,
+            )
+        summary = _summary(unfinished.results(every), shape, moved)
+        inputs = {
+            name: digest(dict(attrs.get("provenance", {})))
+            for name, attrs in (("left", left_attrs), ("right", right_attrs))
+        }
+        inputs |= {path.name: file_sha256(path) for path in method_files(settings)}
+        attrs = {
+            "kind": "prediction",
+            "scene": scene,
+            "view": "left",
+            "epipolar": left_attrs.get("epipolar"),
+            "settings": parameters,
+            "block_offsets_px": moved.offsets.tolist(),
+            "summary": summary,
+            "provenance": describe(inputs, parameters, code),
+        }
+        unfinished.publish(out, every, attrs)
+        shutil.rmtree(tiles.folder, ignore_errors=True)
+    log.info(
+        "%s: %.1f %% of the grid has a disparity, %.0f to %.0f px",
+        method,
+        100.0 * summary["valid_share"],
+        summary["disparity_min_px"],
+        summary["disparity_max_px"],
+    )
+    return summary
+
+
+def _lazy(*images: zarr.Array) -> list[Any]:
+    import dask.array as da
+
+    return [da.from_zarr(image) for image in images]
+
+
+def _summary(results: Sequence[Sequence[Any]], shape: tuple[int, int], moved: Offsets) -> dict:
+    count = sum(result[0] for result in results)
+    if not count:
+        raise InputError(
+            "the method gave no disparity at all", remedy="check its disparity range and offset"
+        )
+    return {
+        "valid_share": round(count / (shape[0] * shape[1]), 6),
+        "disparity_min_px": min(result[1] for result in results if result[0]),
+        "disparity_max_px": max(result[2] for result in results if result[0]),
+        "offset_min_px": int(moved.offsets.min()),
+        "offset_max_px": int(moved.offsets.max()),
+        "blocks_without_offset_of_their_own": int((~moved.known).sum()),
+        "coarse_disparities_in_range": round(moved.in_range, 6),
+    }

@@ -1,0 +1,184 @@
+"""Products that are either whole or absent: files, and Zarr stores (pixel grids and others).
+
+A store is built beside its final place (``<name>.partial``), gets the attribute ``complete`` last
+and is then renamed, so that a killed run never leaves something that looks finished; the one
+opener of each kind of store checks that attribute. One process at a time makes a product.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, BloscShuffle
+
+from ..errors import InputError
+from .files import replacing
+from .locks import exclusive
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+CONVENTIONS = (
+    "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
+    "disparity = x_left - x_right in px of the epipolar grid"
+)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One array of a grid: its type, what a pixel that was never written holds, and attributes.
+
+    ``attrs`` must hold ``units`` and ``long_name``.
+    """
+
+    dtype: str
+    fill: float | int
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+
+def compressor() -> BloscCodec:
+    """The lossless codec of every grid: the same bytes on every machine.
+
+    Ten times as fast as zstd 3 with byte shuffle (0.8-1.2 GB/s), images no larger, floats by a
+    quarter.
+    """
+    return BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.bitshuffle)
+
+
+@contextmanager
+def building(path: str | Path) -> Iterator[Path]:
+    """A fresh scratch folder that becomes ``path`` if the block ends well, else it goes."""
+    path = Path(path)
+    scratch = path.with_name(path.name + ".partial")
+    with exclusive(path):
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield scratch
+            group = zarr.open_group(scratch, mode="r+")
+            group.attrs["complete"] = True
+            with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
+                warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+                zarr.consolidate_metadata(group.store)
+            shutil.rmtree(path, ignore_errors=True)
+            scratch.rename(path)
+        except BaseException:
+            shutil.rmtree(scratch, ignore_errors=True)
+            raise
+
+
+def create_grid(
+    path: str | Path,
+    shape: tuple[int, int],
+    layers: Mapping[str, Layer],
+    *,
+    chunk: int,
+    shard: int,
+    attrs: Mapping[str, Any],
+) -> dict[str, zarr.Array]:
+    """An empty [y, x] grid store of Zarr v3; returns its arrays by name.
+
+    Arrays are stored in square chunks of ``chunk`` px inside shard files of ``shard`` px (a
+    multiple). Writers must write whole shards: two writers in one shard spoil it. Coordinates
+    ``x`` and ``y`` hold the pixel's column and row. Pixels never written take no space.
+    """
+    if shard % chunk:
+        raise ValueError(f"shard of {shard} px is no multiple of the chunk of {chunk} px")
+    group = zarr.open_group(path, mode="w", zarr_format=3)
+    group.attrs.update({"conventions": CONVENTIONS, **attrs})
+    arrays = {}
+    for name, layer in layers.items():
+        arrays[name] = group.create_array(
+            name,
+            shape=shape,
+            dtype=layer.dtype,
+            chunks=(chunk, chunk),
+            shards=(shard, shard),
+            fill_value=layer.fill,
+            compressors=compressor(),
+            dimension_names=("y", "x"),
+            attributes=dict(layer.attrs),
+        )
+    for name, size, axis in (("y", shape[0], "row"), ("x", shape[1], "column")):
+        coordinate = group.create_array(
+            name,
+            shape=(size,),
+            dtype="int32",
+            chunks=(size,),
+            dimension_names=(name,),
+            attributes={"units": "px", "long_name": f"{axis} of the epipolar grid"},
+        )
+        coordinate[:] = np.arange(size, dtype="int32")
+    return arrays
+
+
+def blocks(shape: tuple[int, int], size: int) -> list[tuple[slice, slice]]:
+    """[row, col] windows of at most ``size`` px that cover a grid, in row-major order."""
+    return [
+        (slice(r, min(r + size, shape[0])), slice(c, min(c + size, shape[1])))
+        for r in range(0, shape[0], size)
+        for c in range(0, shape[1], size)
+    ]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Rows of a grid that one of several jobs makes: part ``number`` (from 0 on) of ``count``."""
+
+    number: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Strip:
+        """From ``3-of-8``."""
+        number, _, count = text.partition("-of-")
+        return cls(int(number), int(count))
+
+    def __str__(self) -> str:
+        return f"{self.number}-of-{self.count}"
+
+    def of(self, windows: list[tuple[slice, slice]]) -> list[tuple[slice, slice]]:
+        """The windows in the strip's rows: equal numbers of rows of windows."""
+        starts = sorted({rows.start for rows, _ in windows})
+        first, end = ((self.number + k) * len(starts) // self.count for k in (0, 1))
+        return [window for window in windows if window[0].start in starts[first:end]]
+
+    def tell(self, path: str | Path) -> None:
+        """Write the file that tells that the strip is made."""
+        with replacing(path) as scratch:
+            scratch.write_text(f'{{"strip": "{self}"}}\n')
+
+
+def require_complete(path: str | Path) -> zarr.Group:
+    """Open a store's group for reading.
+
+    Raises InputError if it is missing or was not finished.
+    """
+    try:
+        group = zarr.open_group(path, mode="r")
+    except (FileNotFoundError, ValueError) as error:
+        raise InputError(
+            "no such Zarr store", file=path, remedy="run the stage that makes it"
+        ) from error
+    if not group.attrs.get("complete", False):
+        raise InputError(
+            "half-written Zarr store", file=path, remedy="delete it and run the workflow again"
+        )
+    return group
+
+
+def open_grid(path: str | Path) -> xr.Dataset:
+    """A finished grid store as a lazy xarray Dataset (Dask chunks = shards)."""
+    import xarray as xr  # a quarter of a job's start-up, and most jobs need none
+
+    require_complete(path)
+    return xr.open_zarr(path, consolidated=True, mask_and_scale=False)

@@ -1,0 +1,138 @@
+"""Quick looks: arrays to 8-bit pictures, panels, and the two figures of an exported city.
+
+Disparities are drawn in ``turbo``; pixels without a value are dark grey.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+Picture = NDArray[np.uint8]
+
+
+NO_VALUE = (64, 64, 64)
+
+
+def stretch(
+    image: ArrayLike,
+    *,
+    nodata: float | None = 0,
+    percent: tuple[float, float] = (1.0, 99.0),
+    limits: tuple[float, float] | None = None,
+) -> Picture:
+    """Grey picture uint8[h, w] of an image, between percentiles (or ``limits``); nodata is 0."""
+    image = np.asarray(image, dtype=np.float32)
+    valid = np.isfinite(image) if nodata is None else np.isfinite(image) & (image != nodata)
+    if not valid.any():
+        return np.zeros(image.shape, np.uint8)
+    low, high = limits or np.percentile(image[valid], percent)
+    grey = np.clip((image - low) / max(high - low, 1e-9), 0.0, 1.0) * 254.0 + 1.0
+    return np.where(valid, np.nan_to_num(grey), 0.0).astype(np.uint8)
+
+
+def colours(
+    values: ArrayLike, limits: tuple[float, float] | None = None, cmap: str = "turbo"
+) -> Picture:
+    """Colour picture uint8[h, w, 3]; NaN is dark grey, limits default to percentiles 1 and 99."""
+    values = np.asarray(values, dtype=np.float32)
+    valid = np.isfinite(values)
+    if limits is None:
+        limits = tuple(np.percentile(values[valid], (1, 99))) if valid.any() else (0.0, 1.0)
+    low, high = limits
+    scaled = np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-9), 0.0, 1.0)
+    picture = (colormaps[cmap](scaled)[..., :3] * 255.0 + 0.5).astype(np.uint8)
+    picture[~valid] = NO_VALUE
+    return picture
+
+
+def shrink(picture: Picture, side: int) -> Picture:
+    """A picture scaled down (area mean) so that its longer side is at most ``side`` px."""
+    factor = side / max(picture.shape[:2])
+    if factor >= 1.0:
+        return picture
+    width, height = (max(1, round(n * factor)) for n in picture.shape[1::-1])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def round_length(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten at or below a positive value, for an arrow's key."""
+    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
+    return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power
+
+
+def panels(rows: Sequence[Sequence[Picture]], gap: int = 4) -> Picture:
+    """Grey and colour pictures side by side and below each other, on white."""
+    height = [max(p.shape[0] for p in row) for row in rows]
+    width = [max(row[k].shape[1] for row in rows if k < len(row)) for k in range(len(rows[0]))]
+    sheet = np.full(
+        (sum(height) + gap * (len(height) - 1), sum(width) + gap * (len(width) - 1), 3),
+        255,
+        np.uint8,
+    )
+    for r, row in enumerate(rows):
+        top = sum(height[:r]) + gap * r
+        for c, picture in enumerate(row):
+            left = sum(width[:c]) + gap * c
+            h, w = picture.shape[:2]
+            sheet[top : top + h, left : left + w] = (
+                picture if picture.ndim == 3 else picture[..., None]
+            )
+    return sheet
+
+
+def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
+    """Write a matplotlib figure without any global state; no time or version goes into the file."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
+
+
+Picture = Picture
+
+QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
+
+
+def encode(picture: Picture, limit: int) -> str:
+    """A data URI of a grey or RGB picture as WebP of at most ``limit`` bytes.
+
+    Scaled down where even the lowest quality does not fit, then the best quality that fits (one
+    pixel always does).
+    """
+    colour = picture[..., ::-1] if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    data = _webp(colour, QUALITIES[-1])
+    while data.size > limit and (side := max(colour.shape[:2])) > 1:
+        factor = min(0.9, np.sqrt(limit / data.size))
+        colour = shrink(colour, max(1, int(side * factor)))
+        data = _webp(colour, QUALITIES[-1])
+    better = (_webp(colour, quality) for quality in QUALITIES[:-1])
+    data = next((found for found in better if found.size <= limit), data)
+    return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _webp(colour: Picture, quality: int) -> NDArray[np.uint8]:
+    done, data = cv2.imencode(".webp", colour, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise RuntimeError("OpenCV without WebP")
+    return data
+
+
+def encode_file(path: Path, limit: int, side: int) -> str:
+    """A data URI of a picture file, scaled down to ``side`` px at most."""
+    return encode(shrink(cv2.imread(str(path))[..., ::-1], side), limit)
+
+
+def gradient(cmap: str, stops: int = 13) -> str:
+    """The colours of a matplotlib map as a CSS gradient, left to right."""
+    rgb = (colormaps[cmap](np.linspace(0, 1, stops))[:, :3] * 255 + 0.5).astype(int)
+    return f"linear-gradient(90deg,{','.join(f'rgb({r},{g},{b})' for r, g, b in rgb)})"

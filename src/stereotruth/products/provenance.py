@@ -1,0 +1,178 @@
+"""What a product was made from: checksums of inputs, parameters, and a digest of the code."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+
+PACKAGE = Path(__file__).parents[1]
+
+
+def file_sha256(path: str | Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with Path(path).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _module_file(module: str) -> Path | None:
+    """File of the package's module ``a.b`` (relative to the package), or None if there is none."""
+    path = PACKAGE.joinpath(*module.split(".")) if module else PACKAGE
+    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            match node.body:
+                case [ast.Expr(value=ast.Constant(value=str())), *rest]:
+                    node.body = rest or [ast.Pass()]
+    return tree
+
+
+def _imported_modules(tree: ast.Module, package: str) -> set[str]:
+    """Modules of this package that a parsed module imports, relative to the package's root."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                parts = package.split(".") if package else []
+                parts = parts[: len(parts) - (node.level - 1)]
+                base = ".".join(["stereotruth", *parts, *([node.module] if node.module else [])])
+            else:
+                base = node.module or ""
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            if name.startswith("stereotruth."):
+                found.add(name.removeprefix("stereotruth."))
+    return {name for name in found if _module_file(name) is not None}
+
+
+@dataclass
+class _Sources:
+    """What is known of the package's modules: digest of the code, and modules imported.
+
+    Parsing all takes two seconds, and each job of the workflow asks. As Python does with its
+    byte code, results are kept in ``__pycache__``, for files of the same size and time.
+    """
+
+    file: Path
+    known: dict[str, list[Any]] = field(default_factory=dict)
+    fresh: bool = False
+
+    def load(self) -> _Sources:
+        try:
+            self.known = json.loads(self.file.read_text())
+        except (OSError, ValueError):
+            self.known = {}
+        return self
+
+    def save(self) -> None:
+        """Write what is new, if the folder can be written to."""
+        if not self.fresh:
+            return
+        scratch = self.file.with_suffix(f".{os.getpid()}")
+        try:
+            self.file.parent.mkdir(exist_ok=True)
+            scratch.write_text(json.dumps(self.known))
+            scratch.replace(self.file)
+        except OSError:
+            scratch.unlink(missing_ok=True)
+        self.fresh = False
+
+    def of(self, module: str) -> tuple[str, list[str]]:
+        file = _module_file(module)
+        if file is None:
+            raise ModuleNotFoundError(f"stereotruth.{module}")
+        state = file.stat()
+        stamp = [state.st_mtime_ns, state.st_size]
+        found = self.known.get(module)
+        if found is None or found[0] != stamp:
+            found = self.known[module] = [stamp, *_parsed(module, file)]
+            self.fresh = True
+        return found[1], found[2]
+
+
+def _parsed(module: str, file: Path) -> tuple[str, list[str]]:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+    imports = _imported_modules(tree, package)
+    parts = module.split(".")
+    imports |= {".".join(parts[:n]) for n in range(1, len(parts))}  # parents run on import
+    code = ast.dump(_without_docstrings(tree))
+    return hashlib.sha256(code.encode()).hexdigest(), sorted(imports)
+
+
+_CACHE = f"sources-{sys.implementation.cache_tag}.json"  # Pythons differ in their trees
+
+
+@cache
+def _sources() -> _Sources:
+    return _Sources(PACKAGE / "__pycache__" / _CACHE).load()
+
+
+def source_modules(*modules: str) -> list[str]:
+    """The named modules of this package and all that they import from it, sorted."""
+    seen: set[str] = set()
+    todo = list(modules)
+    while todo:
+        module = todo.pop()
+        if module not in seen:
+            seen.add(module)
+            todo.extend(_sources().of(module)[1])
+    return sorted(seen)
+
+
+def source_digest(*modules: str) -> str:
+    """Digest of the parsed source of the modules and of all that they import from this package.
+
+    Comments, docstrings and layout do not enter, so that only a change of what runs changes it.
+    """
+    digest = hashlib.sha256()
+    for module in source_modules(*modules):
+        digest.update(f"{module}\0{_sources().of(module)[0]}\0".encode())
+    _sources().save()
+    return digest.hexdigest()[:16]
+
+
+def describe(
+    inputs: Iterable[str | Path] | Mapping[str, str],
+    parameters: Mapping[str, Any],
+    code: str,
+) -> dict[str, Any]:
+    """Provenance record of one product.
+
+    ``inputs`` are files, whose checksums are taken, or ready {name: checksum} pairs (for stores,
+    the digest of their own provenance, see :func:`digest`). ``code`` comes from
+    :func:`source_digest`. Holds no time, host or absolute path: equal work gives equal records.
+    """
+    if not isinstance(inputs, Mapping):
+        inputs = {Path(path).name: file_sha256(path) for path in inputs}
+    return {
+        "software": f"stereotruth {__version__}",
+        "code": code,
+        "inputs": dict(sorted(inputs.items())),
+        "parameters": dict(parameters),
+    }
+
+
+def digest(record: Mapping[str, Any]) -> str:
+    """Short digest of a provenance record: stands for the product in later stages' records."""
+    text = json.dumps(record, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

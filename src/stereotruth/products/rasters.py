@@ -1,0 +1,129 @@
+"""TIFF and PNG files of one band: read and written in one place, no georeference expected."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+
+from ..errors import InputError
+from .files import replacing
+
+Floats = NDArray[np.float64]
+
+
+def write_tiff(
+    path: Path,
+    array: NDArray[Any],
+    *,
+    nodata: float | None = None,
+    half: bool = False,
+    description: str = "",
+) -> None:
+    """A one-band deflate TIFF that libtiff's readers open; ``half`` stores float32 in 16 bits.
+
+    GDAL writes IEEE half precision for 32-bit float with NBITS=16. Values must be rounded to
+    half precision before.
+    """
+    rows, cols = array.shape
+    integer = np.issubdtype(array.dtype, np.integer)
+    options: dict[str, Any] = {"nbits": 16} if half else {}
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        width=cols,
+        height=rows,
+        count=1,
+        dtype=array.dtype,
+        nodata=nodata,
+        compress="deflate",
+        predictor=2 if integer else 1,  # readers without libtiff know no float predictor
+        blockysize=min(rows, 64),
+        **options,
+    ) as dataset:
+        dataset.write(array, 1)
+        if description:
+            dataset.update_tags(TIFFTAG_IMAGEDESCRIPTION=description)
+
+
+def read_image(path: str | Path) -> NDArray[Any]:
+    """An image: [h, w], or [h, w, 3] of three bands; uint8, uint16 or else float32; nodata is 0.
+
+    Raises InputError if it cannot be read or has other than one or three bands.
+    """
+    with _opened(path) as source:
+        if source.count not in (1, 3):
+            raise InputError(
+                f"{source.count} bands", file=path, remedy="give images of one band or three"
+            )
+        bands = source.read()
+    if bands.dtype not in (np.uint8, np.uint16):
+        bands = np.nan_to_num(bands.astype(np.float32), copy=False)
+    return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
+
+
+def image_shape(path: str | Path) -> tuple[int, int]:
+    """Rows and columns of an image. Raises InputError if it cannot be read."""
+    with _opened(path) as source:
+        return source.shape
+
+
+def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float32]:
+    """A disparity map, float32[h, w] px; NaN where it is nodata (given or tagged) or not finite.
+
+    Raises InputError if it cannot be read.
+    """
+    with _opened(path) as source:
+        values = source.read(1).astype(np.float32)
+        missing = values == np.float32(nodata)
+        if source.nodata is not None:
+            missing |= values == np.float32(source.nodata)
+    values[missing | ~np.isfinite(values)] = np.nan
+    return values
+
+
+def _opened(path: str | Path) -> rasterio.DatasetReader:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            return rasterio.open(path)
+        except RasterioIOError as error:
+            raise InputError(
+                f"no image that can be read ({error})", file=path, remedy="copy the file anew"
+            ) from None
+
+
+def read_tile(path: Path) -> Floats:
+    """The band of an exported TIFF, float64[h, w]; NaN where it is nodata."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as dataset:
+            values = dataset.read(1).astype(np.float64)
+            values[values == dataset.nodata] = np.nan
+            return values
+
+
+def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
+    """Write a disparity map as a TIFF of 32-bit floats with nodata NaN."""
+    with replacing(path) as scratch, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(
+            scratch,
+            "w",
+            driver="GTiff",
+            height=disparity.shape[0],
+            width=disparity.shape[1],
+            count=1,
+            dtype="float32",
+            nodata=np.nan,
+            compress="deflate",
+            predictor=3,
+            tiled=True,
+        ) as target:
+            target.write(disparity, 1)

@@ -1,0 +1,143 @@
+"""Pictures of exported tiles as data URIs, each within a given number of bytes."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
+
+from ..dataset.warped_tile import warp_tile
+from ..products import pictures
+from ..products.pictures import Picture, encode
+from ..products.rasters import read_tile
+
+NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
+NO_DIFFERENCE = (178, 182, 188)  # and in the difference
+GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
+DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
+STATUS_COLOURS = {
+    "labelled": "#e8f1f8",
+    "no_points": "#26262b",
+    "hidden_in_left": "#f5a55a",
+    "hidden_in_right": "#d1495b",
+    "low_correlation": "#6a4c93",
+    "changed": "#edd03c",
+    "out_of_frame": "#8d99a6",
+    "below_minimum_count": "#9c6b4f",
+    "edge_in_pixel": "#2a9d8f",
+}
+OTHER_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#937860", "#da8bc3", "#8c8c8c")
+
+
+@dataclass
+class TilePictures:
+    """Data URIs of a tile by name, and what their colours mean.
+
+    ``disparity_px``: limits of the colours; ``histogram``: pixels by whole px of disparity;
+    ``difference_dn``: limit of the difference's colours in the image's units; ``correlation``
+    of left and warped right image.
+    """
+
+    uris: dict[str, str]
+    disparity_px: tuple[float, float] | None = None
+    histogram: dict[int, int] = field(default_factory=dict)
+    difference_dn: float | None = None
+    correlation: float | None = None
+
+
+def status_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
+    unknown = [name for name in names if name not in STATUS_COLOURS]
+    other = {name: OTHER_COLOURS[k % len(OTHER_COLOURS)] for k, name in enumerate(unknown)}
+    return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
+
+
+def read_status(path: Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
+    """Status values of a tile and what they mean, from the file's description."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as dataset:
+            text = dataset.tags().get("TIFFTAG_IMAGEDESCRIPTION", "")
+            return dataset.read(1), {int(v): n for v, n in re.findall(r"(\d+) (\w+)", text)}
+
+
+def _grey(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
+    lut = np.rint(255.0 * np.linspace(0, 1, 256) ** GAMMA).astype(np.uint8)
+    return lut[pictures.stretch(image, limits=limits)]
+
+
+def _limits(image: NDArray[np.float64]) -> tuple[float, float]:
+    """Percentiles 1 and 99 of what is known."""
+    known = image[np.isfinite(image) & (image != 0)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (1, 99))
+    return float(low), float(high)
+
+
+def tile_pictures(
+    folder: str | Path,
+    row: Mapping[str, str],
+    *,
+    thumbnail: tuple[int, int],
+    slider: tuple[int, int] | None,
+) -> TilePictures:
+    """The pictures of one tile; ``row`` is its line of the manifest in ``folder``.
+
+    ``thumbnail``, ``slider``: longer side in px and bytes of each picture; without ``slider``
+    there is no warped image and no difference. A pair without labels has its images only.
+    """
+    folder = Path(folder)
+    side, size = thumbnail
+    left, right = (read_tile(folder / row[kind]) for kind in ("left", "right"))
+    limits = _limits(left)
+    result = TilePictures({})
+    for name, image in (("left", left), ("right", right)):
+        grey = _grey(np.nan_to_num(image), limits if name == "left" else _limits(right))
+        result.uris[name] = encode(pictures.shrink(grey, side), size)
+    if row.get("status"):
+        status, names = read_status(folder / row["status"])
+        colours = status_colours(list(names.values()))
+        table = np.zeros((256, 3), np.uint8)
+        for value, name in names.items():
+            table[value] = tuple(bytes.fromhex(colours[name][1:]))
+        result.uris["status"] = encode(pictures.shrink(table[status], side), size)
+    if not row.get("disp"):
+        return result
+    disparity = read_tile(folder / row["disp"])
+    known = disparity[np.isfinite(disparity)]
+    if known.size:
+        low, high = (float(v) for v in np.percentile(known, (1, 99)))
+        result.disparity_px = low, high
+        values, counts = np.unique(np.floor(known).astype(int), return_counts=True)
+        result.histogram = dict(zip(values.tolist(), counts.tolist()))
+        coloured = pictures.colours(disparity, (low, high))
+        result.uris["disparity"] = encode(pictures.shrink(coloured, side), size)
+    if slider is None or not known.size:
+        return result
+    side, size = slider
+    tile = warp_tile(folder, row)
+    sums = tile.sums
+    matched = sums.match(tile.warped)
+    nothing = ~np.isfinite(matched)
+    spread = max(DIFFERENCE * (limits[1] - limits[0]), 1e-9)
+    large = {
+        "slider_left": _grey(tile.left, limits),
+        "slider_warped": np.repeat(_grey(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
+        "slider_difference": pictures.colours(tile.left - matched, (-spread, spread), "RdBu"),
+        "slider_disparity": coloured,
+    }
+    large["slider_warped"][nothing] = NO_MATCH
+    large["slider_difference"][nothing] = NO_DIFFERENCE
+    for name, picture in large.items():
+        result.uris[name] = encode(pictures.shrink(picture, side), size)
+    result.difference_dn = spread
+    result.correlation = sums.coefficient if np.isfinite(sums.coefficient) else None
+    return result

@@ -1,0 +1,240 @@
+"""Buildings of a city, and which of them change between images and LiDAR."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .cities import CitySpec
+from .layout import BUILT, ZONE_KINDS, half_size, image_axes, scene_coordinates
+from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, terrain_heights
+
+FLAT, GRAVEL, TILES, SHEET = range(4)
+
+
+class _Builder:
+    """Collects buildings; refuses those that do not fit the ground."""
+
+    def __init__(self, city: CitySpec, s: Surfaces, sites: cKDTree, rng: np.random.Generator):
+        self.city, self.s, self.sites, self.rng = city, s, sites, rng
+        self.zone_cells = s.zone_cells.tolist()
+        self.around = [
+            (*scene.centre_m, *np.concatenate(image_axes(city, scene)), *half_size(scene))
+            for scene in city.scenes
+        ]
+        self.boxes: list[tuple[float, ...]] = []
+        self.style: list[tuple[float, ...]] = []
+        self.group: list[int] = []
+        self.groups = 0
+
+    def _near(self, x: float, y: float) -> bool:
+        """:func:`near_scenes` of one position, without arrays: most buildings end here."""
+        margin = self.city.margin_m - 40
+        return any(
+            abs((x - cx) * ax + (y - cy) * ay) < width + margin
+            and abs((x - cx) * bx + (y - cy) * by) < height + margin
+            for cx, cy, ax, ay, bx, by, width, height in self.around
+        )
+
+    def add(
+        self, zone: int, cx: float, cy: float, angle: float, length: float, width: float,
+        height: float, rise: float = 0.0, wing: tuple[float, float] | None = None,
+        steepest: float = 4.0, top: bool = True, cover: int | None = None,
+    ) -> bool:  # fmt: skip
+        """One building: a box, perhaps with a wing (length, width) that makes an L, and on top."""
+        ux, uy = math.cos(angle), math.sin(angle)
+        a, b = length / 2, width / 2
+        if not self._near(cx - a * ux + b * uy, cy - a * uy - b * ux):
+            return False
+        here = self.zone_cells[int((cy - self.s.y0) / CELL_M)][int((cx - self.s.x0) / CELL_M)]
+        if zone >= 0 and here >= 0 and here != zone:
+            return False
+        parts = [(cx, cy, ux, uy, a, b)]
+        if wing is not None:
+            # at the end of the body, reaching out to +v
+            wa, wb = wing[1] / 2, wing[0] / 2
+            du, dv = a - wa, b + wb - 2.0
+            parts.append((cx + du * ux - dv * uy, cy + du * uy + dv * ux, ux, uy, wa, wb + 0.0))
+        corners = np.array([
+            (px + i * pa * ux - j * pb * uy, py + i * pa * uy + j * pb * ux)
+            for px, py, _, _, pa, pb in parts
+            for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0))
+        ])  # fmt: skip
+        if zone >= 0 and (self.sites.query(corners)[1] != zone).any():
+            return False
+        z = terrain_heights(self.s, corners)[:, 0]
+        if z.min() < self.s.water + 0.6 or z.max() - z.min() > steepest:
+            return False
+        rng = self.rng
+        eaves = z.max() + height
+        roof = float(np.clip(rng.lognormal(math.log(0.33), 0.42), 0.12, 0.85))
+        walls = float(rng.uniform(0.22, 0.55))
+        if cover is None:
+            cover = TILES if rise > 1.2 else int(rng.choice([FLAT, GRAVEL, FLAT, SHEET]))
+        for part in parts:
+            self._put(part, eaves, rise if wing is None else 0.0, roof, walls, cover)
+        if top and rise == 0 and min(length, width) > 9.5 and height > 9:
+            for _ in range(int(rng.integers(1, 3 if length < 35 else 4))):
+                ta, tb = rng.uniform(1.6, 3.4), rng.uniform(1.4, 2.6)
+                du = rng.uniform(-1, 1) * (a - ta - 2.2)
+                dv = rng.uniform(-1, 1) * (b - tb - 1.8)
+                part = (cx + du * ux - dv * uy, cy + du * uy + dv * ux, ux, uy, ta, tb)
+                self._put(part, eaves + rng.uniform(2.0, 3.6), 0.0, roof * 0.9, walls, FLAT)
+        self.groups += 1
+        return True
+
+    def _put(self, part, eaves, rise, roof, walls, cover) -> None:
+        self.boxes.append((*part, eaves, rise))
+        self.style.append((roof, walls, cover, self.rng.uniform(0, 1000)))
+        self.group.append(self.groups)
+
+
+def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) -> None:
+    """Buildings of one block. ``at(p, q)``: block coordinates (m) to plan; ``size``: inside."""
+    rng = build.rng
+    w, h = size
+    if kind == "towers":
+        columns = 3 if rng.random() < 0.5 else 2
+        pitch_w, pitch_h = w / columns, h / 2
+        podium = rng.random() < 0.35
+        for i in range(columns):
+            for j in range(2):
+                if rng.random() < 0.12:
+                    continue
+                length, width = rng.uniform(15, min(31, pitch_w - 9)), rng.uniform(15, 23)
+                x, y = at((i + 0.5) * pitch_w + rng.uniform(-2, 2), (j + 0.5) * pitch_h)
+                tall = rng.uniform(*towers)
+                if build.add(zone, x, y, angle, length, width, tall) and podium:
+                    build.groups -= 1  # the podium goes with its tower
+                    build.add(zone, x, y, angle, min(length + 12, pitch_w - 4), width + 12,
+                              rng.uniform(7, 11), top=False)  # fmt: skip
+    elif kind == "slabs":
+        lanes = 3
+        for j in range(lanes):
+            p = 2.0
+            storeys = int(rng.integers(6, 12))
+            while p < w - 26:
+                length = min(rng.uniform(32, 58), w - 2 - p)
+                x, y = at(p + length / 2, (j + 0.5) * h / lanes)
+                build.add(zone, x, y, angle, length, rng.uniform(11, 13.5), 3.0 * storeys + 1)
+                p += length + rng.uniform(7, 12)
+    elif kind == "lowrise":
+        columns, lanes = max(1, int(w // 21)), max(1, int(h // 18))
+        pitch_w, pitch_h = w / columns, h / lanes
+        for i in range(columns):
+            for j in range(lanes):
+                if rng.random() < 0.1:
+                    continue
+                length, width = rng.uniform(11, pitch_w - 2.5), rng.uniform(9, pitch_h - 3)
+                x, y = at((i + 0.5) * pitch_w, (j + 0.5) * pitch_h)
+                rise = rng.uniform(1.5, 3) if rng.random() < 0.25 else 0.0
+                build.add(zone, x, y, angle + rng.normal(0, 0.015), length, width,
+                          3.1 * int(rng.integers(2, 7)), rise)  # fmt: skip
+    elif kind == "village":
+        columns, lanes = max(1, int(w // 17)), max(1, int(h // 16))
+        pitch_w, pitch_h = w / columns, h / lanes
+        for i in range(columns):
+            for j in range(lanes):
+                if rng.random() < 0.28:
+                    continue
+                length, width = rng.uniform(9.5, 13), rng.uniform(7.5, 10)
+                x, y = at((i + 0.5) * pitch_w, (j + 0.5) * pitch_h)
+                gabled = rng.random() < 0.5
+                wing = None
+                if not gabled and rng.random() < 0.25:
+                    length, width, wing = 12.0, 6.5, (6.0, 5.0)
+                build.add(zone, x, y, angle + rng.normal(0, 0.05), length, width,
+                          3.0 * int(rng.integers(1, 4)) + 0.5,
+                          rng.uniform(1.8, 3.0) if gabled else 0.0, wing)  # fmt: skip
+    elif kind == "industry":
+        lanes = 2 if rng.random() < 0.6 else 3
+        for j in range(lanes):
+            p = 3.0
+            while p < w - 40:
+                length = min(rng.uniform(45, 90), w - 3 - p)
+                x, y = at(p + length / 2, (j + 0.5) * h / lanes)
+                wide = rng.uniform(0.62, 0.8) * h / lanes
+                if rng.random() < 0.25 and lanes == 2:
+                    build.add(zone, x, y - 0.0, angle, length, wide * 0.5, rng.uniform(8, 14),
+                              wing=(wide * 0.3, 18.0), cover=GRAVEL)  # fmt: skip
+                else:
+                    build.add(
+                        zone,
+                        x,
+                        y,
+                        angle,
+                        length,
+                        wide,
+                        rng.uniform(8, 13),
+                        rng.uniform(1.5, 3.0) if rng.random() < 0.6 else 0.0,
+                        cover=SHEET,
+                    )
+                p += length + rng.uniform(9, 16)
+
+
+def place_buildings(
+    city: CitySpec, rng: np.random.Generator, s: Surfaces, sites: cKDTree
+) -> _Builder:
+    """All buildings of a city, block by block of its land use."""
+    build = _Builder(city, s, sites, rng)
+    ny, nx = s.cell_top.shape
+    x1, y1 = s.x0 + nx * CELL_M, s.y0 + ny * CELL_M
+    for n, zone in enumerate(s.zones):
+        kind = ZONE_KINDS[int(zone[7])]
+        if kind not in BUILT:
+            continue
+        cos, sin, length, width, street = zone[2:7]
+        reach = 1.1 * city.character.zone_m
+        p0, q0 = zone[0] * cos + zone[1] * sin, zone[1] * cos - zone[0] * sin
+        for i in range(math.floor((p0 - reach) / length), math.ceil((p0 + reach) / length)):
+            for j in range(math.floor((q0 - reach) / width), math.ceil((q0 + reach) / width)):
+                edge = street + (3.0 if kind in ("towers", "slabs", "industry") else 1.2)
+                pa, qa = i * length + edge, j * width + edge
+
+                def at(p, q, pa=pa, qa=qa, cos=cos, sin=sin):
+                    p, q = pa + p, qa + q
+                    return p * cos - q * sin, p * sin + q * cos
+
+                middle = at((length - 2 * edge) / 2, (width - 2 * edge) / 2)
+                if not (s.x0 < middle[0] < x1 and s.y0 < middle[1] < y1):
+                    continue
+                if sites.query(middle)[1] != n and kind != "village":
+                    continue
+                _fill_block(build, n, kind, at, (length - 2 * edge, width - 2 * edge),
+                            math.atan2(sin, cos), city.character.towers_m)  # fmt: skip
+    # single houses all over the country, where a slope can carry them
+    pitch = 105.0
+    for y in np.arange(s.y0 + pitch, y1 - pitch / 2, pitch):
+        for x in np.arange(s.x0 + pitch, x1 - pitch / 2, pitch):
+            px, py = x + rng.uniform(-35, 35), y + rng.uniform(-35, 35)
+            zone = int(sites.query((px, py))[1])
+            if ZONE_KINDS[int(s.zones[zone, 7])] in BUILT or rng.random() < 0.25:
+                continue
+            build.add(zone, px, py, rng.uniform(-0.6, 0.6), rng.uniform(11, 17),
+                      rng.uniform(8.5, 11), rng.uniform(5, 10),
+                      rng.uniform(1.5, 2.6) if rng.random() < 0.2 else 0.0,
+                      steepest=7.0)  # fmt: skip
+    return build
+
+
+def choose_changed(
+    city: CitySpec, rng: np.random.Generator, build: _Builder, boxes: np.ndarray
+) -> np.ndarray:
+    """Which views each box is in: a few buildings of every scene in the LiDAR or images only."""
+    view = np.full(len(boxes), IN_IMAGES | IN_LIDAR, np.uint8)
+    group = np.array(build.group)
+    for scene in city.scenes:
+        local = scene_coordinates(city, scene, boxes[:, :2])
+        inside = (np.abs(local) < half_size(scene) - np.array(scene.ragged_m) - 60).all(axis=1)
+        inside &= (local[:, 0] < half_size(scene)[0] - scene.gap_m[0] - 60) | (
+            local[:, 1] > scene.gap_m[1] + 60 - half_size(scene)[1]
+        )
+        solid = inside & (boxes[:, 4] * boxes[:, 5] > 22) & (view == 3)
+        candidates = np.unique(group[solid])
+        count = min(max(4, len(candidates) // 90), 12, len(candidates) // 6)
+        chosen = rng.permutation(candidates)[: 2 * count]
+        view[np.isin(group, chosen[:count])] = IN_IMAGES
+        view[np.isin(group, chosen[count:])] = IN_LIDAR
+    return view
