@@ -1,9 +1,9 @@
 """Do the images agree with the labels? What a pixel's own surface says, not a square window.
 
 The paper's filter (:mod:`stereotruth.disparity.paper_correlation`) compares square windows around
-each point. Where heights step, such a window mixes surfaces and fails although the label is right. Here the right
-image is brought to the left by the labels themselves, and windows hold the pixels of one surface
-only:
+each point. Where heights step, such a window mixes surfaces and fails although the label is right.
+Here the right image is brought to the left by the labels themselves, and windows hold the pixels of
+one surface only:
 
 - :func:`surface_correlation`: correlation coefficient of the left and the warped right image in a
   window around each pixel, over the pixels of its surface;

@@ -136,8 +136,8 @@ def ingest(
     Withheld points are dropped, and those of ``drop_classes``: by default noise, 7 (low) and 18
     (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
     IGN's files) are kept unless listed. Coordinates: see :mod:`stereotruth.lidar.to_wgs84`.
-    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where not needed.
-    With ``workers`` > 1 a thread decodes ahead (the result is the same).
+    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
+    not needed. With ``workers`` > 1 a thread decodes ahead (the result is the same).
 
     Returns what is also in the store's attributes: ``points`` (header, read, kept, dropped by
     reason), ``classes`` (kept points by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in

@@ -1,8 +1,9 @@
 """Sub-pixel matches of a pair that know nothing of its labels.
 
 SIFT key points (:mod:`stereotruth.dataset.sift_matches`) are matched over some rows and a wide
-range of disparities of either sign; least-squares matching (Gruen 1985) then finds, in a window around the
-left pixel nearest the key point, the disparity there, its two slopes, and the vertical parallax.
+range of disparities of either sign; least-squares matching (Gruen 1985) then finds, in a window
+around the left pixel nearest the key point, the disparity there, its two slopes, and the vertical
+parallax.
 What keeps it free of bias:
 
 - both images are smoothed alike before (``SMOOTHING_PX``) and the right one is interpolated by

@@ -1,11 +1,11 @@
 """A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
 
 Work goes in two rounds over the grid, both kept as :mod:`stereotruth.products.resumable_grids`
-keeps blocks: the method makes the tiles (:mod:`stereotruth.matching.scenes.scene_tiles`), side by side in a grid of their own, one to a file; then the
-blocks are blended from the tiles that reach into them. Memory is that of the tiles at work. A job
-that was killed goes on with the tiles that lack; the result has the same bytes for any number of
-workers and kills, as far as the method itself gives the same for the same tile (SGM does; PyTorch
-does on one machine).
+keeps blocks: the method makes the tiles (:mod:`stereotruth.matching.scenes.scene_tiles`), side by
+side in a grid of their own, one to a file; then the blocks are blended from the tiles that reach
+into them. Memory is that of the tiles at work. A job that was killed goes on with the tiles that
+lack; the result has the same bytes for any number of workers and kills, as far as the method itself
+gives the same for the same tile (SGM does; PyTorch does on one machine).
 """
 
 from __future__ import annotations
