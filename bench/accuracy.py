@@ -19,16 +19,20 @@ from typing import Any
 import yaml
 
 from stereotruth import sheets
+from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.dataset import warped_tile
 from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.error_statistics import LIMITS
 from stereotruth.errors import InputError
 from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.products.grids import require_complete
+from stereotruth.products.provenance import source_digest
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -285,6 +289,7 @@ def project_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
     """Align with noise-free GCPs, rectify and project again; the disparity store."""
     from stereotruth.disparity.project import project_scene
+    from stereotruth.disparity.settings import Settings
     from stereotruth.epipolar.rectify import rectify
 
     scene = made.scene
@@ -296,25 +301,26 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         model=config["alignment"]["model"],
         scene=scene.scene,
     )
-    rectify(
-        scene.left_image,
-        scene.right_image,
-        aligned.left,
-        aligned.right,
-        aligned.reference_height,
-        folder / "epipolar.json",
-        folder / "left.zarr",
-        folder / "right.zarr",
-        workers=workers,
-        label_sigma=aligned.label_sigma,
-    )
+    model = epipolar_model(aligned)
+    with open_pair(scene.left_image, scene.right_image) as (left, right):
+        rectify(
+            left,
+            right,
+            model,
+            folder / "epipolar.json",
+            folder / "left.zarr",
+            folder / "right.zarr",
+            workers=workers,
+            left_attrs=LabelUncertainty.of(aligned, model).to_attrs(),
+        )
     project_scene(
         folder / "left.zarr",
         folder / "right.zarr",
         made.points,
         folder / "disparity.zarr",
-        **project_settings(config),
+        Settings(**project_settings(config)),
         workers=workers,
+        code=source_digest("disparity.project"),
     )
     return folder / "disparity.zarr"
 

@@ -34,12 +34,15 @@ import yaml
 from rasterio.transform import RPCTransformer
 
 import stereotruth
+from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
+from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.paper_correlation import correlate
 from stereotruth.disparity.pixel_points import Collection
 from stereotruth.disparity.project import project_scene
-from stereotruth.epipolar.image_reader import Source
+from stereotruth.disparity.settings import Settings
+from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify, rectify_image
 from stereotruth.epipolar.rpc import RPC, SensorModel
@@ -48,6 +51,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.projection_polynomials import PatchedTransform
 from stereotruth.products.grids import Layer, require_complete
+from stereotruth.products.provenance import source_digest
 from stereotruth.products.resumable_grids import making
 from stereotruth.simulate.cities import CITIES, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
@@ -60,20 +64,22 @@ POINTS_AT_25_CM = 82.6  # million, of this scene
 BLOCK = 1 << 16
 INGEST_JOB = """
 import sys
-from stereotruth.points import ingest
-from stereotruth.provenance import describe
-from stereotruth.runlog import job
+from stereotruth.job import job
+from stereotruth.lidar.ingest import ingest
+from stereotruth.products.provenance import describe
 lidar, store, log = sys.argv[1:]
 with job(log, "ingest"):
     ingest(lidar, store, provenance=describe([lidar], {}, ""))
 """
 PROJECT_JOB = """
 import json, sys
-from stereotruth.disparity import project_scene
-from stereotruth.runlog import job
-left, right, points, out, log, settings = sys.argv[1:]
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
+from stereotruth.job import job
+left, right, points, out, log, settings, options = sys.argv[1:]
+settings = Settings(**json.loads(settings))
 with job(log, "project"):
-    project_scene(left, right, json.loads(points), out, **json.loads(settings))
+    project_scene(left, right, json.loads(points), out, settings, **json.loads(options))
 """
 BOUNDS = {  # part of a profile: what its time goes into
     "laspy": "arithmetic decoding, bit by bit: the floor",
@@ -135,17 +141,17 @@ def make_scene(folder: Path, million: float, seed: int) -> list[Path]:
         print("rectifying", flush=True)
         images = folder / "left.tif", folder / "right.tif"
         alignment = align(*images, PROJECT / "config" / "gcps" / f"{SCENE}.csv", scene=SCENE)
-        rectify(
-            *images,
-            alignment.left,
-            alignment.right,
-            alignment.reference_height,
-            folder / "epipolar.json",
-            folder / "left.zarr",
-            folder / "right.zarr",
-            workers=os.cpu_count() or 1,
-            label_sigma=alignment.label_sigma,
-        )
+        model = epipolar_model(alignment)
+        with open_pair(*images) as pair:
+            rectify(
+                *pair,
+                model,
+                folder / "epipolar.json",
+                folder / "left.zarr",
+                folder / "right.zarr",
+                workers=os.cpu_count() or 1,
+                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
+            )
     return lidar
 
 
@@ -271,13 +277,14 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     print("compiling", flush=True)
     ingest_all([smallest], folder / "points", 1, env)
     smallest_store = folder / "points" / f"{smallest.stem}.zarr"
-    project_scene(left, right, [smallest_store], out, **settings)
+    code = source_digest("disparity.project")
+    project_scene(left, right, [smallest_store], out, Settings(**settings), code=code)
 
     print("T0, ingest, project", flush=True)
     count = decode(files)  # into the page cache
     seconds = {"T0": math.inf, "ingest": math.inf, "project": math.inf}
     cpu = dict(seconds)
-    told = json.dumps({"workers": workers, **settings})
+    told = json.dumps(dict(settings)), json.dumps({"workers": workers, "code": code})
     for _ in range(arguments.repeats):
         for made in (folder / "points", out.parent):  # nothing of an earlier run is taken over
             shutil.rmtree(made, ignore_errors=True)
@@ -294,7 +301,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
                     json.dumps(list(map(str, stores))),
                     out,
                     folder / "project.log",
-                    told,
+                    *told,
                     env=env,
                 ),
             ),
@@ -317,7 +324,9 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         shutil.rmtree(made)
         shutil.rmtree(out.parent)
         times = profiled(
-            lambda: project_scene(left, right, stores, out, scheduler="synchronous", **settings)
+            lambda: project_scene(
+                left, right, stores, out, Settings(**settings), scheduler="synchronous", code=code
+            )
         )
         profiles["project"] = parts(times, count)
 

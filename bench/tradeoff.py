@@ -29,6 +29,7 @@ from accuracy import (
 from matplotlib.figure import Figure
 
 from stereotruth.disparity.project import SHARD, project_scene
+from stereotruth.disparity.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.evaluation.labels_against_truth import (
     ByClass,
@@ -40,6 +41,7 @@ from stereotruth.evaluation.labels_against_truth import (
 )
 from stereotruth.products.files import replacing
 from stereotruth.products.grids import blocks, require_complete
+from stereotruth.products.provenance import source_digest
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
 # name: occlusion method, representative, thresholds of the correlation (None: it takes none)
@@ -72,7 +74,15 @@ def measure(
     with tempfile.TemporaryDirectory(dir=made.exact) as folder:
         out = Path(folder) / "disparity.zarr"
         with patch("stereotruth.disparity.project.blocks", lambda *_: list(windows)):
-            project_scene(made.left, made.right, made.points, out, **settings, workers=workers)
+            project_scene(
+                made.left,
+                made.right,
+                made.points,
+                out,
+                Settings(**settings),
+                workers=workers,
+                code=source_digest("disparity.project"),
+            )
         store = require_complete(out)
         true = open_truth(truth, store.attrs["epipolar"])
         for window in windows:

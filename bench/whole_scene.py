@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 import rasterio
 
+from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
+from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.error_statistics import ErrorSum
@@ -99,8 +101,9 @@ def make_scene(folder: Path) -> None:
         simulate_image(CITY, SCENE, image.stem, image, seed=1)
     aligned = align(*images, folder / "gcps.csv")
     stores = [folder / f"whole_{image.stem}.zarr" for image in images]
-    given = (aligned.left, aligned.right, aligned.reference_height)
-    model = rectify(*images, *given, None, *stores, workers=2)
+    model = epipolar_model(aligned)
+    with open_pair(*images) as pair:
+        rectify(*pair, model, None, *stores, workers=2)
     row, col = ((n - SIZE) // 2 for n in model.shape)
     inner = replace(
         model,

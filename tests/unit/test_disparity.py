@@ -11,8 +11,10 @@ import pyproj
 import pytest
 import zarr
 
+from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.pixel_labels import RIDGE
-from stereotruth.disparity.project import MAX_POINTS, _Scene, project_scene
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status
 from stereotruth.epipolar.fit import fit_epipolar
@@ -107,6 +109,15 @@ def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path
     return folder / f"{name}.zarr"
 
 
+RUN = ("code", "view", "workers", "scheduler", "scene", "max_points", "strip")
+
+
+def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):
+    """project_scene; ``options`` are its own and those of its settings."""
+    run = {name: options.pop(name) for name in RUN if name in options}
+    return project_scene(left, right, stores, out, Settings(**options), **{"code": "test", **run})
+
+
 class Scene:
     """Rectified images and points of the plane, with or without the box."""
 
@@ -128,7 +139,7 @@ class Scene:
 
     def project(self, name: str = "out.zarr", stores: list[Path] | None = None, **options):
         out = self.folder / name
-        self.summary = project_scene(*self.images, stores or [self.store], out, **options)
+        self.summary = project_with(*self.images, stores or [self.store], out, **options)
         return open_grid(out)
 
 
@@ -304,7 +315,7 @@ def test_building_in_one_world_only_is_masked_as_changed(plane, box, only_in, tm
     else:
         shown, scanned = box, plane
         there = (box.surface[2] > HEIGHT) & (np.abs(box.truth - plane.truth) > 1)
-    project_scene(*shown.images, [scanned.store], tmp_path / "out.zarr", method="both")
+    project_with(*shown.images, [scanned.store], tmp_path / "out.zarr", method="both")
     status = open_grid(tmp_path / "out.zarr")["status"].values
     labelled = status == Status.LABELLED
     inner = there & ~dilated(~there, 2)
@@ -372,7 +383,7 @@ def test_water_is_masked_as_changed(plane, tmp_path) -> None:
         classification=water,
     )
     ingest(tmp_path / "water.las", tmp_path / "water.zarr")
-    project_scene(*plane.images, [tmp_path / "water.zarr"], tmp_path / "out.zarr", method="both")
+    project_with(*plane.images, [tmp_path / "water.zarr"], tmp_path / "out.zarr", method="both")
     grid = open_grid(tmp_path / "out.zarr")
     status, east = grid["status"].values, plane.surface[0]
     assert not (status == Status.LABELLED)[east > 1.0].any()
@@ -413,11 +424,11 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
 
 def test_blocks_can_go_to_other_processes(plane) -> None:
     """A block's task is made of plain values, whatever has been opened before."""
-    job = _Scene(*plane.images, (plane.store,), Settings(), MAX_POINTS)
+    scene = SceneInputs(*plane.images, (plane.store,), Settings())
     window = slice(100, 140), slice(120, 170)
-    first = job.label(*window)
-    second = pickle.loads(pickle.dumps(job)).label(*window)
-    assert len(pickle.dumps(job)) < 2000
+    first = label_window(scene, *window)
+    second = label_window(pickle.loads(pickle.dumps(scene)), *window)
+    assert len(pickle.dumps(scene)) < 2000
     for name, layer in first[0].items():
         assert np.array_equal(layer, second[0][name], equal_nan=True)
 
@@ -477,7 +488,7 @@ def project_and_open(scene: Scene, folder: Path, left, right, **options):
         write_image(folder / f"{name}.zarr", scene.model, pixels)
         for name, pixels in (("left", left), ("right", right))
     ]
-    project_scene(*images, [scene.store], folder / "out.zarr", **options)
+    project_with(*images, [scene.store], folder / "out.zarr", **options)
     return open_grid(folder / "out.zarr")
 
 
@@ -523,7 +534,7 @@ def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path) -> None:
     flat = [[0.0, 0.0], [0.0, 0.0]]
     nodes = {"step_px": 100, "disparity": [[0.1, 0.3], [0.1, 0.3]], "x": flat, "y": flat}
     zarr.open_group(images[0], mode="r+").attrs["alignment_sigma"] = nodes
-    project_scene(*images, [plane.store], tmp_path / "out.zarr", method="none")
+    project_with(*images, [plane.store], tmp_path / "out.zarr", method="none")
     sigma = open_grid(tmp_path / "out.zarr")["uncertainty"].values
     col = np.broadcast_to(np.arange(sigma.shape[1]), sigma.shape)
     expected = np.hypot(none, 0.1 + 0.2 * np.clip(col / 100.0, 0, 1))
@@ -535,7 +546,7 @@ def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path) -> None:
 def refused(scene: Scene, store: Path, match: str) -> None:
     out = scene.folder / "refused.zarr"
     with pytest.raises(InputError, match=match):
-        project_scene(*scene.images, [store], out, method="none")
+        project_with(*scene.images, [store], out, method="none")
     assert not list(scene.folder.glob("refused*"))
 
 
@@ -546,7 +557,7 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     far = plane.points[:2000] + np.array([1.5, 3.0, 0])
     refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
     with pytest.raises(InputError, match=r"114\.3.*30\.6"):
-        project_scene(
+        project_with(
             *plane.images, [tmp_path / "far" / "points.zarr"], tmp_path / "x.zarr", method="none"
         )
 
@@ -556,7 +567,7 @@ def test_settings_are_checked(plane) -> None:
         with pytest.raises(InputError, match="Remedy"):
             plane.project(**options)
     with pytest.raises(InputError, match="no point store"):
-        project_scene(*plane.images, [], plane.folder / "x.zarr")
+        project_with(*plane.images, [], plane.folder / "x.zarr")
 
 
 def test_store_bounds_are_kept(plane) -> None:

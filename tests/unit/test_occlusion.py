@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity.hidden_pixels import Rays, build_surface, hidden_pixels
+from stereotruth.disparity.hidden_pixels import Rays, Surface, SurfaceBuilder, hidden_pixels
 from stereotruth.disparity.one_surface import SURFACE_PX
 from stereotruth.disparity.pixel_points import POINT, PX, PixelPoints
 from stereotruth.disparity.seen_surface import COVER_PX, MANY, MAX_COVER_PX, seen_surface
@@ -41,6 +41,14 @@ def plane_with_box(half: float, roof: float, spacing: float = 0.4) -> Points:
     east, north = np.stack([east, north]) + rng.uniform(-0.2, 0.2, (2, east.size)) * spacing
     inside = (abs(east) < half) & (abs(north) < half)
     return points_at(east, north, np.where(inside, HEIGHT + roof, HEIGHT))
+
+
+def build_surface(points: Points, rays: Rays) -> Surface:
+    """The surface of all given points."""
+    low, high = ((int(edge(points.lon_q)), int(edge(points.lat_q))) for edge in (np.min, np.max))
+    builder = SurfaceBuilder(rays, low, high)
+    builder.add(points.lon_q, points.lat_q, points.h_q)
+    return builder.built()
 
 
 def verdicts(model, points: Points, east: np.ndarray, north: np.ndarray, height) -> np.ndarray:
@@ -143,7 +151,8 @@ def test_surface_has_no_small_holes_and_no_grown_roofs() -> None:
     assert np.isfinite(inner).all()
     roof = (inner > HEIGHT + 15).sum() * 0.325**2
     assert roof == pytest.approx(16.0**2, rel=0.15)
-    assert build_surface(points_at(np.empty(0), np.empty(0), np.empty(0)), rays) is None
+    empty = SurfaceBuilder(rays, (0, 0), (900, 900)).built()
+    assert (empty.height == -np.inf).all() and (empty.ceiling == -np.inf).all()
 
 
 def test_a_cell_is_as_high_as_the_mean_of_its_top() -> None:

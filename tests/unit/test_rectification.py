@@ -12,7 +12,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.image_reader import Source
+from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.resampling import resample
 from stereotruth.epipolar.rpc import SensorModel
@@ -59,7 +59,9 @@ def run(folder: Path, left: np.ndarray, right: np.ndarray, sensors=None, **optio
         for name, pixels in (("left", left), ("right", right))
     ]
     out = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
-    model = rectify(*images, *sensors, HEIGHT, *out, **options)
+    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
+    with open_pair(*images) as opened:
+        rectify(*opened, model, *out, **options)
     return model, *(open_grid(path).image.values for path in out[1:])
 
 
@@ -349,8 +351,12 @@ def test_a_file_cut_short_is_refused(tmp_path: Path) -> None:
     right = write_image(tmp_path / "right.tif", None, noise)
     left.write_bytes(left.read_bytes()[: left.stat().st_size // 2])
     out = tmp_path / "out"
-    with pytest.raises(InputError, match=r"left.tif: (rows|not a raster)"):
-        rectify(left, right, *pair(), HEIGHT, out / "e.json", out / "l.zarr", out / "r.zarr")
+    model = fit_epipolar(*pair(), SIZE, SIZE, HEIGHT)
+    with (
+        pytest.raises(InputError, match=r"left.tif: (rows|not a raster)"),
+        open_pair(left, right) as opened,
+    ):
+        rectify(*opened, model, out / "e.json", out / "l.zarr", out / "r.zarr")
     assert not out.exists() or products(out) == []
 
 

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stereotruth.alignment.adjustment import estimate
 from stereotruth.alignment.aligned_pair import Alignment, GcpResidual, ViewFit
+from stereotruth.alignment.label_uncertainty import label_sigma
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.epipolar.fit import fit_epipolar
@@ -139,7 +140,7 @@ def test_rpcs_alone_are_brought_together(images, points):
     assert max(relative_error(planted)) > 10.0
     assert max(relative_error(refined)) < 0.03
     model = fit_epipolar(refined.left, refined.right, SIZE, SIZE, HEIGHT)
-    disparity, x, y = refined.label_sigma(model, model.shape[1] / 2, model.shape[0] / 2)
+    disparity, x, y = label_sigma(refined, model, model.shape[1] / 2, model.shape[0] / 2)
     assert disparity < 0.03
     # The common part is seen on slopes only: the uncertainty of the labels' places says so.
     miss = np.subtract(refined.left.project(LON, LAT, HEIGHT), TRUE[0].project(LON, LAT, HEIGHT))
@@ -327,5 +328,5 @@ def test_label_sigma_is_the_spread_of_labels():
         x_left, y_left = model.left_to_epipolar(*left.project(*ground))
         x_right, _ = model.right_to_epipolar(*right.project(*ground))
         labels.append([x_left - x_right, x_left, y_left])
-    for sigma, spread in zip(alignment.label_sigma(model, x, y), np.std(labels, axis=0)):
+    for sigma, spread in zip(label_sigma(alignment, model, x, y), np.std(labels, axis=0)):
         assert sigma == pytest.approx(spread, rel=0.06)

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.disparity.project import project_scene
 from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
 from stereotruth.products.grids import Strip
 
 from .test_block_store import tree
-from .test_disparity import Scene, write_image, write_points
+from .test_disparity import Scene, project_with, write_image, write_points
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def project(scene: Scene, stores: list[Path], out: Path, **options) -> set[str]:
     """Project; names of the blocks that were made."""
     done = out.with_name(f".{out.name}.work") / "done"
     before = {file.name: file.stat().st_mtime_ns for file in done.glob("*.json")}
-    project_scene(*scene.images, stores, out, code="test", **{"method": "both", **options})
+    project_with(*scene.images, stores, out, **{"method": "both", **options})
     return {
         file.name
         for file in done.glob("*.json")

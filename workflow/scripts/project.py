@@ -1,6 +1,7 @@
 """One scene's points to its disparity grid."""
 
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
 from stereotruth.job import dask_scheduler, job
 
 if __name__ == "__main__":
@@ -11,8 +12,8 @@ if __name__ == "__main__":
             snakemake.input.right,
             snakemake.input.points,
             snakemake.output.disparity,
+            Settings(**snakemake.params.settings),
             view=snakemake.params.view,
-            **snakemake.params.settings,
             workers=snakemake.threads,
             scheduler=scheduler,
             code=snakemake.params.code,

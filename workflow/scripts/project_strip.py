@@ -1,6 +1,7 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
 
@@ -12,8 +13,8 @@ if __name__ == "__main__":
             snakemake.input.right,
             snakemake.input.points,
             snakemake.params.store,
+            Settings(**snakemake.params.settings),
             view=snakemake.params.view,
-            **snakemake.params.settings,
             workers=snakemake.threads,
             code=snakemake.params.code,
             scene=scene,

@@ -1,6 +1,9 @@
 """One aligned pair to epipolar images."""
 
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.label_uncertainty import LabelUncertainty
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.job import job
 from stereotruth.products.provenance import describe
@@ -8,18 +11,26 @@ from stereotruth.products.provenance import describe
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     files = [*snakemake.input.left, *snakemake.input.right, snakemake.input.alignment]
+    names = snakemake.input.left[0], snakemake.input.right[0]
     with job(snakemake.log[0], f"rectify {scene}"):
         alignment = Alignment.load(snakemake.input.alignment)
-        rectify(
-            snakemake.input.left[0],
-            snakemake.input.right[0],
-            alignment.left,
-            alignment.right,
-            alignment.reference_height,
-            snakemake.output.epipolar,
-            snakemake.output.left,
-            snakemake.output.right,
-            workers=snakemake.threads,
-            label_sigma=alignment.label_sigma,
-            provenance=describe(files, {}, snakemake.params.code),
-        )
+        with open_pair(*names) as (left, right):
+            model = fit_epipolar(
+                alignment.left,
+                alignment.right,
+                left.size,
+                right.size,
+                alignment.reference_height,
+                names=names,
+            )
+            rectify(
+                left,
+                right,
+                model,
+                snakemake.output.epipolar,
+                snakemake.output.left,
+                snakemake.output.right,
+                workers=snakemake.threads,
+                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
+                provenance=describe(files, {}, snakemake.params.code),
+            )

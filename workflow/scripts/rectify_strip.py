@@ -1,23 +1,26 @@
 """One strip of an aligned pair to blocks of its epipolar images."""
 
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
+    names = snakemake.input.left[0], snakemake.input.right[0]
     with job(snakemake.log[0], f"rectify {scene} {strip}"):
         alignment = Alignment.load(snakemake.input.alignment)
-        rectify(
-            snakemake.input.left[0],
-            snakemake.input.right[0],
-            alignment.left,
-            alignment.right,
-            alignment.reference_height,
-            None,
-            *snakemake.params.stores,
-            workers=snakemake.threads,
-            strip=strip,
-        )
+        with open_pair(*names) as (left, right):
+            model = fit_epipolar(
+                alignment.left,
+                alignment.right,
+                left.size,
+                right.size,
+                alignment.reference_height,
+                names=names,
+            )
+            stores = snakemake.params.stores
+            rectify(left, right, model, None, *stores, workers=snakemake.threads, strip=strip)
         strip.tell(snakemake.output.done)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..epipolar.model import EpipolarModel
 from ..epipolar.rpc import SensorModel
 from ..errors import InputError
 from ..products.files import replacing
@@ -143,33 +142,6 @@ class Alignment:
         """float64[12, 12] px² of the parameters of both fits, left first."""
         left, right = (fit.covariance for fit in self.fits)
         return np.block([[left, self.cross_covariance], [self.cross_covariance.T, right]])
-
-    def label_sigma(
-        self, model: EpipolarModel, x: ArrayLike, y: ArrayLike
-    ) -> tuple[Floats, Floats, Floats]:
-        """Standard uncertainty in px that the alignment gives to labels at epipolar (x, y).
-
-        Of the disparity, and of the label's own x and y in the left grid. For points at the
-        reference height; NaN where the model has no ground.
-        """
-        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        height = model.reference_height
-        left = np.stack(model.epipolar_to_left(x, y), axis=-1)
-        ground = model.left.localize(left[..., 0], left[..., 1], height)
-        right = np.stack(model.right.project(*ground, height), axis=-1)
-        effects = [
-            image.slopes(at[..., 0], at[..., 1]) @ fit.design(at[..., 0], at[..., 1])
-            for image, at, fit in zip(
-                (model.left_image, model.right_image), (left, right), self.fits
-            )
-        ]
-        disparity = np.concatenate([effects[0][..., 0, :], -effects[1][..., 0, :]], axis=-1)
-        of_left = self.left_fit.covariance
-        variances = [np.einsum("...i,ij,...j->...", disparity, self.covariance, disparity)]
-        for axis in (0, 1):
-            e = effects[0][..., axis, :]
-            variances.append(np.einsum("...i,ij,...j->...", e, of_left, e))
-        return tuple(np.sqrt(np.maximum(v, 0.0)) for v in variances)
 
     @property
     def fits(self) -> tuple[ViewFit, ViewFit]:

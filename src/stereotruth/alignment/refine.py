@@ -22,11 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ..epipolar.image_reader import CACHE_MB, Source
+from ..epipolar.image_reader import Source, open_pair
 from ..error_statistics import median_and_nmad
 from ..errors import InputError
 from ..lidar.point_store import PointStore
@@ -256,11 +255,7 @@ def refine(
     Raises InputError if there are neither GCPs nor usable tie points.
     """
     of = f" (scene {alignment.scene})" if alignment.scene else ""
-    with (
-        rasterio.Env(GDAL_CACHEMAX=CACHE_MB),
-        Source(left_image) as left,
-        Source(right_image) as right,
-    ):
+    with open_pair(left_image, right_image) as (left, right):
         stores = [PointStore(path) for path in sorted(Path(p) for p in point_stores)]
         prior = prior_of(alignment)
         result = _search(alignment, (left, right), stores, prior)

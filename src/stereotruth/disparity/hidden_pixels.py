@@ -5,10 +5,10 @@ The paper (section III-C) removes hidden points by the correlation of image wind
 
 1. A pixel shows the surface that its centre sees. Points that others, nearer to the left camera
    (of larger disparity), surround in the left image are covered; the uncovered point nearest to
-   the centre tells the surface (:func:`seen_surface`).
+   the centre tells the surface (:func:`.seen_surface.seen_surface`).
 2. The scene is a grid of ground cells, each as high as the top surface of its points. Below its top
    a cell counts as solid, so that walls hide although no LiDAR point lies on them
-   (:func:`build_surface`).
+   (:class:`SurfaceBuilder`).
 3. What a pixel shows is hidden in a view if the ray from there to that camera, which rises along a
    straight track over the ground, runs into a cell (:func:`hidden_pixels`).
 
@@ -20,15 +20,14 @@ results do not depend on blocks, files or their order.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..lidar.point_store import Points
 from .one_surface import SURFACE_PX
+from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -48,21 +47,6 @@ NEAREST_CELLS = 0.5
 FILL_RADII = (1, 2, 4)
 _TILE = 8  # cells, of the coarse grid of maxima that bounds the search
 _PER_M = round(1 / LATTICE_M)
-
-
-class ViewGeometry(Protocol):
-    """What is used of :class:`stereotruth.epipolar.model.EpipolarModel`."""
-
-    shape: tuple[int, int]
-    reference_height: float
-
-    def ground_to_epipolar(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> Floats:
-        """float64[4, n]: x_left, y_left, x_right, y_right in px."""
-
-    def epipolar_to_ground(
-        self, x: ArrayLike, y: ArrayLike, height: ArrayLike
-    ) -> tuple[Floats, Floats]:
-        """(lon, lat) in degrees where the left image's ray meets a height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,16 +293,6 @@ class SurfaceBuilder:
         return Surface(height, ceiling, self.first[1], self.first[0])
 
 
-def build_surface(points: Points, rays: Rays) -> Surface | None:
-    """The surface of all given points; None if there are none."""
-    if len(points) == 0:
-        return None
-    low, high = ((int(edge(points.lon_q)), int(edge(points.lat_q))) for edge in (np.min, np.max))
-    builder = SurfaceBuilder(rays, low, high)
-    builder.add(points.lon_q, points.lat_q, points.h_q)
-    return builder.built()
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _to_border(place: float, size: float, speed: float) -> tuple[float, float]:
     """Way to the next border of cells of a ``size``, and between borders, along one axis."""
@@ -347,7 +321,7 @@ def _is_hidden(
     """Does the ray from place (a, b) in [0, 1)² of cell (i, j) at height ``start`` hit a cell?
 
     (du, dv): cells per metre of rise; ``top``: no cell is higher (m). The cell of the start does
-    not count: what lies above the start there is the business of :func:`seen_surface`.
+    not count: what lies above the start there is the business of :mod:`.seen_surface`.
     """
     speed = np.sqrt(du * du + dv * dv)
     if speed < 1e-6:  # the camera stands in the zenith
@@ -467,8 +441,8 @@ def hidden_pixels(
 ) -> NDArray[np.uint8]:
     """Whether what each pixel of a window shows is hidden.
 
-    ``sums`` [pixels, 4] come from :func:`exact_sums` over the seen surfaces, pixels in row-major
-    order of ``rows`` x ``cols`` of the left epipolar grid. Returns uint8 [pixels]: 0 seen in both
+    ``sums`` [pixels, 4] are those of :class:`.pixel_labels.Pixels`, pixels in row-major order of
+    ``rows`` x ``cols`` of the left epipolar grid. Returns uint8 [pixels]: 0 seen in both
     views (or no point), 1 hidden from the left, 2 hidden from the right.
     """
     out = np.empty(len(sums), dtype=np.uint8)

@@ -14,13 +14,13 @@ orthogonal there: sums in a fixed order, no linear algebra library.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
+from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,13 +43,6 @@ _CHECKS = np.vstack(
     [np.stack(np.meshgrid(*[[-4.0, 4.0]] * 3, indexing="ij"), -1).reshape(-1, 3), np.zeros((1, 3))]
 )
 _BLOCK = 512  # points that are worked on at once; see _at_points
-
-
-class Model(Protocol):
-    """What is used of :class:`stereotruth.epipolar.model.EpipolarModel`."""
-
-    def ground_to_epipolar(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> Floats:
-        """float64[4, n]: x_left, y_left, x_right, y_right in px."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -210,14 +203,14 @@ class LocalProjection:
     ``coefficients`` [cubes, 80] (x_left, y_left, x_right, y_right; 20 each); ``good`` [cubes].
     """
 
-    model: Model
+    model: ViewGeometry
     low: Ints
     shape: Ints
     coefficients: Floats
     good: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, model: Model, low: ArrayLike, high: ArrayLike) -> LocalProjection:
+    def of(cls, model: ViewGeometry, low: ArrayLike, high: ArrayLike) -> LocalProjection:
         """For points between two corners, lattice (lon, lat, height), both included."""
         first = np.asarray(low, dtype=np.int64) >> CELL_BITS
         shape = (np.asarray(high, dtype=np.int64) >> CELL_BITS) - first + 1

@@ -18,12 +18,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .local_projection import LocalProjection
 from .one_surface import SURFACE_PX
 from .pixel_points import PX, PixelPoints
-from .right_view import MirroredModel
+from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -129,7 +128,7 @@ def _collect(
 
 
 def condense(
-    model: EpipolarModel | MirroredModel,
+    model: ViewGeometry,
     local: LocalProjection,
     window: PixelPoints,
     use: Bools,

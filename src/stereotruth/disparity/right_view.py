@@ -3,17 +3,24 @@
 A pair whose images are exchanged and mirrored along the rows is a pair like any other: with
 x' = last - x, the new left image is the old right one, and d' = x'_left' - x'_right' =
 x_left - x_right. So the right view's labels are those of the mirrored pair, mirrored back.
+
+:func:`seen_from` is the one place where the views part: what works on its :class:`Pair` labels the
+left image, windows go in by :meth:`Pair.cols`, and labels come out by :meth:`Pair.arrays`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from .image_patches import Array2D
+from .status import Status
+from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 
@@ -68,3 +75,66 @@ class MirroredImage:
     def __getitem__(self, key: tuple[slice, slice]) -> NDArray[np.uint16]:
         rows, cols = key
         return self.image[rows, mirrored(cols, self.shape[1])][:, ::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A pair whose left image gets labels.
+
+    ``images``: left, right, [y, x]; ``uncertainty``: what the alignment adds to the labels'.
+    """
+
+    images: tuple[Array2D, Array2D]
+    model: ViewGeometry
+    uncertainty: LabelUncertainty
+
+    def cols(self, cols: slice) -> slice:
+        """The columns here of a window of the view's own grid."""
+        return cols
+
+    def uncertainty_at(self, x: Floats, y: Floats) -> Floats:
+        """[3, rows, cols] px at columns ``x`` and rows ``y``; see :meth:`LabelUncertainty.at`."""
+        return self.uncertainty.at(x, y)
+
+    def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        """The layers [y, x] of a window here, as they are in the view's own grid."""
+        return dict(arrays)
+
+
+class MirroredPair(Pair):
+    """A pair exchanged and mirrored: the right image gets labels."""
+
+    @classmethod
+    def of(cls, pair: Pair) -> MirroredPair:
+        """From the pair as it is."""
+        left, right = pair.images
+        images = MirroredImage(right), MirroredImage(left)
+        return cls(images, MirroredModel(pair.model), pair.uncertainty)
+
+    def cols(self, cols: slice) -> slice:
+        """See :class:`Pair`."""
+        return mirrored(cols, self.model.shape[1])
+
+    def uncertainty_at(self, x: Floats, y: Floats) -> Floats:
+        """See :class:`Pair`."""
+        return self.uncertainty.at(self.model.shape[1] - 1 - x, y)
+
+    def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        """See :class:`Pair`; what the mirrored pair calls left is right in the view's grid."""
+        found = {name: array[:, ::-1] for name, array in arrays.items()}
+        if "status" in found:
+            found["status"] = _exchanged(found["status"])
+        return found
+
+
+def _exchanged(status: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The status with the views in which pixels are hidden exchanged."""
+    out = status.copy()
+    out[status == Status.HIDDEN_IN_LEFT] = Status.HIDDEN_IN_RIGHT
+    out[status == Status.HIDDEN_IN_RIGHT] = Status.HIDDEN_IN_LEFT
+    return out
+
+
+def seen_from(view: str, pair: Pair) -> Pair:
+    """The pair in which the ``view``, left or right, is the left one."""
+    return MirroredPair.of(pair) if view == "right" else pair

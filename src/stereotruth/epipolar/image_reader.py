@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +107,11 @@ class Source:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def open_pair(left: str | Path, right: str | Path) -> Iterator[tuple[Source, Source]]:
+    """Both images of a pair, of which GDAL keeps CACHE_MB decoded at most."""
+    # GDAL's default, 5 % of the machine's memory, can be more than a job may use
+    with rasterio.Env(GDAL_CACHEMAX=CACHE_MB), Source(left) as first, Source(right) as second:
+        yield first, second

@@ -7,31 +7,26 @@ d = x_left - x_right is in px of that grid. The geometry is :mod:`stereotruth.ep
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import dask
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
-from ..alignment.label_uncertainty import sigma_nodes
 from ..errors import InputError
 from ..job import BlockProgress
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, making
-from .fit import fit_epipolar
-from .image_reader import CACHE_MB, Source
+from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, RADIUS, resample
-from .rpc import SensorModel
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
-LabelSigma = Callable[[EpipolarModel, Any, Any], tuple[Floats, Floats, Floats]]
 
 
 SHARD = 1024  # px; one task writes one shard file
@@ -160,49 +155,32 @@ def rectify_image(
 
 
 def rectify(
-    left_image: str | Path,
-    right_image: str | Path,
-    left_sensor: SensorModel,
-    right_sensor: SensorModel,
-    reference_height: float,
+    left: Source,
+    right: Source,
+    model: EpipolarModel,
     epipolar_json: str | Path | None,
     left_store: str | Path,
     right_store: str | Path,
     *,
     workers: int = 1,
-    height_range: tuple[float, float] | None = None,
-    label_sigma: LabelSigma | None = None,
+    left_attrs: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
     strip: Strip | None = None,
-) -> EpipolarModel:
-    """Fit the epipolar model of an aligned pair and resample both images into Zarr grids.
+) -> None:
+    """Resample both images of a pair into the Zarr grids of its epipolar model.
 
-    Heights are ellipsoidal m; ``height_range`` defaults to the RPCs'. ``label_sigma`` is
-    ``Alignment.label_sigma``, for the attribute ``alignment_sigma`` of the left grid. Grids hold
-    ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model and
-    ``provenance``. All three products appear when they are whole, or not at all.
+    Grids hold ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model
+    and ``provenance``, those of the left one ``left_attrs`` too. ``epipolar_json``: where the model
+    goes. All three products appear when they are whole, or not at all.
 
     Blocks that an earlier call has left, made of the same images by the same model and code, are
     taken over (see :mod:`stereotruth.products.resumable_grids`). ``strip``: make its blocks only,
     for a later call without it.
 
-    Raises InputError for images that cannot be read, do not overlap, are one view, or hold nothing
-    but nodata.
+    Raises InputError for images that cannot be read or hold nothing but nodata.
     """
     code = source_digest("epipolar.rectify")
     with ExitStack() as stack:
-        # GDAL's default, 5 % of the machine's memory, can be more than a job may use
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=CACHE_MB))
-        left, right = (stack.enter_context(Source(path)) for path in (left_image, right_image))
-        model = fit_epipolar(
-            left_sensor,
-            right_sensor,
-            left.size,
-            right.size,
-            reference_height,
-            height_range=height_range,
-            names=(str(left_image), str(right_image)),
-        )
         finished = []
         for view, source, image, store in (
             ("left", left, model.left_image, left_store),
@@ -222,8 +200,8 @@ def rectify(
                 "epipolar": model.to_dict(),
                 "provenance": dict(provenance or {}),
             }
-            if label_sigma is not None and view == "left":
-                attrs["alignment_sigma"] = sigma_nodes(model, label_sigma)
+            if view == "left":
+                attrs |= left_attrs or {}
             grid = stack.enter_context(
                 making(
                     store,
@@ -256,4 +234,3 @@ def rectify(
                 grid.publish(store, blocks(model.shape, SHARD), attrs)
             if epipolar_json is not None:
                 model.save(epipolar_json, provenance)
-    return model

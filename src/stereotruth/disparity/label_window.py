@@ -1,0 +1,235 @@
+"""The labels of one window of the left epipolar grid, and why its other pixels have none.
+
+What is tested, in this order; a pixel has the status of the first test that leaves it nothing, that
+of its point that got furthest:
+
+1. of each point: does it lie in both frames; is it on the surface that its pixel's centre sees
+   (:func:`.seen_surface.seen_surface`; with the representative ``top`` or geometric
+   visibility); do the image windows around it correlate (method ``correlation``: the paper's
+   filter, :func:`.paper_correlation.correlate`);
+2. of each pixel: do both cameras see it past the other surfaces
+   (:func:`.hidden_pixels.hidden_pixels`; ``geometric``, ``both``); is an edge of its surface
+   near its centre (``top``); do the images agree with what the LiDAR has there, and is it no water
+   (:func:`.image_agreement.outvoted`; ``both``); do its neighbours carry its surface
+   (:func:`.image_agreement.supported`; ``geometric``, ``both``); are there ``min_points``.
+
+So the method ``correlation`` is the paper's filter, ``geometric`` is visibility in both views from
+the points, ``both`` is geometric, and what the images contradict is changed; ``none`` tests no view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from .hidden_pixels import Surface, SurfaceBuilder, hidden_pixels
+from .image_agreement import outvoted, supported, surface_correlation, warp_to_left
+from .image_patches import Patch, read_patch
+from .local_projection import LocalProjection
+from .paper_correlation import correlate
+from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
+from .pixel_points import Collection, PixelPoints
+from .point_windows import Box, Reach
+from .scene_inputs import SceneInputs
+from .seen_surface import seen_surface
+from .settings import Settings
+from .status import WATER_CLASS, Status
+
+Floats = NDArray[np.float64]
+Window = tuple[slice, slice]
+
+
+BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
+
+
+def label_window(
+    scene: SceneInputs, rows: slice, cols: slice
+) -> tuple[dict[str, NDArray], NDArray[np.int64]] | None:
+    """All layers of a window and its point counts; None if it has no points.
+
+    Counts: points in the window, in both frames, used.
+    """
+    reach = scene.windows.reach(rows, cols)
+    if reach is None:
+        return None
+    settings, margin = scene.settings, scene.settings.margin
+    wide = (
+        slice(rows.start - margin, rows.stop + margin),
+        slice(cols.start - margin, cols.stop + margin),
+    )
+    left, right = _patches(scene, wide, reach)
+    found = _collect(scene, scene.windows.strips(rows, cols, reach), wide, left, right)
+    if found is None:
+        return None
+    points, local, surface = found
+    use, edge = np.ones(points.points.size, dtype=np.bool_), None
+    if settings.uses_seen_surface:
+        use, edge = seen_surface(points, settings.edge_margin_px)
+    seen, correlation = use, None
+    if settings.method == "correlation":
+        correlation = correlate(points, use, left, right, settings.window)
+        use = use & (correlation >= settings.correlation_threshold)
+    pixels = condense(scene.pair.model, local, points, use, correlation, settings.representative)
+    status = _test_points(settings, points, seen, pixels)
+    if surface is not None:
+        hidden = hidden_pixels(surface, scene.rays, pixels.sums, *wide).reshape(status.shape)
+        status[hidden == 1] = Status.HIDDEN_IN_LEFT
+        status[hidden == 2] = Status.HIDDEN_IN_RIGHT
+    if edge is not None and settings.representative == "top":
+        status[(status == Status.LABELLED) & edge] = Status.EDGE_IN_PIXEL
+    labels = _labels(scene, pixels, status == Status.LABELLED, wide)
+    agreement = pixels.correlation
+    if settings.method == "both":
+        agreement = _test_agreement(settings, labels, pixels, status, left, right, wide)
+    if settings.uses_geometry:
+        known = np.where(status == Status.LABELLED, labels.disparity, np.nan)
+        alone = np.isfinite(known) & ~supported(known, status != Status.NO_POINTS)
+        status[alone] = Status.EDGE_IN_PIXEL
+    few = (status == Status.LABELLED) & (pixels.count < settings.min_points)
+    status[few] = Status.BELOW_MINIMUM_COUNT
+    layers = _layers(scene, pixels, labels, agreement, status, wide)
+    return layers, _counts(points, pixels, status, margin)
+
+
+def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Patch]:
+    """Of the left image, the window; of the right one, all that its points can be seen in."""
+    x, y, height = (
+        grid.reshape(-1)
+        for grid in np.meshgrid(
+            np.linspace(wide[1].start - 1.0, wide[1].stop, 5),
+            np.linspace(wide[0].start - 1.0, wide[0].stop, 5),
+            [reach.low, reach.high],
+        )
+    )
+    model, (left, right) = scene.pair.model, scene.pair.images
+    x_right = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
+    x_right = x_right[np.isfinite(x_right)]
+    # A few pixels more, for what is not linear in between.
+    cols = slice(int(x_right.min(initial=0.0)) - 8, int(x_right.max(initial=0.0)) + 9)
+    window = scene.settings.images_window
+    return read_patch(left, *wide, window), read_patch(right, wide[0], cols, window)
+
+
+def _collect(
+    scene: SceneInputs, strips: Sequence[Box], wide: Window, left: Patch, right: Patch
+) -> tuple[PixelPoints, LocalProjection, Surface | None] | None:
+    """The points of a window by pixel, and the surface of all points around; None if none."""
+    if not strips:
+        return None
+    box = [step(strip[k] for strip in strips) for k, step in enumerate((min, min, max, max))]
+    heights = scene.windows.heights(box)
+    if heights is None:
+        return None
+    low = [int(np.floor(edge / LATTICE_DEG)) for edge in box[:2]]
+    high = [int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]]
+    shape = wide[0].stop - wide[0].start, wide[1].stop - wide[1].start
+    low_h, high_h = (round(height / LATTICE_M) for height in heights)
+    local = LocalProjection.of(scene.pair.model, (*low, low_h), (*high, high_h))
+    first = wide[0].start, wide[1].start
+    collection = Collection(shape, first, (low[0], low[1]), left, right)
+    builder = None
+    if scene.settings.uses_geometry:
+        builder = SurfaceBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
+    for strip in strips:
+        for store in scene.stores:
+            points = store.query(*strip)
+            for start in range(0, len(points), BLOCK):
+                where = slice(start, start + BLOCK)
+                lattice = points.lon_q[where], points.lat_q[where], points.h_q[where]
+                collection.add(*lattice, points.classification[where], local.at_points(*lattice))
+                if builder is not None:
+                    builder.add(*lattice)
+    surface = None if builder is None else builder.built()
+    points = collection.sorted()
+    if points.points.size == 0 and not points.outside.any():
+        return None
+    return points, local, surface
+
+
+def _test_points(
+    settings: Settings, points: PixelPoints, seen: NDArray[np.bool_], pixels: Pixels
+) -> NDArray[np.uint8]:
+    """Status of each pixel by its point that got furthest."""
+    status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
+    status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
+    status[points.count > 0] = Status.HIDDEN_IN_LEFT
+    if settings.method == "correlation":
+        status[points.any(seen)] = Status.LOW_CORRELATION
+    status[pixels.count > 0] = Status.LABELLED
+    return status
+
+
+def _labels(scene: SceneInputs, pixels: Pixels, valid: NDArray[np.bool_], wide: Window) -> Labels:
+    """Labels of the valid pixels by the settings' representative."""
+    if scene.settings.representative == "paper":
+        return at_points(pixels, valid, scene.rays.px_per_m)
+    first = wide[0].start, wide[1].start
+    return at_centres(pixels, valid, first, scene.rays.px_per_m)
+
+
+def _test_agreement(
+    settings: Settings,
+    labels: Labels,
+    pixels: Pixels,
+    status: NDArray[np.uint8],
+    left: Patch,
+    right: Patch,
+    wide: Window,
+) -> Floats:
+    """Correlation of the images over each pixel's surface; sets what has changed in status."""
+    warped = warp_to_left(right, *wide, labels.disparity)
+    top, side = wide[0].start - left.row, wide[1].start - left.col
+    shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
+    surface = labels.disparity, labels.slope
+    found = surface_correlation(shown, warped, *surface, settings.window)
+    changed = outvoted(found, *surface, settings.correlation_threshold)
+    changed |= (status == Status.LABELLED) & (pixels.surface_class == WATER_CLASS)
+    status[changed] = Status.CHANGED
+    return found
+
+
+def _layers(
+    scene: SceneInputs,
+    pixels: Pixels,
+    labels: Labels,
+    correlation: Floats,
+    status: NDArray[np.uint8],
+    wide: Window,
+) -> dict[str, NDArray]:
+    """The layers of a window, without its margin."""
+    margin = scene.settings.margin
+    inner = slice(margin, -margin), slice(margin, -margin)
+    y, x = (np.arange(w.start + margin, w.stop - margin, dtype=np.float64) for w in wide)
+    sigma, sigma_x, sigma_y = scene.pair.uncertainty_at(x, y)
+    slope = labels.slope[:, *inner]
+    variance = labels.variance[inner] + sigma**2
+    variance = variance + (slope[0] * sigma_x) ** 2 + (slope[1] * sigma_y) ** 2
+    values = {
+        "disparity": labels.disparity[inner],
+        "height": pixels.highest[inner],
+        "correlation": correlation[inner],
+        "uncertainty": np.sqrt(variance),
+    }
+    known = status[inner] == Status.LABELLED
+    result = {name: np.where(known, v, np.nan).astype(np.float32) for name, v in values.items()}
+    kept = known | (status[inner] == Status.BELOW_MINIMUM_COUNT)
+    count = np.where(kept, np.minimum(pixels.count[inner], 65535), 0)
+    result["point_count"] = count.astype(np.uint16)
+    result["surface_class"] = np.where(known, pixels.surface_class[inner], 0).astype(np.uint8)
+    result["status"] = status[inner]
+    return result
+
+
+def _counts(
+    points: PixelPoints, pixels: Pixels, status: NDArray[np.uint8], margin: int
+) -> NDArray[np.int64]:
+    """Points of a window without its margin: all, in both frames, used."""
+    inner = (slice(margin, -margin),) * 2
+    framed = points.count[inner].sum()
+    outside = points.outside.reshape(points.shape)[inner].sum()
+    labelled = np.isin(status[inner], (Status.LABELLED, Status.BELOW_MINIMUM_COUNT))
+    used = pixels.count[inner][labelled].sum()
+    return np.array([framed + outside, framed, used])

@@ -1,0 +1,63 @@
+"""What the labels of a scene are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ..alignment.label_uncertainty import LabelUncertainty
+from ..epipolar.model import EpipolarModel
+from ..lidar.point_store import PointStore
+from ..products.grids import require_complete
+from .hidden_pixels import Rays
+from .point_windows import PointWindows
+from .right_view import Pair, seen_from
+from .settings import Settings
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInputs:
+    """The rectified images and point stores of a scene, and how to judge and condense the points.
+
+    Plain values, so that it can go to another process; what they stand for is opened when it is
+    asked for. ``view``: left, or right for the labels of the right image.
+    """
+
+    left_store: Path
+    right_store: Path
+    point_stores: tuple[Path, ...]
+    settings: Settings
+    view: str = "left"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
+
+    @cached_property
+    def pair(self) -> Pair:
+        """The images with their geometry; its left image is the one that gets labels."""
+        left, right = (require_complete(path) for path in (self.left_store, self.right_store))
+        return seen_from(
+            self.view,
+            Pair(
+                (left["image"], right["image"]),
+                EpipolarModel.from_dict(left.attrs["epipolar"]),
+                LabelUncertainty.from_attrs(left.attrs),
+            ),
+        )
+
+    @cached_property
+    def rays(self) -> Rays:
+        """From the ground to both cameras."""
+        return Rays.of(self.pair.model)
+
+    @cached_property
+    def stores(self) -> tuple[PointStore, ...]:
+        """The points."""
+        return tuple(PointStore(path) for path in self.point_stores)
+
+    @cached_property
+    def windows(self) -> PointWindows:
+        """Where the points of windows of the pair's left image are."""
+        return PointWindows(self.pair.model, self.rays, self.stores, self.settings)
