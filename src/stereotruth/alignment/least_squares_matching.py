@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.resampling import RADIUS, sample, tap_weights
+from .window_fit import gain_and_correlation, normal_equations, solve_two, weighted_mean
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -39,6 +40,18 @@ def warp_patch(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _inner(picture: Picture, window: Floats) -> None:
+    """Fill a window [n, 3] by the values and slopes of a picture inside its margin of one px."""
+    k = 0
+    for j in range(1, picture.shape[0] - 1):
+        for i in range(1, picture.shape[1] - 1):
+            window[k, 0] = picture[j, i]
+            window[k, 1] = 0.5 * (picture[j, i + 1] - picture[j, i - 1])
+            window[k, 2] = 0.5 * (picture[j + 1, i] - picture[j - 1, i])
+            k += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def least_squares_match(
     template: Picture,
     source: Picture,
@@ -55,67 +68,37 @@ def least_squares_match(
     the slopes are the mean of both windows', so that noise does not draw the shift. NaN where the
     match leaves the picture or does not converge.
     """
-    n = template.shape[0] - 2
-    x, y = start[0], start[1]
-    window = np.empty(template.shape, np.float32)
+    count = (template.shape[0] - 2) ** 2
+    warped = np.empty(template.shape, np.float32)
+    left, right, weight = np.empty((count, 3)), np.empty((count, 3)), np.ones(count)
+    moves = np.zeros((count, 2, 2))
+    moves[:, 0, 0], moves[:, 1, 1] = 1.0, 1.0
+    normal, rhs, middle = np.empty((2, 2)), np.empty(2), np.empty(2)
     result[:] = np.nan
-    count = n * n
-    mean_left = 0.0
-    for j in range(1, n + 1):
-        for i in range(1, n + 1):
-            mean_left += template[j, i]
-    mean_left /= count
+    _inner(template, left)
+    mean_left = weighted_mean(left, weight)
+    x, y = start[0], start[1]
     for _ in range(ITERATIONS):
         c = col + carry[0, 0] * x + carry[0, 1] * y
         r = row + carry[1, 0] * x + carry[1, 1] * y
-        warp_patch(source, c, r, carry, scale, window)
-        mean_right = 0.0
-        for j in range(1, n + 1):
-            for i in range(1, n + 1):
-                mean_right += window[j, i]
-        mean_right /= count
-        if np.isnan(mean_right):
+        warp_patch(source, c, r, carry, scale, warped)
+        _inner(warped, right)
+        mean_right = weighted_mean(right, weight)
+        gain, correlation = gain_and_correlation(left, right, weight, mean_left, mean_right)
+        if np.isnan(gain):
             return
-        ll, lr, rr = 0.0, 0.0, 0.0
-        for j in range(1, n + 1):
-            for i in range(1, n + 1):
-                a, b = template[j, i] - mean_left, window[j, i] - mean_right
-                ll += a * a
-                lr += a * b
-                rr += b * b
-        if ll <= 0.0 or rr <= 0.0 or lr <= 0.0:
+        misfit = normal_equations(
+            left, right, weight, mean_left, mean_right, gain, moves, normal, rhs, middle
+        )
+        dx, dy, det = solve_two(normal, rhs)
+        if np.isnan(det):
             return
-        gain = np.sqrt(ll / rr)
-        xx, xy, yy, bx, by, misfit = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(1, n + 1):
-            for i in range(1, n + 1):
-                miss = template[j, i] - mean_left - gain * (window[j, i] - mean_right)
-                gx = 0.25 * (
-                    template[j, i + 1]
-                    - template[j, i - 1]
-                    + gain * (window[j, i + 1] - window[j, i - 1])
-                )
-                gy = 0.25 * (
-                    template[j + 1, i]
-                    - template[j - 1, i]
-                    + gain * (window[j + 1, i] - window[j - 1, i])
-                )
-                xx += gx * gx
-                xy += gx * gy
-                yy += gy * gy
-                bx += gx * miss
-                by += gy * miss
-                misfit += miss * miss
-        det = xx * yy - xy * xy
-        if not det > 0.0:
-            return
-        dx, dy = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
         x += dx
         y += dy
         if abs(x - start[0]) > 2.0 or abs(y - start[1]) > 2.0:
             return
         if max(abs(dx), abs(dy)) < CONVERGED:
             result[0], result[1] = x, y
-            result[2] = np.sqrt(misfit / (count - 4) * max(xx, yy) / det)
-            result[3] = lr / np.sqrt(ll * rr)
+            result[2] = np.sqrt(misfit / (count - 4) * max(normal[0, 0], normal[1, 1]) / det)
+            result[3] = correlation
             return

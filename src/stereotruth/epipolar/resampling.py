@@ -1,20 +1,17 @@
 """Resampling of an image at given positions: cubic convolution with six taps along each axis.
 
-Keys' six-point kernel (IEEE TASSP 29, 1981, section VI), exact sub-pixel weights, in vector
-instructions; wider where the image is downsampled. Nodata is NaN.
+Keys' six-point kernel (IEEE TASSP 29, 1981, section VI), exact sub-pixel weights; wider where the
+image is downsampled. Nodata is NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Picture = NDArray[np.float32]
 
 
 # Of waves of 6 px, Keys' six points leave 0.6 % rms, four points 2.1 %, Lanczos' eight 0.7 %; but
@@ -34,14 +31,12 @@ TAP_POLYNOMIALS = (
             [-16, 20, 8, 0],
             [7, -6, -1, 0],
             [-1, 1, 0, 0],
-            [0, 0, 0, 0],
-            [0, 0, 0, 0],
         ]
     )
     / 12
-)
-INT32 = ir.IntType(32)
-LANES, LANE_NUMBERS = ir.VectorType(ir.FloatType(), 8), ir.VectorType(INT32, 8)
+).astype(np.float32)
+# Unsigned: of signed indices Numba asks whether they count from the end, a quarter slower.
+ONE, TWO, THREE, FOUR, FIVE = np.arange(1, 6, dtype=np.uint64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -78,90 +73,87 @@ def tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
         weights[k] /= total
 
 
-def _lanes(values: Iterable[float]) -> ir.Constant:
-    return ir.Constant(LANES, [ir.Constant(ir.FloatType(), float(np.float32(v))) for v in values])
+@njit(cache=True, nogil=True, error_model="numpy")
+def _row_weights(f: Picture, weights: Picture) -> None:
+    """Weights [6, n] of the taps of n px, each of which lies ``f`` in [0, 1] past its third tap.
 
-
-def _spread(builder: ir.IRBuilder, vector: ir.Value, lane: int) -> ir.Value:
-    """All lanes hold the vector's lane ``lane``."""
-    return builder.shuffle_vector(vector, vector, ir.Constant(LANE_NUMBERS, [lane] * 8))
-
-
-def _polynomials(builder: ir.IRBuilder, f: ir.Value) -> ir.Value:
-    """The weights of the taps at ``f``, by Horner's rule in all lanes."""
-    first = builder.insert_element(ir.Constant(LANES, ir.Undefined), f, ir.Constant(INT32, 0))
-    f = _spread(builder, first, 0)
-    weights = _lanes(TAP_POLYNOMIALS[:, 0])
-    for power in range(1, 4):
-        weights = builder.fadd(builder.fmul(weights, f), _lanes(TAP_POLYNOMIALS[:, power]))
-    return weights
-
-
-@intrinsic
-def six_by_six(typing, source, first, width, f_col, f_row):
-    """The value of 6 x 6 taps, float32, from a flat image whose rows are ``width`` samples apart.
-
-    ``first`` is the index of the upper-left tap; the position lies ``f_col``, ``f_row`` in [0, 1]
-    past the third tap. Rows are read 8 samples wide, the last two with weight 0: NaN in any of
-    them makes NaN.
-
-    In vector instructions of its own: 64 M px/s in all; written out in Python, which Numba leaves
-    scalar, 33; by gathers for 64 px at once, 47.
+    One loop for each tap, which is vectorised.
     """
-    signature = types.float32(source, types.int64, types.int64, types.float32, types.float32)
+    for tap in range(6):
+        a, b, c, d = TAP_POLYNOMIALS[tap]
+        for k in range(f.size):
+            weights[tap, k] = ((a * f[k] + b) * f[k] + c) * f[k] + d
 
-    def generate(context, builder, signature, arguments):
-        array, first, width, f_col, f_row = arguments
-        data = context.make_array(signature.args[0])(context, builder, array).data
-        across, down = _polynomials(builder, f_col), _polynomials(builder, f_row)
-        total = _lanes([0.0] * 8)
-        for j in range(6):
-            at = builder.add(first, builder.mul(width, ir.Constant(width.type, j)))
-            line = builder.load(builder.bitcast(builder.gep(data, [at]), LANES.as_pointer()))
-            line.align = 4
-            total = builder.fadd(total, builder.fmul(line, _spread(builder, down, j)))
-        total = builder.fmul(total, across)
-        for shift in (4, 2, 1):
-            turn = ir.Constant(LANE_NUMBERS, [(lane + shift) % 8 for lane in range(8)])
-            total = builder.fadd(total, builder.shuffle_vector(total, total, turn))
-        return builder.extract_element(total, ir.Constant(INT32, 0))
 
-    return signature, generate
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _column(
+    source: Picture, at: np.uint64, width: np.uint64, down: tuple[np.float32, ...]
+) -> np.float32:
+    """Weighted sum of six samples, one below the other."""
+    return (
+        source[at] * down[0]
+        + source[at + width] * down[1]
+        + source[at + TWO * width] * down[2]
+        + source[at + THREE * width] * down[3]
+        + source[at + FOUR * width] * down[4]
+        + source[at + FIVE * width] * down[5]
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _six_by_six(
+    source: Picture, first: np.uint64, width: np.uint64, across: Picture, down: Picture, k: int
+) -> np.float32:
+    """The value of 6 x 6 taps, from a flat image whose rows are ``width`` samples apart.
+
+    ``first`` is the index of the upper-left tap; ``across`` and ``down`` [6, n] are the weights of
+    all px of a row, of which this is the one with number ``k``. NaN in any sample makes NaN.
+    """
+    v = down[0, k], down[1, k], down[2, k], down[3, k], down[4, k], down[5, k]
+    a = _column(source, first, width, v) * across[0, k]
+    b = _column(source, first + ONE, width, v) * across[1, k]
+    c = _column(source, first + TWO, width, v) * across[2, k]
+    d = _column(source, first + THREE, width, v) * across[3, k]
+    e = _column(source, first + FOUR, width, v) * across[4, k]
+    f = _column(source, first + FIVE, width, v) * across[5, k]
+    return (a + e + c) + (b + f + d)  # three terms each: the sums need not wait for one another
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _at_an_edge(
-    source: NDArray[np.float32],
+    source: Picture,
     row: int,
     col: int,
-    f_row: np.float32,
-    f_col: np.float32,
-    patch: NDArray[np.float32],
+    f_row: Picture,
+    f_col: Picture,
+    across: Picture,
+    down: Picture,
+    k: int,
 ) -> np.float32:
-    """:func:`six_by_six` where samples are nodata or missing; those without weight do not count.
+    """:func:`_six_by_six` where samples are nodata or missing; those without weight do not count.
 
     (row, col) is the third tap. The same bits as without an edge where all samples are there.
     """
-    down, across = np.empty(6), np.empty(6)
-    tap_weights(f_row, -2, 1.0, down)
-    tap_weights(f_col, -2, 1.0, across)
-    patch[:] = 0.0
+    exact_down, exact_across = np.empty(6), np.empty(6)
+    tap_weights(f_row[k], -2, 1.0, exact_down)
+    tap_weights(f_col[k], -2, 1.0, exact_across)
+    patch = np.zeros(36, np.float32)
     for j in range(6):
-        if abs(down[j]) < NO_WEIGHT:
+        if abs(exact_down[j]) < NO_WEIGHT:
             continue
         for i in range(6):
-            if abs(across[i]) < NO_WEIGHT:
+            if abs(exact_across[i]) < NO_WEIGHT:
                 continue
             r, c = row - 2 + j, col - 2 + i
             if r < 0 or c < 0 or r >= source.shape[0] or c >= source.shape[1]:
                 return np.float32(np.nan)
-            patch[j, i] = source[r, c]
-    return six_by_six(patch.reshape(-1), 0, 8, f_col, f_row)
+            patch[6 * j + i] = source[r, c]
+    return _six_by_six(patch, np.uint64(0), np.uint64(6), across, down, k)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _along_row(
-    lattice: Floats, step: int, y: int, x: int, axis: int, whole: Floats, part: NDArray[np.float32]
+    lattice: Floats, step: int, y: int, x: int, axis: int, whole: Floats, part: Picture
 ) -> None:
     """Source positions of ``whole.size`` px from (x, y) on: whole px and the rest, in [0, 1].
 
@@ -192,36 +184,36 @@ def _along_row(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _resample(
-    source: NDArray[np.float32], lattice: Floats, step: int, out: NDArray[np.uint16]
-) -> int:
+def _resample(source: Picture, lattice: Floats, step: int, out: NDArray[np.uint16]) -> int:
     """:func:`resample` without widening; a tile's source stays in the processor's cache."""
     rows, cols = source.shape
     flat = source.reshape(-1)
-    patch = np.zeros((6, 8), dtype=np.float32)
     valid = 0
     for y0 in range(0, out.shape[0], TILE):
         for x0 in range(0, out.shape[1], TILE):
             width = min(TILE, out.shape[1] - x0)
             col, row = np.empty(width), np.empty(width)
             f_col, f_row = np.empty(width, np.float32), np.empty(width, np.float32)
+            across, down = np.empty((6, width), np.float32), np.empty((6, width), np.float32)
             values = np.empty(width, np.float32)
             for y in range(y0, min(y0 + TILE, out.shape[0])):
                 _along_row(lattice, step, y, x0, 0, col, f_col)
                 _along_row(lattice, step, y, x0, 1, row, f_row)
+                _row_weights(f_col, across)
+                _row_weights(f_row, down)
                 for k in range(width):
                     c, r = col[k], row[k]
                     value = np.float32(np.nan)
-                    if c >= 2.0 and r >= 2.0 and c <= cols - 6.0 and r <= rows - 4.0:
-                        first = (int(r) - 2) * cols + int(c) - 2
-                        value = six_by_six(flat, first, cols, f_col[k], f_row[k])
+                    if c >= 2.0 and r >= 2.0 and c <= cols - 4.0 and r <= rows - 4.0:
+                        first = np.uint64((int(r) - 2) * cols + int(c) - 2)
+                        value = _six_by_six(flat, first, np.uint64(cols), across, down, k)
                     if np.isnan(value) and (
                         c + f_col[k] >= -0.5
                         and r + f_row[k] >= -0.5
                         and c + f_col[k] <= cols - 0.5
                         and r + f_row[k] <= rows - 0.5
                     ):
-                        value = _at_an_edge(source, int(r), int(c), f_row[k], f_col[k], patch)
+                        value = _at_an_edge(source, int(r), int(c), f_row, f_col, across, down, k)
                     values[k] = value
                 for k in range(width):
                     value = np.floor(values[k] + np.float32(0.5))
@@ -233,9 +225,7 @@ def _resample(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sample(
-    source: NDArray[np.float32], first_row: int, first_col: int, down: Floats, across: Floats
-) -> float:
+def sample(source: Picture, first_row: int, first_col: int, down: Floats, across: Floats) -> float:
     """Weighted sum of source samples; NaN where a sample with weight is nodata or missing."""
     rows, cols = source.shape
     if (
@@ -268,7 +258,7 @@ def sample(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _resample_widened(
-    source: NDArray[np.float32],
+    source: Picture,
     lattice: Floats,
     step: int,
     scale: tuple[float, float],
@@ -306,7 +296,7 @@ def _resample_widened(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def resample(
-    source: NDArray[np.float32],
+    source: Picture,
     lattice: Floats,
     step: int,
     scale: tuple[float, float],

@@ -1,0 +1,201 @@
+"""Compiled least-squares matches of windows of two cubic B-splines."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...alignment.window_fit import (
+    centre,
+    gain_and_correlation,
+    normal_equations,
+    solve,
+    solve_two,
+    weighted_mean,
+)
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.float32]
+
+
+ITERATIONS = 15
+CONVERGED = 0.002  # px
+MOVE_PX = 1.5  # that a match may move from where SIFT has it
+STEEPEST = 0.6  # px of disparity per px
+LABELLED = 0.6  # of a window, by weight, where labels are held against a match
+LABEL_MOVE_PX = 3.0  # by which that may move the match: a window's middle may stand out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _taps(f: float, value: Floats, slope: Floats) -> None:
+    """Weights of four coefficients, the second of which lies ``f`` px before the position."""
+    g = 1.0 - f
+    value[0] = g * g * g / 6.0
+    value[1] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
+    value[2] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
+    value[3] = f * f * f / 6.0
+    slope[0] = -g * g / 2.0
+    slope[1] = (3.0 * f * f - 4.0 * f) / 2.0
+    slope[2] = (4.0 * g - 3.0 * g * g) / 2.0
+    slope[3] = f * f / 2.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats) -> bool:
+    """Fill ``out`` [3] by value and slopes of a spline; False next to its border and outside."""
+    if not (x >= 2.0 and y >= 2.0 and x <= c.shape[1] - 4.0 and y <= c.shape[0] - 4.0):
+        return False
+    i, j = int(np.floor(x)), int(np.floor(y))
+    _taps(x - i, taps[0], taps[1])
+    _taps(y - j, taps[2], taps[3])
+    value, along, down = 0.0, 0.0, 0.0
+    for b in range(4):
+        v, s = 0.0, 0.0
+        for a in range(4):
+            p = c[j - 1 + b, i - 1 + a]
+            v += taps[0, a] * p
+            s += taps[1, a] * p
+        value += taps[2, b] * v
+        along += taps[2, b] * s
+        down += taps[3, b] * v
+    out[0], out[1], out[2] = value, along, down
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _match(
+    left: Picture, right: Picture, weight: Floats, x0: int, y0: int, d: float, p: float, out: Floats
+) -> None:
+    """Fill ``out`` [6] by disparity, its slopes, parallax, sigma and correlation, or NaN.
+
+    ``left``, ``right``: splines; starts from disparity ``d`` and parallax ``p``.
+    """
+    side = weight.shape[0]
+    half, n = side // 2, side * side
+    out[:] = np.nan
+    taps = np.empty((4, 4))
+    a, b, weights = np.empty((n, 3)), np.empty((n, 3)), weight.reshape(-1)
+    moves = np.zeros((n, 2, 4))
+    moves[:, 0, 0], moves[:, 1, 3] = -1.0, 1.0
+    total = 0.0
+    for k in range(n):
+        u, v = k % side - half, k // side - half
+        if not _sample(left, float(x0 + u), float(y0 + v), taps, a[k]):
+            return
+        moves[k, 0, 1], moves[k, 0, 2] = -u, -v
+        total += weights[k]
+    mean_a = weighted_mean(a, weights)
+    at = np.array([d, 0.0, 0.0, p])
+    normal, rhs, middle = np.empty((4, 4)), np.empty(4), np.empty(4)
+    for _ in range(ITERATIONS):
+        for k in range(n):
+            u, v = k % side - half, k // side - half
+            x = x0 + u - (at[0] + at[1] * u + at[2] * v)
+            if not _sample(right, x, y0 + v + at[3], taps, b[k]):
+                return
+        mean_b = weighted_mean(b, weights)
+        gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)
+        if np.isnan(gain):
+            return
+        misfit = normal_equations(a, b, weights, mean_a, mean_b, gain, moves, normal, rhs, middle)
+        centre(normal, middle, total)
+        if not solve(normal, rhs):
+            return
+        at += rhs
+        if abs(at[0] - d) > MOVE_PX or abs(at[3] - p) > MOVE_PX:
+            return
+        if max(abs(at[1]), abs(at[2])) > STEEPEST:
+            return
+        if max(abs(rhs[0]), abs(rhs[3])) < CONVERGED:
+            out[:4] = at
+            out[4] = np.sqrt(misfit / (total - 4.0) * normal[0, 0])
+            out[5] = correlation
+            return
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def match_all(left: Picture, right: Picture, weight: Floats, start: Floats, out: Floats) -> None:
+    """:func:`_match` from each ``start`` [n, 4]: x, y, disparity, parallax; ``out`` is [n, 6]."""
+    for k in range(start.shape[0]):
+        x0, y0 = int(start[k, 0]), int(start[k, 1])
+        _match(left, right, weight, x0, y0, start[k, 2], start[k, 3], out[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _offset(
+    left: Picture,
+    right: Picture,
+    labels: Picture,
+    weight: Floats,
+    x0: int,
+    y0: int,
+    d: float,
+    p: float,
+    out: Floats,
+) -> None:
+    """Fill ``out`` [2] by label less disparity and correlation, or NaN; starts as :func:`_match`.
+
+    Unknowns are one offset of all labels of the window, and the parallax.
+    """
+    half = weight.shape[0] // 2
+    out[:] = np.nan
+    rows, cols = left.shape
+    if x0 - half < 2 or y0 - half < 2 or x0 + half > cols - 4 or y0 + half > rows - 4:
+        return
+    if np.isnan(labels[y0, x0]):
+        return
+    taps = np.empty((4, 4))
+    place, a, b = np.empty((weight.size, 2)), np.empty((weight.size, 3)), np.empty((weight.size, 3))
+    some = np.empty(weight.size)
+    n, total, whole = 0, 0.0, 0.0
+    for j in range(2 * half + 1):
+        for i in range(2 * half + 1):
+            x, y = x0 + i - half, y0 + j - half
+            whole += weight[j, i]
+            if np.isnan(labels[y, x]):
+                continue
+            place[n, 0], place[n, 1] = x - labels[y, x], y
+            _sample(left, float(x), float(y), taps, a[n])
+            some[n] = weight[j, i]
+            total += weight[j, i]
+            n += 1
+    if total < LABELLED * whole:
+        return
+    weights = some[:n]
+    moves = np.zeros((n, 2, 2))
+    moves[:, 0, 0], moves[:, 1, 1] = 1.0, 1.0
+    mean_a = weighted_mean(a, weights)
+    first = labels[y0, x0] - d
+    offset, parallax = first, p
+    normal, rhs, middle = np.empty((2, 2)), np.empty(2), np.empty(2)
+    for _ in range(ITERATIONS):
+        for k in range(n):
+            if not _sample(right, place[k, 0] + offset, place[k, 1] + parallax, taps, b[k]):
+                return
+        mean_b = weighted_mean(b, weights)
+        gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)
+        if np.isnan(gain):
+            return
+        normal_equations(a, b, weights, mean_a, mean_b, gain, moves, normal, rhs, middle)
+        centre(normal, middle, total)
+        along, down, det = solve_two(normal, rhs)
+        if np.isnan(det):
+            return
+        offset += along
+        parallax += down
+        if abs(offset - first) > LABEL_MOVE_PX or abs(parallax - p) > MOVE_PX:
+            return
+        if max(abs(along), abs(down)) < CONVERGED:
+            out[0], out[1] = offset, correlation
+            return
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def offset_all(
+    left: Picture, right: Picture, labels: Picture, weight: Floats, start: Floats, out: Floats
+) -> None:
+    """:func:`_offset` from each ``start`` [n, 4]: x, y, disparity, parallax; ``out`` is [n, 2]."""
+    for k in range(start.shape[0]):
+        x0, y0 = int(start[k, 0]), int(start[k, 1])
+        _offset(left, right, labels, weight, x0, y0, start[k, 2], start[k, 3], out[k])
