@@ -23,7 +23,7 @@ from ..dataset.warped_tile import warp_tile
 from ..epipolar.warping import CorrelationSum
 from ..error_statistics import ErrorSum
 from ..products import pictures
-from ..products.files import write_rows
+from ..products.files import write_table
 from ..products.grids import require_complete
 from ..products.rasters import read_tile
 from .scene_warping import SceneWarping, warp_scene
@@ -184,43 +184,37 @@ def evaluate_city(
         maps[found.scene].add(found)
     order = ("city", "tiles of class", "key points on", "scene", "tile")
     table = [table4_row(f"{city} ({kind})", errors) for kind, errors in by_kind.items() if errors]
-    write_rows(table4, TABLE4, table)
-    write_rows(
+    write_table(table4, table, TABLE4)
+    write_table(
         sift,
-        SIFT,
         [
             _sift_row(*key, pairs[key], sums[key])
             for key in sorted(sums, key=lambda key: order.index(key[0]))
         ],
+        SIFT,
     )
     by_scene = {scene: warp_scene(*stores) for scene, stores in scenes.items()}
     whole = SceneWarping()
     for warped in by_scene.values():
         whole.merge(warped)
-    write_rows(
-        warping,
-        WARPING,
-        [
-            _warping_row("city", city, whole),
-            *(_warping_row("scene", scene, warped) for scene, warped in by_scene.items()),
-            *(
-                dict(
-                    zip(
-                        WARPING,
-                        (
-                            "tile",
-                            row["tile"],
-                            row["class"],
-                            row["labelled_share"],
-                            row["count_labelled"],
-                            row["warp_correlation"],
-                        ),
-                    )
-                )
-                for row in rows
-            ),
-        ],
-    )
+    tile_rows = [
+        dict(
+            zip(
+                WARPING,
+                (
+                    "tile",
+                    row["tile"],
+                    row["class"],
+                    row["labelled_share"],
+                    row["count_labelled"],
+                    row["warp_correlation"],
+                ),
+            )
+        )
+        for row in rows
+    ]
+    scene_rows = [_warping_row("scene", scene, warped) for scene, warped in by_scene.items()]
+    write_table(warping, [_warping_row("city", city, whole), *scene_rows, *tile_rows], WARPING)
     _draw_sift(Path(sift_figure), city, by_kind, maps)
     _draw_warping(Path(warping_figure), city, Path(tiles), rows)
     return table

@@ -23,7 +23,7 @@ from ..epipolar.model import EpipolarModel
 from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
-from ..products.files import write_json, write_rows
+from ..products.files import write_json, write_table
 from ..products.grids import blocks, require_complete
 from ..products.rasters import read_tile
 
@@ -428,7 +428,7 @@ def evaluate_truth(
                 scene.disparity, scene.truth, scene.tiles, scene=scene.name, workers=workers
             )
         )
-    write_rows(csv_file, TABLE, table(result))
+    write_table(csv_file, table(result), TABLE)
     write_json(json_file, result.figures() | {"provenance": dict(provenance or {})})
     shown = result.all_tiles if result.tiles else result.whole
     row = table_row("", shown.total)
