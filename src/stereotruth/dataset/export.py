@@ -12,7 +12,7 @@ Rules for a pair, at its window of the scene's grid:
   complete images go under ``unlabelled/``.
 
 Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
-gates of :mod:`gates`, which flag tiles and scenes in the manifest and the summary.
+gates of :mod:`.quality_limits`, which flag tiles and scenes in the manifest and the summary.
 
 The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
 tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
@@ -40,7 +40,8 @@ from .quality_limits import NO_LIMITS, Limits, flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
 from .scene_stores import SceneFiles, open_stores
 from .sift_matches import MATCH_COLUMNS, match_rows
-from .splits import NONE, Place, scaled_counts, split_tiles
+from .split_names import NONE
+from .splits import Place, scaled_counts, split_tiles
 from .summary import in_counts, summarise
 from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
@@ -98,7 +99,8 @@ def export_city(
     flagged. ``building_share``: share of building pixels from which on a tile is of that class.
     ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
     matches. ``work``: folder in which finished tiles wait for a later call that would make the
-    same, by default a hidden one beside ``out_dir``. Returns a summary, see :func:`summary_lines`.
+    same, by default a hidden one beside ``out_dir``. Returns a summary, see
+    :func:`.summary.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.

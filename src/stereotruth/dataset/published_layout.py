@@ -17,7 +17,8 @@ from ..job import progress
 from ..products.files import whole_folder, write_table
 from ..products.provenance import file_sha256
 from .manifest import read_manifest
-from .splits import NO_TRUTH, NONE, SPLITS, TRUTH, shared_ground
+from .split_names import NO_TRUTH, NONE, SPLITS, TRUTH
+from .splits import shared_ground
 
 log = logging.getLogger("stereotruth")
 

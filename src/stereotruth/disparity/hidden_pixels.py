@@ -5,7 +5,7 @@ The paper (section III-C) removes hidden points by the correlation of image wind
 
 1. A pixel shows the surface that its centre sees. Points that others, nearer to the left camera
    (of larger disparity), surround in the left image are covered; the uncovered point nearest to
-   the centre tells the surface (:func:`seen_surface`).
+   the centre tells the surface (:func:`.seen_surface.seen_surface`).
 2. The scene is a grid of ground cells, each as high as the top surface of its points. Below its top
    a cell counts as solid, so that walls hide although no LiDAR point lies on them
    (:func:`build_surface`).
@@ -26,9 +26,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..lidar.point_store import Points
-from .one_surface import SURFACE_PX
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -347,7 +347,8 @@ def _is_hidden(
     """Does the ray from place (a, b) in [0, 1)² of cell (i, j) at height ``start`` hit a cell?
 
     (du, dv): cells per metre of rise; ``top``: no cell is higher (m). The cell of the start does
-    not count: what lies above the start there is the business of :func:`seen_surface`.
+    not count: what lies above the start there is the business of
+    :func:`.seen_surface.seen_surface`.
     """
     speed = np.sqrt(du * du + dv * dv)
     if speed < 1e-6:  # the camera stands in the zenith
@@ -467,7 +468,7 @@ def hidden_pixels(
 ) -> NDArray[np.uint8]:
     """Whether what each pixel of a window shows is hidden.
 
-    ``sums`` [pixels, 4] come from :func:`exact_sums` over the seen surfaces, pixels in row-major
+    ``sums`` [pixels, 4] are exact ones over the points of the seen surfaces, pixels in row-major
     order of ``rows`` x ``cols`` of the left epipolar grid. Returns uint8 [pixels]: 0 seen in both
     views (or no point), 1 hidden from the left, 2 hidden from the right.
     """

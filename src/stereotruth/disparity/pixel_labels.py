@@ -19,9 +19,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.model import EpipolarModel
+from ..epipolar.one_surface import SURFACE_PX
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .local_projection import LocalProjection
-from .one_surface import SURFACE_PX
 from .pixel_points import PX, PixelPoints
 from .right_view import MirroredModel
 

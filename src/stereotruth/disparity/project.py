@@ -40,6 +40,7 @@ from scipy.spatial import ConvexHull
 
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
+from ..epipolar.surface_correlation import surface_correlation
 from ..errors import InputError
 from ..job import BlockProgress
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
@@ -48,7 +49,7 @@ from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import describe, digest, source_digest
 from ..products.resumable_grids import BlockStore, making
 from .hidden_pixels import FILL_RADII, Rays, Surface, SurfaceBuilder, hidden_pixels
-from .image_agreement import outvoted, supported, surface_correlation, warp_to_left
+from .image_agreement import outvoted, supported, warp_to_left
 from .image_patches import Array2D, Patch, read_patch
 from .layers import layers
 from .local_projection import LocalProjection

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ...dataset.splits import SPLITS
+from ...dataset.split_names import SPLITS
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
 from ...products.files import replacing, whole_folder, write_table
