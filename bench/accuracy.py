@@ -7,7 +7,6 @@ left image with these points; in all, the right image is warped to the left.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import logging
 import shutil
@@ -24,6 +23,7 @@ from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.dataset import warped_tile
+from stereotruth.dataset.manifest import labelled_tiles
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
@@ -31,6 +31,7 @@ from stereotruth.error_statistics import LIMITS
 from stereotruth.errors import InputError
 from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
 from stereotruth.products.provenance import source_digest
 from stereotruth.simulate.cities import CITIES
@@ -215,8 +216,7 @@ def table4(city: str) -> list[dict[str, str]]:
     file = Path(f"results/evaluate/{city}/table4.csv")
     if not file.is_file():
         return []
-    with file.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+    return list(read_table(file))
 
 
 def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
@@ -327,14 +327,11 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
 
 def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
     """Correlation of each exported tile; pictures of the first ``count``."""
-    manifest = made.tiles / "manifest.csv"
-    if not manifest.is_file():
+    if not (made.tiles / "manifest.csv").is_file():
         return []
-    with manifest.open(newline="", encoding="utf-8") as stream:
-        rows = [r for r in csv.DictReader(stream) if r["scene"] == made.scene.scene]
     found = []
-    for k, row in enumerate(r for r in rows if r["complete"] == "yes"):
-        tile = warped_tile.warp_tile(made.tiles, row)
+    for k, of in enumerate(labelled_tiles(made.tiles, made.scene.scene)):
+        tile = warped_tile.warp_tile(made.tiles, of.row)
         found.append({"tile": tile.name, "correlation": f"{tile.correlation:.4f}"})
         if k < count:
             scene_warping.draw_panels(tile, folder / f"{tile.name}.png")

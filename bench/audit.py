@@ -21,6 +21,7 @@ import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from stereotruth.dataset.manifest import Tile
 from stereotruth.dataset.stereo_dataset import Pair, StereoDataset
 from stereotruth.evaluation.audit import sharing
 from stereotruth.evaluation.audit.conventions import label_values
@@ -67,11 +68,10 @@ def wrong_labels(labels: Labels, share: float, rng: np.random.Generator) -> Labe
 
 def with_hidden(labels: Labels, pair: Pair, truth: Path, share: float) -> Labels:
     """Labels, and exact disparities at a share of the pixels that the right view does not see."""
-    row = pair.row
-    store = require_complete(truth / row["city"] / f"{row['scene']}.zarr")
-    top, left, size = (int(row[name]) for name in ("row0", "col0", "size"))
-    window = slice(top, top + size), slice(left, left + size)
-    exact = store["disparity"][window] - float(row["right_offset_px"])
+    tile = Tile.of(pair.row)
+    store = require_complete(truth / tile.city / f"{tile.scene}.zarr")
+    window, size = tile.window, tile.size
+    exact = store["disparity"][window] - tile.right_offset_px
     hidden = (store["hidden"][window] > 0) & np.isfinite(exact) & ~np.isfinite(labels)
     if share < 1:
         patch = np.random.default_rng(1).random((size // 16 + 1, size // 16 + 1)) < share

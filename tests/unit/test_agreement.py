@@ -8,10 +8,10 @@ import pytest
 from stereotruth.disparity.image_agreement import (
     outvoted,
     supported,
-    surface_correlation,
     warp_to_left,
 )
 from stereotruth.disparity.image_patches import read_patch
+from stereotruth.epipolar.surface_correlation import surface_correlation
 
 LEVEL = np.zeros((2, 80, 80))
 

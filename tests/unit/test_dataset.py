@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.dataset.manifest import write_manifest
 from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
+from stereotruth.products.files import write_table
 
 SPLITS = ["train", "train", "val", "test", "none", "unlabelled"]
 
@@ -35,10 +35,12 @@ def make_city(folder: Path, prefix: str, *, east: float = 0.0) -> Path:
         }
         row = {
             "tile": f"{prefix}_{n}",
+            "city": prefix,
             "scene": prefix,
             "row0": 0,
             "col0": 64 * n,
             "size": 64,
+            "right_offset_px": 0,
             "complete": "yes" if complete else "no",
             "split": split if complete else "none",
             "disparity_rounding_px": "0.0150" if complete else "",
@@ -55,7 +57,7 @@ def make_city(folder: Path, prefix: str, *, east: float = 0.0) -> Path:
                 )
                 row[f"{kind}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
         rows.append(row)
-    write_manifest(folder / "manifest.csv", rows)
+    write_table(folder / "manifest.csv", rows)
     return folder
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.hidden_pixels import Rays, Surface, SurfaceBuilder, hidden_pixels
-from stereotruth.disparity.one_surface import SURFACE_PX
 from stereotruth.disparity.pixel_points import POINT, PX, PixelPoints
 from stereotruth.disparity.seen_surface import COVER_PX, MANY, MAX_COVER_PX, seen_surface
 from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.one_surface import SURFACE_PX
 from stereotruth.lidar.lattice import LATTICE_DEG
 from stereotruth.lidar.point_store import Points
 

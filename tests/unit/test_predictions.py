@@ -13,7 +13,8 @@ import pytest
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.benchmark.predictions import predict, read_prediction, read_record
+from stereotruth.matching.benchmark.prediction_files import read_prediction, read_record
+from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.products.rasters import read_disparity
 
 from .test_layouts import write

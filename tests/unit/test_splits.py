@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stereotruth.dataset.splits import SPLITS, Place, overlaps, scaled_counts, split_tiles
+from stereotruth.dataset.split_names import SPLITS
+from stereotruth.dataset.splits import Place, overlaps, scaled_counts, split_tiles
 
 PAPER = {
     "Shaoguan": (20, 5, 23),

@@ -41,7 +41,7 @@ def test_pixels_near_a_step_of_the_labels():
 def own(tmp_path):
     """A pair cut out of a scene at row 10, column 20, with status, classes and exact truth."""
     row = {"tile": "T_3", "scene": "T-1", "row0": "10", "col0": "20", "size": str(SIZE)}
-    row["right_offset_px"] = "-7"
+    row |= {"city": "Town", "split": "test", "complete": "yes", "right_offset_px": "-7"}
     pair = Pair("T_3", "Town", "test", tmp_path, tmp_path, tmp_path, row)
     status = np.full((SIZE, SIZE), Status.LABELLED, np.uint8)
     status[5, 30] = Status.HIDDEN_IN_RIGHT
@@ -56,6 +56,8 @@ def own(tmp_path):
         dtype="uint8",
     ) as target:
         target.write(status, 1)
+        meanings = ", ".join(f"{value:d} {value.name.lower()}" for value in Status)
+        target.update_tags(TIFFTAG_IMAGEDESCRIPTION=meanings)
     layers = {
         "project": {"surface_class": np.uint8},
         "truth": dict.fromkeys(("changed", "changed_right", "visible", "hidden"), np.uint8)

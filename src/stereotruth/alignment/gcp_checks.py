@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from ..epipolar.rpc import SensorModel
 from ..epipolar.rpc_files import read_rpc
 from ..errors import InputError
+from ..products.ungeoreferenced import open_raster
 from .control_points import ControlPoints
 from .robust_fit import MINIMAL, System
 
@@ -97,10 +96,8 @@ def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, 
     """The RPC of an image and its size (cols, rows)."""
     sensor = SensorModel(read_rpc(image))
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(image) as dataset:
-                return sensor, (dataset.width, dataset.height)
+        with open_raster(image) as dataset:
+            return sensor, (dataset.width, dataset.height)
     except RasterioError as error:
         raise InputError(
             f"cannot be opened as the {name} image{of} ({error})",

@@ -12,7 +12,7 @@ Rules for a pair, at its window of the scene's grid:
   complete images go under ``unlabelled/``.
 
 Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
-gates of :mod:`gates`, which flag tiles and scenes in the manifest and the summary.
+gates of :mod:`.quality_limits`, which flag tiles and scenes in the manifest and the summary.
 
 The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
 tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
@@ -20,11 +20,7 @@ tile) is that which gives most labelled pairs, then most pairs, then most labell
 
 from __future__ import annotations
 
-import csv
 import logging
-import os
-import shutil
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -34,29 +30,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning
 
 from ..errors import InputError
 from ..job import progress
-from ..products.files import replacing
-from ..products.locks import exclusive
+from ..products.files import growing_table, replacing, whole_folder, write_table
 from ..products.provenance import describe, file_sha256, source_digest
-from .manifest import write_manifest
 from .orientation import save
 from .quality_limits import NO_LIMITS, Limits, flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
 from .scene_stores import SceneFiles, open_stores
 from .sift_matches import MATCH_COLUMNS, match_rows
-from .splits import NONE, Place, scaled_counts, split_tiles
+from .split_names import NONE
+from .splits import Place, scaled_counts, split_tiles
 from .summary import in_counts, summarise
 from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
 from .windows import cell_step, choose_windows, scan_scene
 
 log = logging.getLogger("stereotruth")
-
-
-NONE_KIND, IMAGES, LABELLED = 0, 1, 2
 
 
 def _refuse_empty(
@@ -108,7 +99,8 @@ def export_city(
     flagged. ``building_share``: share of building pixels from which on a tile is of that class.
     ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
     matches. ``work``: folder in which finished tiles wait for a later call that would make the
-    same, by default a hidden one beside ``out_dir``. Returns a summary, see :func:`summary_lines`.
+    same, by default a hidden one beside ``out_dir``. Returns a summary, see
+    :func:`.summary.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
@@ -160,16 +152,16 @@ def export_city(
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=provenance,
     )
-    scratch = out.with_name(out.name + ".partial")
     with ExitStack() as stack:
-        stack.enter_context(exclusive(out))
-        shutil.rmtree(scratch, ignore_errors=True)
-        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
         # all appear when the tiles do: a job that outlives its run cannot be found halfway
-        matches, coverage, contact_sheet = (
+        table = None
+        if matches is not None:
+            table = stack.enter_context(growing_table(matches, MATCH_COLUMNS))
+        coverage, contact_sheet = (
             None if path is None else stack.enter_context(replacing(path))
-            for path in (matches, coverage, contact_sheet)
+            for path in (coverage, contact_sheet)
         )
+        scratch = stack.enter_context(whole_folder(out))
         kinds = {"left", "right", "disp", "status", "orientation"}
         if any(source.of_right is not None for source in sources):
             kinds |= set(RIGHT_FILES)
@@ -182,29 +174,23 @@ def export_city(
             return write_tile(scratch, *chosen[k], k, cut)
 
         written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in sources}
-        matches_file = Path(os.devnull) if matches is None else matches
-        with (
-            warnings.catch_warnings(),
-            matches_file.open("w", newline="", encoding="utf-8") as stream,
-            ThreadPoolExecutor(workers) as pool,
-        ):
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            writer = csv.DictWriter(stream, MATCH_COLUMNS, lineterminator="\n")
-            writer.writeheader()
+        with ThreadPoolExecutor(workers) as pool:
             numbers = range(len(chosen))
             done = progress(pool.map(write, numbers), len(chosen), f"{city}: tiles")
             for row, ring, checks in done:
                 written.append((row, ring))
-                if checks is not None:
+                if checks is None:
+                    continue
+                scene_checks[row["scene"]].add(checks)
+                if table is not None:
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
-                    writer.writerows(match_rows(head, checks.matches))
-                    scene_checks[row["scene"]].add(checks)
+                    table.writerows(match_rows(head, checks.matches))
         rows = [row for row, _ in written]
         splits = _split(written, parameters["split_counts"], seed, strict, city)
         gates = _gates(city, rows, scene_checks, quality, strict)
         summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
         summary["quality"] = gates
-        write_manifest(scratch / "manifest.csv", rows)
+        write_table(scratch / "manifest.csv", rows)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
             "provenance": provenance,
@@ -214,8 +200,6 @@ def export_city(
             draw_coverage(coverage, city, rows, scans)
         if contact_sheet is not None:
             draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
-        shutil.rmtree(out, ignore_errors=True)
-        scratch.rename(out)
         _forget_others(cut, rows)
     return summary
 

@@ -1,21 +1,55 @@
-"""The manifest of a city's tiles."""
+"""The manifest of a folder of tiles: a line per pair."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ..errors import InputError
+from ..products.files import read_table
 
 
-def write_manifest(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Rows of one kind as CSV; the columns are those of the first row."""
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+@dataclass(frozen=True)
+class Tile:
+    """A pair of a city, as its line of the manifest tells.
+
+    ``row0``, ``col0``: its upper-left pixel in the scene's grid; ``size``, ``right_offset_px`` in
+    px; ``labelled``: whether its labels are complete; ``row``: the whole line, as text.
+    """
+
+    name: str
+    city: str
+    scene: str
+    row0: int
+    col0: int
+    size: int
+    right_offset_px: int
+    labelled: bool
+    split: str
+    row: Mapping[str, str] = field(repr=False, compare=False)
+
+    @classmethod
+    def of(cls, row: Mapping[str, str]) -> Tile:
+        """From a line of the manifest."""
+        return cls(
+            name=row["tile"],
+            city=row["city"],
+            scene=row["scene"],
+            row0=int(row["row0"]),
+            col0=int(row["col0"]),
+            size=int(row["size"]),
+            right_offset_px=int(row["right_offset_px"]),
+            labelled=row["complete"] == "yes",
+            split=row["split"],
+            row=row,
+        )
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """[rows, cols] of the left image in the scene's grid."""
+        rows = slice(self.row0, self.row0 + self.size)
+        return rows, slice(self.col0, self.col0 + self.size)
 
 
 def read_manifest(folder: str | Path) -> list[dict[str, str]]:
@@ -25,24 +59,16 @@ def read_manifest(folder: str | Path) -> list[dict[str, str]]:
         raise InputError(
             "no manifest", file=path, remedy="make the folder with snakemake, tiles/<City>"
         )
-    with path.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+    return list(read_table(path))
 
 
-def labelled_tiles(tiles: Path, scene: str) -> list[dict[str, str]]:
-    """Manifest rows of a scene's labelled tiles."""
-    manifest = tiles / "manifest.csv"
+def labelled_tiles(folder: Path, scene: str) -> list[Tile]:
+    """A scene's labelled tiles. Raises InputError if there is no manifest."""
+    manifest = folder / "manifest.csv"
     try:
-        with manifest.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+        tiles = [Tile.of(row) for row in read_table(manifest)]
     except FileNotFoundError:
         raise InputError(
             "no manifest of tiles", file=manifest, remedy="run the export stage"
         ) from None
-    return [row for row in rows if row["scene"] == scene and row["complete"] == "yes"]
-
-
-def window_of(row: Mapping[str, str]) -> tuple[slice, slice]:
-    """Window [rows, cols] of a tile in its scene's grid; ``row`` is its line of the manifest."""
-    r, c, size = int(row["row0"]), int(row["col0"]), int(row["size"])
-    return slice(r, r + size), slice(c, c + size)
+    return [tile for tile in tiles if tile.scene == scene and tile.labelled]

@@ -14,9 +14,11 @@ from typing import Any
 
 from ..errors import InputError
 from ..job import progress
+from ..products.files import whole_folder, write_table
 from ..products.provenance import file_sha256
-from .manifest import read_manifest, write_manifest
-from .splits import NO_TRUTH, NONE, SPLITS, TRUTH, shared_ground
+from .manifest import read_manifest
+from .split_names import NO_TRUTH, NONE, SPLITS, TRUTH
+from .splits import shared_ground
 
 log = logging.getLogger("stereotruth")
 
@@ -82,9 +84,7 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
             else:
                 place, kinds = NO_TRUTH, ("left", "right")
             todo.append((folder, row, place, kinds))
-    scratch = out.with_name(out.name + ".partial")
-    shutil.rmtree(scratch, ignore_errors=True)
-    try:
+    with whole_folder(out) as scratch:
         for split in SPLITS:
             for kind in ("left", "right", "disp"):
                 (scratch / TRUTH / split / kind).mkdir(parents=True)
@@ -96,7 +96,7 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
         for a, b in shared:
             log.warning("%s and %s share ground and are in different splits", a, b)
         if rows:
-            write_manifest(scratch / "manifest.csv", rows)
+            write_table(scratch / "manifest.csv", rows)
         text = README.format(
             counts="\n".join(f"  {count:5d} pairs  {place}" for place, count in counts.items()),
             nodata=" or ".join(sorted(nodata)),
@@ -104,11 +104,6 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
             shared=f"Except: {shared}." if shared else "",
         )
         (scratch / "README.txt").write_text(text, encoding="utf-8")
-        shutil.rmtree(out, ignore_errors=True)
-        scratch.rename(out)
-    except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise
     for place, count in sorted(counts.items()):
         log.info("%s/%s: %d pairs", out, place, count)
     return {"pairs": dict(counts), "shared_ground": shared}

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning
 
 from ..products import pictures
 from ..products.pictures import colours, save_figure
+from ..products.rasters import read_disparity, read_image
 
 Picture = NDArray[np.uint8]
 
@@ -48,18 +46,12 @@ def draw_contact_sheet(
     labelled = [row for row in rows if row["complete"] == "yes"]
     picked = np.unique(np.linspace(0, len(labelled) - 1, CONTACT_TILES).round().astype(int))
     tiles = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        for row in (labelled[k] for k in picked):
-            arrays = {}
-            for kind in ("left", "right", "disp"):
-                with rasterio.open(folder / row[kind]) as dataset:
-                    arrays[kind] = dataset.read(1)
-            step = max(1, row["size"] // 256)
-            disparity = arrays["disp"][::step, ::step].astype(np.float32)
-            disparity = np.where(disparity == nodata, np.nan, disparity)
-            grey = [pictures.shrink(pictures.stretch(arrays[k]), 256) for k in ("left", "right")]
-            tiles.append((row["tile"], *grey, disparity))
+    for row in (labelled[k] for k in picked):
+        images = (read_image(folder / row[kind]) for kind in ("left", "right"))
+        grey = [pictures.shrink(pictures.stretch(image), 256) for image in images]
+        step = max(1, row["size"] // 256)
+        disparity = read_disparity(folder / row["disp"], nodata)[::step, ::step]
+        tiles.append((row["tile"], *grey, disparity))
     values = np.concatenate([tile[3][np.isfinite(tile[3])] for tile in tiles])
     limits = tuple(float(v) for v in np.percentile(values, (1, 99)))
     title = f"{city}: {len(tiles)} of {len(labelled)} labelled pairs"

@@ -10,7 +10,6 @@ beside it matters at the few places only where a split ends within a row.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-SPLITS = ("train", "val", "test")
-NONE = "none"
+from ..products.files import read_table
+from .manifest import Tile
+from .split_names import NONE, SPLITS
+
 # Footprints follow the heights on the tile's border; what leans across it by less than this many
 # pixels (a roof 30 m high in a view 5° off nadir at 0.65 m) does not count as shared.
 TOLERANCE_PX = 4.0
@@ -216,16 +217,12 @@ def shared_ground(*manifests: str | Path) -> list[tuple[str, str]]:
     """
     names, split, places = [], [], []
     for manifest in map(Path, manifests):
-        with manifest.open(newline="", encoding="utf-8") as stream:
-            for row in csv.DictReader(stream):
-                if row["split"] in SPLITS:
-                    sidecar = json.loads((manifest.parent / row["orientation"]).read_text("utf-8"))
-                    ring = np.array(sidecar["footprint"]["coordinates"][0][:-1])
-                    window = (int(row["row0"]), int(row["col0"]), int(row["size"]))
-                    places.append(Place(row["scene"], *window, ring))
-                    names.append(row["tile"])
-                    split.append(row["split"])
+        for tile in map(Tile.of, read_table(manifest)):
+            if tile.split in SPLITS:
+                file = manifest.parent / tile.row["orientation"]
+                sidecar = json.loads(file.read_text("utf-8"))
+                ring = np.array(sidecar["footprint"]["coordinates"][0][:-1])
+                places.append(Place(tile.scene, tile.row0, tile.col0, tile.size, ring))
+                names.append(tile.name)
+                split.append(tile.split)
     return [(names[i], names[j]) for i, j in overlaps(places) if split[i] != split[j]]
-
-
-TRUTH, NO_TRUTH = "with ground truth", "without ground truth"

@@ -17,7 +17,6 @@ the prefix of the name.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,8 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..products.files import read_table
 from ..products.rasters import read_disparity
-from .splits import NO_TRUTH, NONE, SPLITS
+from .split_names import NO_TRUTH, NONE, SPLITS
 
 LAYOUTS = ("stereotruth", "whu", "us3d")
 CITY_OF_PREFIX = {
@@ -171,9 +171,7 @@ def match_inside(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _of_manifest(root: Path) -> Iterator[Pair]:
-    with (root / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    for row in rows:
+    for row in read_table(root / "manifest.csv"):
         try:
             split = row["split"] if row["disp"] else NONE
             files = [root / row[kind] if row[kind] else None for kind in ("left", "right", "disp")]

@@ -21,7 +21,7 @@ from .orientation import orientation, save
 from .quality_limits import Limits
 from .scene_stores import SceneStores
 from .sift_matches import match_tile
-from .splits import NONE
+from .split_names import NONE
 from .tile_checks import TileChecks, check_cells
 from .tile_classes import tile_class
 from .windows import Window

@@ -5,8 +5,8 @@ each point. Where heights step, such a window mixes surfaces and fails although 
 Here the right image is brought to the left by the labels themselves, and windows hold the pixels of
 one surface only:
 
-- :func:`surface_correlation`: correlation coefficient of the left and the warped right image in a
-  window around each pixel, over the pixels of its surface;
+- :mod:`stereotruth.epipolar.surface_correlation`: correlation coefficient of the left and the
+  warped right image in a window around each pixel, over the pixels of its surface;
 - :func:`outvoted`: whether most pixels of the same surface around a pixel fail the threshold. A
   building that only the LiDAR or only the images have fails as a whole; single failures among
   agreeing pixels, by noise or in shadow, do not;
@@ -23,9 +23,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
 from ..epipolar.warping import warp_rows
 from .image_patches import Patch
-from .one_surface import BEND, SURFACE_PX
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -35,10 +36,6 @@ Bools = NDArray[np.bool_]
 VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
 SUPPORT = 0.6  # share of the neighbours with points that must carry the surface
-# Pixels of a row that are worked on at once, one per vector lane: each window's sums are added in
-# one order, whatever the block. 52 ns a pixel (window 9) against 240 window by window. What belongs
-# together lies at constant distances in one array: LLVM vectorises only if few may overlap.
-_BLOCK = 256
 
 
 def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
@@ -52,116 +49,18 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _of_block(disparity: Singles, slope: Singles, y: int, x0: int, size: int, c: Singles) -> None:
-    """``c`` [3 * _BLOCK]: disparity and slopes along x and y of ``size`` pixels of a row."""
-    for k in range(size):
-        c[k] = disparity[y, x0 + k]
-        c[_BLOCK + k] = slope[0, y, x0 + k]
-        c[2 * _BLOCK + k] = slope[1, y, x0 + k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _overlap(x0: int, size: int, cols: int, across: int) -> tuple[int, int]:
-    """Pixels [first, end) of a block whose neighbour ``across`` columns on lies in the image."""
-    return max(0, -across - x0), min(size, cols - across - x0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _tolerance(down: int, across: int) -> float:
-    return np.float32(SURFACE_PX + BEND * max(abs(down), abs(across)))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _correlation(
-    left: Singles, warped: Singles, disparity: Singles, slope: Singles, half: int, out: Singles
-) -> None:
-    rows, cols = left.shape
-    surface = np.empty(3 * _BLOCK, np.float32)
-    centre = np.empty(2 * _BLOCK, np.float32)
-    sums = np.empty(6 * _BLOCK, np.float32)
-    one, zero = np.float32(1.0), np.float32(0.0)
-    for y in range(rows):
-        for x0 in range(0, cols, _BLOCK):
-            size = min(_BLOCK, cols - x0)
-            _of_block(disparity, slope, y, x0, size, surface)
-            centre[:size] = left[y, x0 : x0 + size]
-            centre[_BLOCK : _BLOCK + size] = warped[y, x0 : x0 + size]
-            sums[:] = zero
-            for b in range(max(y - half, 0), min(y + half + 1, rows)):
-                down = np.float32(b - y)
-                for step in range(-half, half + 1):
-                    across, tolerance = np.float32(step), _tolerance(b - y, step)
-                    first, end = _overlap(x0, size, cols, step)
-                    d, uu, vv = (
-                        disparity[b, x0 + step + first : x0 + step + end],
-                        left[b, x0 + step + first : x0 + step + end],
-                        warped[b, x0 + step + first : x0 + step + end],
-                    )
-                    p, c, s = surface[first:], centre[first:], sums[first:]
-                    for k in range(d.size):
-                        plane = p[k] + across * p[_BLOCK + k] + down * p[2 * _BLOCK + k]
-                        same = one if abs(d[k] - plane) <= tolerance else zero
-                        u = (uu[k] - c[k]) * same
-                        v = (vv[k] - c[_BLOCK + k]) * same
-                        s[k] += same
-                        s[_BLOCK + k] += u
-                        s[2 * _BLOCK + k] += v
-                        s[3 * _BLOCK + k] += u * u
-                        s[4 * _BLOCK + k] += v * v
-                        s[5 * _BLOCK + k] += u * v
-            for k in range(size):
-                n, su, sv = sums[k], sums[_BLOCK + k], sums[2 * _BLOCK + k]
-                # A few pixels correlate by chance: they neither agree nor disagree.
-                if n < 2 * half + 1:
-                    out[y, x0 + k] = np.nan
-                    continue
-                suu = sums[3 * _BLOCK + k] - su * su / n
-                svv = sums[4 * _BLOCK + k] - sv * sv / n
-                suv = sums[5 * _BLOCK + k] - su * sv / n
-                out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
-
-
-def surface_correlation(
-    left: NDArray[np.floating],
-    warped: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    window: int,
-) -> Singles:
-    """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
-
-    ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
-    where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
-    px) is wide; 0 where either image is constant. In float32, about the centre's values: within
-    1e-5 of float64.
-    """
-    known = np.isfinite(warped)
-    disparity = np.where(known, disparity, np.float32(np.nan)).astype(np.float32, copy=False)
-    out = np.empty(left.shape, np.float32)
-    _correlation(
-        np.ascontiguousarray(left, dtype=np.float32),
-        np.where(known, warped, 0).astype(np.float32, copy=False),
-        disparity,
-        np.ascontiguousarray(slope, dtype=np.float32),
-        window // 2,
-        out,
-    )
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _outvoted(
     against: Singles, disparity: Singles, voters: Singles, slope: Singles, out: Bools
 ) -> None:
     """``voters``: disparity of the pixels that vote, else NaN; ``against``: 1 or 0."""
     rows, cols = disparity.shape
-    surface = np.empty(3 * _BLOCK, np.float32)
-    votes = np.empty(2 * _BLOCK, np.float32)
+    surface = np.empty(3 * BLOCK, np.float32)
+    votes = np.empty(2 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
-        for x0 in range(0, cols, _BLOCK):
-            size = min(_BLOCK, cols - x0)
-            _of_block(disparity, slope, y, x0, size, surface)
+        for x0 in range(0, cols, BLOCK):
+            size = min(BLOCK, cols - x0)
+            surface_of_row(disparity, slope, y, x0, size, surface)
             votes[:] = zero
             for step_down in range(-VOTE_PX, VOTE_PX + 1, VOTE_STEP):
                 b = y + step_down
@@ -169,18 +68,18 @@ def _outvoted(
                     continue
                 down = np.float32(step_down)
                 for step in range(-VOTE_PX, VOTE_PX + 1, VOTE_STEP):
-                    across, tolerance = np.float32(step), _tolerance(step_down, step)
-                    first, end = _overlap(x0, size, cols, step)
+                    across, tolerance = np.float32(step), tolerance_px(step_down, step)
+                    first, end = columns_inside(x0, size, cols, step)
                     d = voters[b, x0 + step + first : x0 + step + end]
                     no = against[b, x0 + step + first : x0 + step + end]
                     p, s = surface[first:], votes[first:]
                     for k in range(d.size):
-                        plane = p[k] + across * p[_BLOCK + k] + down * p[2 * _BLOCK + k]
+                        plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
                         same = one if abs(d[k] - plane) <= tolerance else zero
                         s[k] += same
-                        s[_BLOCK + k] += same * no[k]
+                        s[BLOCK + k] += same * no[k]
             for k in range(size):
-                out[y, x0 + k] = 2 * votes[_BLOCK + k] > votes[k]
+                out[y, x0 + k] = 2 * votes[BLOCK + k] > votes[k]
 
 
 def outvoted(

@@ -24,9 +24,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .hidden_pixels import Surface, SurfaceBuilder, hidden_pixels
-from .image_agreement import outvoted, supported, surface_correlation, warp_to_left
+from .image_agreement import outvoted, supported, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .paper_correlation import correlate

@@ -18,9 +18,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .local_projection import LocalProjection
-from .one_surface import SURFACE_PX
 from .pixel_points import PX, PixelPoints
 from .view_geometry import ViewGeometry
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .one_surface import SURFACE_PX
+from ..epipolar.one_surface import SURFACE_PX
 from .pixel_points import PX, PixelPoints
 
 Ints = NDArray[np.int64]

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from ..errors import InputError
+from ..products.ungeoreferenced import open_raster
 
 log = logging.getLogger("stereotruth")
 
@@ -37,7 +35,6 @@ class Source:
         self.path = Path(path)
         self._local = threading.local()
         self._opened: list[rasterio.DatasetReader] = []
-        self._lock = threading.Lock()
         dataset = self._dataset()
         self.size = (dataset.width, dataset.height)
         dtype = np.dtype(dataset.dtypes[0])
@@ -69,18 +66,16 @@ class Source:
 
     def _dataset(self) -> rasterio.DatasetReader:
         if not hasattr(self._local, "dataset"):
-            with self._lock, warnings.catch_warnings():  # which is not thread-safe by itself
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                try:
-                    dataset = rasterio.open(self.path)
-                except RasterioError as error:
-                    raise InputError(
-                        f"not a raster that GDAL can read ({error})",
-                        file=self.path,
-                        remedy="check the path and the file",
-                    ) from error
-                self._opened.append(dataset)
-                self._local.dataset = dataset
+            try:
+                dataset = open_raster(self.path)
+            except RasterioError as error:
+                raise InputError(
+                    f"not a raster that GDAL can read ({error})",
+                    file=self.path,
+                    remedy="check the path and the file",
+                ) from error
+            self._opened.append(dataset)
+            self._local.dataset = dataset
         return self._local.dataset
 
     def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import re
-import warnings
 from pathlib import Path
 from typing import Any
 
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from ..errors import InputError
+from ..products.ungeoreferenced import open_raster
 from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")
@@ -101,10 +100,7 @@ def read_rpc(image: str | Path) -> RPC:
             rpc = RPC.from_dict(parse(text))
         else:
             source = image
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                dataset = rasterio.open(image)
-            with dataset:
+            with open_raster(image) as dataset:
                 tags = {key.lower(): value for key, value in dataset.tags(ns="RPC").items()}
             if not tags:
                 raise InputError(

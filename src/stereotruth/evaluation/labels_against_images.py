@@ -1,12 +1,12 @@
 """What the images say about a city's labels (section IV of the paper): table 4, image warping.
 
-No truth is needed. SIFT matches were taken when the tiles were made (:mod:`sift`); they are read
-from their CSV file, summed up by class, scene and tile, and drawn.
+No truth is needed. SIFT matches were taken when the tiles were made
+(:mod:`stereotruth.dataset.sift_matches`); they are read from their CSV file, summed up by class,
+scene and tile, and drawn.
 """
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -16,14 +16,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..dataset.manifest import read_manifest
+from ..dataset.manifest import Tile, read_manifest
 from ..dataset.sift_matches import GROSS_PX
 from ..dataset.tile_classes import BUILDING, VEGETATION
 from ..dataset.warped_tile import warp_tile
 from ..epipolar.warping import CorrelationSum
 from ..error_statistics import ErrorSum
 from ..products import pictures
-from ..products.files import write_rows
+from ..products.files import read_table, write_table
 from ..products.grids import require_complete
 from ..products.rasters import read_tile
 from .scene_warping import SceneWarping, warp_scene
@@ -79,27 +79,26 @@ class Matches(NamedTuple):
     surface_class: NDArray[np.uint8]
 
 
-def read_matches(path: str | Path, rows: Iterable[Mapping[str, str]]) -> Iterator[Matches]:
-    """Matches of a CSV file of the export stage, tile by tile; ``rows``: those of the manifest."""
-    origin = {row["tile"]: (int(row["col0"]), int(row["row0"])) for row in rows}
-    with Path(path).open(newline="", encoding="utf-8") as stream:
-        for tile, lines in groupby(csv.DictReader(stream), key=lambda line: line["tile"]):
-            lines = list(lines)
-            column = {
-                name: np.array([float(line[name]) for line in lines])
-                for name in ("x", "y", "y_right", "error_px", "surface_class")
-            }
-            col0, row0 = origin[tile]
-            yield Matches(
-                tile=tile,
-                scene=lines[0]["scene"],
-                kind=lines[0]["class"],
-                error=column["error_px"],
-                y_parallax=column["y_right"] - column["y"],
-                x=column["x"] + col0,
-                y=column["y"] + row0,
-                surface_class=column["surface_class"].astype(np.uint8),
-            )
+def read_matches(path: str | Path, tiles: Iterable[Tile]) -> Iterator[Matches]:
+    """Matches of a CSV file of the export stage, tile by tile; ``tiles``: those of the manifest."""
+    origin = {tile.name: (tile.col0, tile.row0) for tile in tiles}
+    for name, lines in groupby(read_table(path), key=lambda line: line["tile"]):
+        lines = list(lines)
+        column = {
+            name: np.array([float(line[name]) for line in lines])
+            for name in ("x", "y", "y_right", "error_px", "surface_class")
+        }
+        col0, row0 = origin[name]
+        yield Matches(
+            tile=name,
+            scene=lines[0]["scene"],
+            kind=lines[0]["class"],
+            error=column["error_px"],
+            y_parallax=column["y_right"] - column["y"],
+            x=column["x"] + col0,
+            y=column["y"] + row0,
+            surface_class=column["surface_class"].astype(np.uint8),
+        )
 
 
 def _mean(values: Sequence[float]) -> float | str:
@@ -173,7 +172,7 @@ def evaluate_city(
             sums.setdefault((scope, name), ErrorSum()).add(errors)
             pairs[scope, name] = pairs.get((scope, name), 0) + 1
 
-    for found in read_matches(matches, rows):
+    for found in read_matches(matches, map(Tile.of, rows)):
         by_kind[found.kind].append(found.error)
         add("city", city, found.error)
         add("tiles of class", found.kind, found.error)
@@ -184,43 +183,37 @@ def evaluate_city(
         maps[found.scene].add(found)
     order = ("city", "tiles of class", "key points on", "scene", "tile")
     table = [table4_row(f"{city} ({kind})", errors) for kind, errors in by_kind.items() if errors]
-    write_rows(table4, TABLE4, table)
-    write_rows(
+    write_table(table4, table, TABLE4)
+    write_table(
         sift,
-        SIFT,
         [
             _sift_row(*key, pairs[key], sums[key])
             for key in sorted(sums, key=lambda key: order.index(key[0]))
         ],
+        SIFT,
     )
     by_scene = {scene: warp_scene(*stores) for scene, stores in scenes.items()}
     whole = SceneWarping()
     for warped in by_scene.values():
         whole.merge(warped)
-    write_rows(
-        warping,
-        WARPING,
-        [
-            _warping_row("city", city, whole),
-            *(_warping_row("scene", scene, warped) for scene, warped in by_scene.items()),
-            *(
-                dict(
-                    zip(
-                        WARPING,
-                        (
-                            "tile",
-                            row["tile"],
-                            row["class"],
-                            row["labelled_share"],
-                            row["count_labelled"],
-                            row["warp_correlation"],
-                        ),
-                    )
-                )
-                for row in rows
-            ),
-        ],
-    )
+    tile_rows = [
+        dict(
+            zip(
+                WARPING,
+                (
+                    "tile",
+                    row["tile"],
+                    row["class"],
+                    row["labelled_share"],
+                    row["count_labelled"],
+                    row["warp_correlation"],
+                ),
+            )
+        )
+        for row in rows
+    ]
+    scene_rows = [_warping_row("scene", scene, warped) for scene, warped in by_scene.items()]
+    write_table(warping, [_warping_row("city", city, whole), *scene_rows, *tile_rows], WARPING)
     _draw_sift(Path(sift_figure), city, by_kind, maps)
     _draw_warping(Path(warping_figure), city, Path(tiles), rows)
     return table

@@ -18,12 +18,12 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..dataset.manifest import labelled_tiles, window_of
+from ..dataset.manifest import Tile, labelled_tiles
 from ..epipolar.model import EpipolarModel
 from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
-from ..products.files import write_json, write_rows
+from ..products.files import write_json, write_table
 from ..products.grids import blocks, require_complete
 from ..products.rasters import read_tile
 
@@ -292,16 +292,16 @@ def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     return result
 
 
-def read_tile_labels(tiles: Path, row: Mapping[str, str], store: zarr.Group) -> Labels:
-    """Labels of an exported tile, ``row`` its line of the manifest.
+def read_tile_labels(tiles: Path, tile: Tile, store: zarr.Group) -> Labels:
+    """Labels of an exported tile.
 
     Its right offset is added to the disparity, px of the scene's grid. The uncertainty, which is
     not exported, is that of the disparity store.
     """
     return Labels(
-        read_tile(tiles / row["disp"]) + float(row["right_offset_px"]),
-        np.nan_to_num(read_tile(tiles / row["status"])).astype(np.uint8),
-        store["uncertainty"][window_of(row)].astype(np.float64),
+        read_tile(tiles / tile.row["disp"]) + tile.right_offset_px,
+        np.nan_to_num(read_tile(tiles / tile.row["status"])).astype(np.uint8),
+        store["uncertainty"][tile.window].astype(np.float64),
     )
 
 
@@ -337,14 +337,14 @@ def compare_scene(
     if tiles is not None:
         folder = Path(tiles)
 
-        def tile(row: Mapping[str, str]) -> ByClass:
-            here = Truth.read(true, *window_of(row))
-            return compare(read_tile_labels(folder, row, store), here, statuses)
+        def of_tile(tile: Tile) -> ByClass:
+            here = Truth.read(true, *tile.window)
+            return compare(read_tile_labels(folder, tile, store), here, statuses)
 
-        rows = labelled_tiles(folder, scene)
-        done = _mapped(tile, rows, workers, f"{scene}: tiles compared")
-        for row, part in zip(rows, done):
-            result.tiles[row["tile"]] = part.total
+        found = labelled_tiles(folder, scene)
+        done = _mapped(of_tile, found, workers, f"{scene}: tiles compared")
+        for tile, part in zip(found, done):
+            result.tiles[tile.name] = part.total
             result.all_tiles.merge(part)
     return result
 
@@ -428,7 +428,7 @@ def evaluate_truth(
                 scene.disparity, scene.truth, scene.tiles, scene=scene.name, workers=workers
             )
         )
-    write_rows(csv_file, TABLE, table(result))
+    write_table(csv_file, table(result), TABLE)
     write_json(json_file, result.figures() | {"provenance": dict(provenance or {})})
     shown = result.all_tiles if result.tiles else result.whole
     row = table_row("", shown.total)

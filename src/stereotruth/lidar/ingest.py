@@ -1,4 +1,4 @@
-"""LiDAR files to spatially ordered point stores, and exact box queries on these.
+"""LiDAR files to spatially ordered point stores.
 
 Every point lies on one global lattice: longitude and latitude in steps of 1e-9° (0.1 mm), height in
 steps of 1e-4 m. Sums over lattice integers are exact, so that nothing later depends on the order

@@ -15,7 +15,7 @@ from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..errors import InputError
 from ..products.grids import require_complete
-from .lattice import CELL_BITS, DEGREE_M, PER_DEG, PER_M, cell_key, lattice_box
+from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
 Integers = NDArray[np.int64]
@@ -205,50 +205,3 @@ def query_points(
             and store.bounds[3] >= lat_min
         ]
     )
-
-
-def coverage(stores: Sequence[PointStore]) -> np.ndarray:
-    """Boxes of the cells that hold points: float64[m, 4] of lon_min, lat_min, lon_max, lat_max.
-
-    Cells of different stores coincide (one global lattice); each is given once, south to north.
-    """
-    size = (1 << CELL_BITS) / PER_DEG
-    cells = np.unique(
-        np.concatenate([np.stack([s.cell_row, s.cell_col], axis=1) for s in stores]), axis=0
-    )
-    corner = cells[:, ::-1] * size
-    return np.hstack([corner, corner + size])
-
-
-def summary(stores: Sequence[PointStore]) -> dict[str, Any]:
-    """Counts, bounds and remarks over the stores of a scene.
-
-    ``points`` (header, read, kept, dropped by reason), ``bounds`` as in :class:`PointStore`,
-    ``covered_km2`` (area of the cells that hold points, rounded up to whole cells), ``notes`` by
-    source file.
-    """
-    bounds = np.array([store.bounds for store in stores])
-    points: dict[str, Any] = {"header": 0, "read": 0, "kept": 0, "dropped": {}}
-    for store in stores:
-        for name, value in store.attrs["points"].items():
-            if name == "dropped":
-                for reason, number in value.items():
-                    points["dropped"][reason] = points["dropped"].get(reason, 0) + number
-            else:
-                points[name] += value
-    boxes = coverage(stores)
-    width = np.diff(boxes[:, [0, 2]])[:, 0] * np.cos(np.radians(boxes[:, 1]))
-    return {
-        "files": [store.attrs["source"] for store in stores],
-        "points": points,
-        "bounds": [
-            *bounds[:, :2].min(0),
-            *bounds[:, 2:4].max(0),
-            bounds[:, 4].min(),
-            bounds[:, 5].max(),
-        ],
-        "covered_km2": float(
-            (width * np.diff(boxes[:, [1, 3]])[:, 0]).sum() * (DEGREE_M / 1e3) ** 2
-        ),
-        "notes": {store.attrs["source"]: store.attrs["notes"] for store in stores},
-    }

@@ -158,7 +158,8 @@ def to_wgs84(
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
-    ``lidar_crs``: see :func:`parse_crs`; ``geoid``: path of a grid for orthometric heights.
+    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``geoid``: path of a grid for orthometric
+    heights.
     Raises InputError: no or unusable coordinate system, orthometric heights without a geoid.
     """
     system, notes = resolve(header, lidar_crs or None, file)

@@ -3,8 +3,8 @@
 A method is a :class:`Matcher`. Kinds of entries (``benchmark.methods.<name>``):
 
 ==============================  ====================================================================
-``sgm``                         OpenCV's semi-global matching (:mod:`sgm`)
-``stereonet, psmnet, hmsmnet``  the networks (:mod:`networks`; needs PyTorch)
+``sgm``                         OpenCV's semi-global matching (:mod:`.sgm`)
+``stereonet, psmnet, hmsmnet``  the networks (:mod:`.networks`; needs PyTorch)
 ``function``                    the user's own, named by ``function``: ``package.module:name``
                                 (modules of the working directory are found), ``path.py:name``, or
                                 the entry point ``name`` of the group ``stereotruth.methods``

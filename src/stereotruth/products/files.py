@@ -1,4 +1,4 @@
-"""Files and folders that are whole or absent."""
+"""Files and folders that are whole or absent, and tables in CSV."""
 
 from __future__ import annotations
 
@@ -31,6 +31,26 @@ def replacing(path: str | Path) -> Iterator[Path]:
             scratch.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """An empty scratch folder beside ``path`` that takes its place if the block ends well.
+
+    If the block fails, the scratch folder goes and ``path`` stays as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f"{path.name}.partial")
+    with exclusive(path):
+        shutil.rmtree(scratch, ignore_errors=True)  # of a writer that was killed
+        scratch.mkdir()
+        try:
+            yield scratch
+            shutil.rmtree(path, ignore_errors=True)
+            scratch.rename(path)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
 def link(source: Path, target: Path) -> None:
     """Hard link, or a copy where the file system has none."""
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -40,12 +60,35 @@ def link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def write_rows(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """A CSV file, whole or absent."""
+@contextmanager
+def growing_table(
+    path: str | Path, columns: Iterable[str], line_end: str = "\n"
+) -> Iterator[csv.DictWriter]:
+    """A CSV file with its header, whole when the block ends well; its rows go to what is given."""
     with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(columns), lineterminator="\n")
+        writer = csv.DictWriter(stream, list(columns), lineterminator=line_end)
         writer.writeheader()
-        writer.writerows(rows)
+        yield writer
+
+
+def write_table(
+    path: str | Path,
+    rows: Iterable[Mapping[str, Any]],
+    columns: Iterable[str] | None = None,
+    line_end: str = "\n",
+) -> None:
+    """A CSV file, whole or absent; its columns are those of the first row, if none are given."""
+    rows = list(rows)
+    if columns is None:
+        columns = rows[0] if rows else ()
+    with growing_table(path, columns, line_end) as table:
+        table.writerows(rows)
+
+
+def read_table(path: str | Path) -> Iterator[dict[str, str]]:
+    """Rows of a CSV file, one after the other. Raises FileNotFoundError if there is none."""
+    with Path(path).open(newline="", encoding="utf-8") as stream:
+        yield from csv.DictReader(stream)
 
 
 def write_json(path: str | Path, values: Mapping[str, Any]) -> None:

@@ -1,13 +1,12 @@
-"""Products that are either whole or absent: files, and Zarr stores (pixel grids and others).
+"""Zarr stores that are whole or absent: pixel grids and others.
 
-A store is built beside its final place (``<name>.partial``), gets the attribute ``complete`` last
-and is then renamed, so that a killed run never leaves something that looks finished; the one
-opener of each kind of store checks that attribute. One process at a time makes a product.
+A store is built as :func:`.files.whole_folder` builds folders and gets the attribute ``complete``
+last, so that a killed run never leaves something that looks finished; the one opener of each kind
+of store checks that attribute.
 """
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,8 +19,7 @@ import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..errors import InputError
-from .files import replacing
-from .locks import exclusive
+from .files import replacing, whole_folder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,24 +54,14 @@ def compressor() -> BloscCodec:
 
 @contextmanager
 def building(path: str | Path) -> Iterator[Path]:
-    """A fresh scratch folder that becomes ``path`` if the block ends well, else it goes."""
-    path = Path(path)
-    scratch = path.with_name(path.name + ".partial")
-    with exclusive(path):
-        shutil.rmtree(scratch, ignore_errors=True)
-        scratch.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield scratch
-            group = zarr.open_group(scratch, mode="r+")
-            group.attrs["complete"] = True
-            with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
-                warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-                zarr.consolidate_metadata(group.store)
-            shutil.rmtree(path, ignore_errors=True)
-            scratch.rename(path)
-        except BaseException:
-            shutil.rmtree(scratch, ignore_errors=True)
-            raise
+    """An empty scratch folder whose store becomes ``path`` if the block ends well."""
+    with whole_folder(path) as scratch:
+        yield scratch
+        group = zarr.open_group(scratch, mode="r+")
+        group.attrs["complete"] = True
+        with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
+            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+            zarr.consolidate_metadata(group.store)
 
 
 def create_grid(

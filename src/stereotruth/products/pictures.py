@@ -1,4 +1,4 @@
-"""Quick looks: arrays to 8-bit pictures, panels, and the two figures of an exported city.
+"""Arrays to 8-bit pictures, pictures to data URIs, figures to files.
 
 Disparities are drawn in ``turbo``; pixels without a value are dark grey.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -70,26 +69,6 @@ def round_length(value: float) -> float:
     return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power
 
 
-def panels(rows: Sequence[Sequence[Picture]], gap: int = 4) -> Picture:
-    """Grey and colour pictures side by side and below each other, on white."""
-    height = [max(p.shape[0] for p in row) for row in rows]
-    width = [max(row[k].shape[1] for row in rows if k < len(row)) for k in range(len(rows[0]))]
-    sheet = np.full(
-        (sum(height) + gap * (len(height) - 1), sum(width) + gap * (len(width) - 1), 3),
-        255,
-        np.uint8,
-    )
-    for r, row in enumerate(rows):
-        top = sum(height[:r]) + gap * r
-        for c, picture in enumerate(row):
-            left = sum(width[:c]) + gap * c
-            h, w = picture.shape[:2]
-            sheet[top : top + h, left : left + w] = (
-                picture if picture.ndim == 3 else picture[..., None]
-            )
-    return sheet
-
-
 def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     """Write a matplotlib figure without any global state; no time or version goes into the file."""
     path = Path(path)
@@ -97,8 +76,6 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
 
-
-Picture = Picture
 
 QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+from rasterio.errors import RasterioIOError
 
 from ..errors import InputError
 from .files import replacing
+from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def write_tiff(
     rows, cols = array.shape
     integer = np.issubdtype(array.dtype, np.integer)
     options: dict[str, Any] = {"nbits": 16} if half else {}
-    with rasterio.open(
+    with open_raster(
         path,
         "w",
         driver="GTiff",
@@ -89,31 +90,40 @@ def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float
 
 
 def _opened(path: str | Path) -> rasterio.DatasetReader:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        try:
-            return rasterio.open(path)
-        except RasterioIOError as error:
-            raise InputError(
-                f"no image that can be read ({error})", file=path, remedy="copy the file anew"
-            ) from None
+    try:
+        return open_raster(path)
+    except RasterioIOError as error:
+        raise InputError(
+            f"no image that can be read ({error})", file=path, remedy="copy the file anew"
+        ) from None
 
 
 def read_tile(path: Path) -> Floats:
     """The band of an exported TIFF, float64[h, w]; NaN where it is nodata."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path) as dataset:
-            values = dataset.read(1).astype(np.float64)
-            values[values == dataset.nodata] = np.nan
-            return values
+    with open_raster(path) as dataset:
+        values = dataset.read(1).astype(np.float64)
+        values[values == dataset.nodata] = np.nan
+        return values
+
+
+def read_labels(path: str | Path) -> tuple[NDArray[Any], float | None]:
+    """The band of a label file as it is, and its nodata tag."""
+    with open_raster(path) as dataset:
+        return dataset.read(1), dataset.nodata
+
+
+def read_flags(path: str | Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
+    """The band of a file of flags as :func:`write_tiff` writes it, and what its values mean."""
+    with open_raster(path) as dataset:
+        text = dataset.tags().get("TIFFTAG_IMAGEDESCRIPTION", "")
+        return dataset.read(1), {int(v): n for v, n in re.findall(r"(\d+) (\w+)", text)}
 
 
 def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
     """Write a disparity map as a TIFF of 32-bit floats with nodata NaN."""
-    with replacing(path) as scratch, warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(
+    with (
+        replacing(path) as scratch,
+        open_raster(
             scratch,
             "w",
             driver="GTiff",
@@ -125,5 +135,6 @@ def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
             compress="deflate",
             predictor=3,
             tiled=True,
-        ) as target:
-            target.write(disparity, 1)
+        ) as target,
+    ):
+        target.write(disparity, 1)

@@ -112,7 +112,8 @@ class BlockStore:
                 files += [file] if name in sums else []
         layout = json.loads((self.folder / "layout.json").read_text())
         with building(path) as unfinished:
-            shutil.copytree(self.store, unfinished, ignore=_only_metadata(self))
+            metadata = _only_metadata(self)
+            shutil.copytree(self.store, unfinished, ignore=metadata, dirs_exist_ok=True)
             for file in files:
                 link(file, unfinished / file.relative_to(self.store))
             group = zarr.open_group(unfinished, mode="r+")
@@ -134,7 +135,7 @@ def making(
     shard: int,
     shared: bool = False,
 ) -> Iterator[BlockStore]:
-    """Work on the grid store that is to be at ``path``; see :func:`grid_store.create_grid`.
+    """Work on the grid store that is to be at ``path``; see :func:`.grids.create_grid`.
 
     Waits while another process works on it. ``shared``: this one makes a part of the blocks only,
     while others may make other parts.

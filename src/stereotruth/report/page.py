@@ -7,7 +7,6 @@ whose input is missing is left out. Equal input gives equal bytes.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from ..dataset import quick_looks
 from ..dataset.manifest import read_manifest
 from ..job import progress
 from ..products import pictures
-from ..products.files import replacing
+from ..products.files import read_table, replacing
 from ..products.html_tables import gate, minus, missed, table, words
 from . import drawings, sections, tile_pictures
 
@@ -39,8 +38,7 @@ def _rows(path: str | Path | None) -> list[dict[str, str]]:
     """Rows of a CSV file; none if there is no such file."""
     if path is None or not Path(path).is_file():
         return []
-    with Path(path).open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+    return list(read_table(path))
 
 
 def _record(path: str | Path | None) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..dataset import quick_looks
-from ..dataset.splits import NONE, SPLITS
+from ..dataset.manifest import Tile
+from ..dataset.split_names import NONE, SPLITS
 from ..products.html_tables import (
     Table,
     cells_of,
@@ -282,7 +283,7 @@ def tile_index(rows: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     found = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         here = [row for row in rows if row["scene"] == scene]
-        boxes = [(int(r["col0"]), int(r["row0"]), int(r["size"])) for r in here]
+        boxes = [(tile.col0, tile.row0, tile.size) for tile in map(Tile.of, here)]
         left, top = min(b[0] for b in boxes), min(b[1] for b in boxes)
         right, bottom = max(b[0] + b[2] for b in boxes), max(b[1] + b[2] for b in boxes)
         windows = [

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning
 
 from ..dataset.warped_tile import warp_tile
 from ..products import pictures
 from ..products.pictures import Picture, encode
-from ..products.rasters import read_tile
+from ..products.rasters import read_flags, read_tile
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
@@ -59,15 +55,6 @@ def status_colours(names: Sequence[str]) -> dict[str, str]:
     return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
 
 
-def read_status(path: Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
-    """Status values of a tile and what they mean, from the file's description."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path) as dataset:
-            text = dataset.tags().get("TIFFTAG_IMAGEDESCRIPTION", "")
-            return dataset.read(1), {int(v): n for v, n in re.findall(r"(\d+) (\w+)", text)}
-
-
 def _grey(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
     lut = np.rint(255.0 * np.linspace(0, 1, 256) ** GAMMA).astype(np.uint8)
     return lut[pictures.stretch(image, limits=limits)]
@@ -103,7 +90,7 @@ def tile_pictures(
         grey = _grey(np.nan_to_num(image), limits if name == "left" else _limits(right))
         result.uris[name] = encode(pictures.shrink(grey, side), size)
     if row.get("status"):
-        status, names = read_status(folder / row["status"])
+        status, names = read_flags(folder / row["status"])
         colours = status_colours(list(names.values()))
         table = np.zeros((256, 3), np.uint8)
         for value, name in names.items():

@@ -30,7 +30,7 @@ class _Builder:
         self.groups = 0
 
     def _near(self, x: float, y: float) -> bool:
-        """:func:`near_scenes` of one position, without arrays: most buildings end here."""
+        """:func:`.layout.near_scenes` of one position, without arrays: most buildings end here."""
         margin = self.city.margin_m - 40
         return any(
             abs((x - cx) * ax + (y - cy) * ay) < width + margin

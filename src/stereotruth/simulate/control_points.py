@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..products.files import replacing
+from ..products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .kernels import kernel
@@ -117,14 +116,6 @@ def _table(ready: ImagedScene, names: list[str], xyz: np.ndarray, image: np.ndar
     ]  # fmt: skip
 
 
-def write_table(path: str | Path, rows: list[dict]) -> None:
-    """Write points as CSV with the columns of FIELDS."""
-    with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def make_points(
     city: CitySpec, scene: SceneSpec, *, seed: int
 ) -> tuple[list[dict], list[dict], list[dict]]:
@@ -199,9 +190,9 @@ def simulate_points(
     """Write measured GCPs (unless None), exact GCPs and check points of a scene."""
     measured, exact, checks = make_points(city, scene, seed=seed)
     if gcps_csv is not None:
-        write_table(gcps_csv, measured)
-    write_table(gcps_exact_csv, exact)
-    write_table(checkpoints_csv, checks)
+        write_table(gcps_csv, measured, FIELDS)
+    write_table(gcps_exact_csv, exact, FIELDS)
+    write_table(checkpoints_csv, checks, FIELDS)
 
 
 def write_gcps(folder: str | Path, *, seed: int) -> list[Path]:
@@ -210,6 +201,6 @@ def write_gcps(folder: str | Path, *, seed: int) -> list[Path]:
     for city in CITIES.values():
         for scene in city.scenes:
             path = Path(folder) / f"{scene.name}.csv"
-            write_table(path, make_points(city, scene, seed=seed)[0])
+            write_table(path, make_points(city, scene, seed=seed)[0], FIELDS)
             written.append(path)
     return written

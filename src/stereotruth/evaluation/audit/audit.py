@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
-import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,18 +23,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rasterio.errors import NotGeoreferencedWarning
 
-from ...dataset.splits import SPLITS
+from ...dataset.split_names import SPLITS
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
-from ...products.files import replacing
+from ...products.files import replacing, whole_folder, write_table
 from ...products.finished_pieces import Ledger
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
+from .page import write_page
 from .pair import measure
 from .sharing import Features, Shared, features, find_shared
-from .summary import Audited, in_words, summarise, write_table
+from .summary import Audited, in_words, summarise, table_rows
 from .verdicts import FAULT, NOTE, Finding, Limits, judge
 
 log = logging.getLogger("stereotruth")
@@ -66,17 +64,12 @@ def audit(
     shared = find_shared(looks)
     audited = decide(pairs, measured, shared, limits)
     summary = summarise(dataset, audited, shared, limits)
-    scratch = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
-    write_table(scratch / "pairs.csv", audited)
-    (scratch / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
-    from .page import write_page
-
-    write_page(scratch / "index.html", dataset, audited, summary, limits, worst)
-    shutil.rmtree(out, ignore_errors=True)
-    scratch.rename(out)
+    text = json.dumps(summary, indent=2) + "\n"
+    with whole_folder(out) as scratch:
+        write_table(scratch / "pairs.csv", table_rows(audited))
+        (scratch / "summary.json").write_text(text, encoding="utf-8")
+        (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
+        write_page(scratch / "index.html", dataset, audited, summary, limits, worst)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary
@@ -107,8 +100,7 @@ def _measure_all(
             piece = ledger.put(pair.name, key, products, measure(dataset, pair))
         return piece.result
 
-    with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # here, as threads share filters
+    with ThreadPoolExecutor(workers) as pool:
         done = pool.map(one, pairs)
         return list(progress(done, len(pairs), f"{dataset.name}: pairs measured"))
 

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...disparity.one_surface import BEND, SURFACE_PX
+from ...epipolar.one_surface import BEND, SURFACE_PX
 from .estimates import Estimate, cells, ratio
 
 Bools = NDArray[np.bool_]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...disparity.one_surface import BEND, SURFACE_PX
+from ...epipolar.one_surface import BEND, SURFACE_PX
 from .estimates import Estimate, cells, ratio, share
 from .matches import Matches
 

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...disparity.image_agreement import surface_correlation
+from ...epipolar.surface_correlation import surface_correlation
 from ...epipolar.warping import warp_rows
 from .estimates import Estimate, cells, location
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ SIDE, BYTES = 460, 60_000  # of a picture
 DOT_PX = 3  # radius in the shown picture
 LIMIT_PX = 3.0  # ends of the colours of label less match
 ROW_LIMIT_PX = 1.5  # and of the vertical parallax
-NEGATIVE = re.compile(r"(?<!\w)-(?=\d)")  # in a text, the sign of a number
 ERRORS = "RdYlBu_r"
 COLUMNS = (
     "pair",

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
-from ...products.rasters import read_image
+from ...products.rasters import read_image, read_labels
 from . import conventions, hidden
 from .contradiction import REACH_PX, scan_labels
 from .estimates import NOTHING, Estimate, cells, robust_fit, scale_of
@@ -132,12 +129,8 @@ def _raw_labels(pair: Pair) -> tuple[NDArray[Any] | None, dict[str, Any]]:
     """The label file as it is, and what it says of itself."""
     if pair.disparity is None:
         return None, {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        source = rasterio.open(pair.disparity)
-    with source:
-        values = source.read(1)
-        return values, {"dtype": source.dtypes[0], "nodata_tag": source.nodata}
+    values, nodata = read_labels(pair.disparity)
+    return values, {"dtype": str(values.dtype), "nodata_tag": nodata}
 
 
 def _image(image: NDArray[Any]) -> dict[str, Any]:

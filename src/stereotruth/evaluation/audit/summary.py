@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -277,13 +274,3 @@ def _text(value: float | None) -> str:
     if value is None or not np.isfinite(value):
         return ""
     return str(value) if isinstance(value, int) else f"{value:.4f}"
-
-
-def write_table(path: Path, audited: Sequence[Audited]) -> None:
-    """Write ``pairs.csv``."""
-    rows = table_rows(audited)
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    path.write_text(stream.getvalue(), encoding="utf-8")

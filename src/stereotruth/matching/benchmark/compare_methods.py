@@ -13,7 +13,7 @@ from ...products.rasters import read_image
 from .differences import differences
 from .page import write_page
 from .panels import Column, draw_columns
-from .predictions import read_prediction
+from .prediction_files import read_prediction
 from .score_method import choose
 from .scores import Scorer
 from .tables import make_tables, read_scores, write_tables

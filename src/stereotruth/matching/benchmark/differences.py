@@ -8,7 +8,6 @@ pixels, holes filled, pooled.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...products.files import read_table
 from .scores import CONFIDENCE, MIN_TILES, resampled
 from .tables import FILLED, Table, with_interval
 
@@ -26,8 +26,7 @@ Row = dict[str, Any]
 
 def read_tiles(folder: str | Path, figures: Sequence[str]) -> dict[str, Sums]:
     """Sums by figure and tile of a method's ``scores.csv``; tiles without labels are left out."""
-    with (Path(folder) / "scores.csv").open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if int(row["labelled"])]
+    rows = [row for row in read_table(Path(folder) / "scores.csv") if int(row["labelled"])]
     return {
         name: {row["tile"]: int(row["labelled"]) * np.array([1, float(row[name])]) for row in rows}
         for name in figures

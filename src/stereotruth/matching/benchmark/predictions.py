@@ -15,7 +15,6 @@ import json
 import platform
 import re
 import resource
-import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -31,14 +30,14 @@ from numpy.typing import NDArray
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...errors import InputError
 from ...job import progress
-from ...products.files import link
+from ...products.files import link, whole_folder
 from ...products.finished_pieces import Ledger
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
 from ..kinds import FOLDER
 from ..methods import Matcher, make_method
+from .prediction_files import RECORD
 
-RECORD = "predictions.json"
 SUFFIXES = (".tif", ".tiff", ".npy", ".pfm")  # of a folder of results
 MB = 1 << 20
 
@@ -71,7 +70,7 @@ def predict(
     Raises InputError if a pair, the method or one of its results cannot be used.
     """
     pairs = dataset.pairs(split)
-    out, work = Path(out), Path(work)
+    work = Path(work)
     made_of = {
         "method": dict(settings),
         "files": [file_sha256(file) for file in files if Path(file).is_file()],
@@ -106,31 +105,16 @@ def predict(
         **_summary(found),
         "pairs": {pair: vars(of) for pair, of in found.items()},
     }
-    scratch = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(scratch, ignore_errors=True)
-    for pair in pairs:
-        link(work / f"{pair.name}.tiff", scratch / f"{pair.name}.tiff")
-    (scratch / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    shutil.rmtree(out, ignore_errors=True)
-    scratch.rename(out)
+    text = json.dumps(record, indent=2) + "\n"
+    with whole_folder(out) as scratch:
+        for pair in pairs:
+            link(work / f"{pair.name}.tiff", scratch / f"{pair.name}.tiff")
+        (scratch / RECORD).write_text(text, encoding="utf-8")
     ledger.keep_only(set(found))
     for file in work.glob("*.tiff"):
         if file.stem not in found:
             file.unlink()
     return record
-
-
-def read_record(folder: str | Path) -> dict[str, Any]:
-    """The record of a folder of predictions. Raises InputError if there is none."""
-    file = Path(folder) / RECORD
-    if not file.is_file():
-        raise InputError("no predictions", file=file, remedy="run rule match")
-    return json.loads(file.read_text(encoding="utf-8"))
-
-
-def read_prediction(folder: str | Path, pair: Pair) -> NDArray[np.float32]:
-    """A pair's prediction, float32[h, w] px, NaN where there is none."""
-    return read_disparity(Path(folder) / f"{pair.name}.tiff", np.nan)
 
 
 class _Runs:

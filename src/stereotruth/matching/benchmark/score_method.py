@@ -2,17 +2,15 @@
 
 scores.csv   a row per tile
 cities.csv   a row per city, and one of all, with 95 % confidence intervals
-strata.csv   a row per stratum (see :mod:`strata`), with confidence intervals
+strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
 scores.json  all of it but the tiles, with settings, time and memory
 panels/      pictures of tiles: left, right, truth, disparity, error
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,14 @@ import numpy as np
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
+from ...products.files import whole_folder, write_table
 from ...products.rasters import read_image
 from .panels import Column, draw_columns
-from .predictions import read_prediction, read_record
+from .prediction_files import read_prediction, read_record
 from .scores import ALL, Collector, Scorer, Scores
 from .strata import Products, exact_truth, label_strata
 
 log = logging.getLogger("stereotruth")
-Rows = list[dict[str, Any]]
 
 
 def score(
@@ -54,59 +52,55 @@ def score(
     Raises InputError if there are no labelled pairs, or files are missing.
     """
     pairs = dataset.pairs(split, labelled=True)
-    out, products = Path(out), products or Products()
+    products = products or Products()
     record = read_record(predictions)
     scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
     collector = Collector(thresholds_px)
-    scratch = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(scratch, ignore_errors=True)
     drawn = {pair.name for pair in choose(pairs, panels)}
-    for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
-        found, truth = read_prediction(predictions, pair), dataset.labels(pair)
-        sums = scorer.sums(found, truth, label_strata(pair, truth, products))
-        for stratum, exact in exact_truth(pair, products).items():
-            sums[stratum] = scorer.sums(found, exact)[ALL]
-        collector.add(pair.name, pair.city, sums)
-        if pair.name in drawn:
-            shown = np.where(scorer.counted(truth), truth, np.float32(np.nan))
-            column = Column(
-                pair.name, read_image(pair.left), read_image(pair.right), shown, {label: found}
-            )
-            draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
-    scores = collector.scores()
-    sampling = {"times": bootstrap, "seed": seed}
-    cities = [
-        _row(scores, {"city": city}, sampling, scores.in_city(city)) for city in _cities(scores)
-    ]
-    total = _row(scores, {"city": ALL}, sampling)
-    strata = [
-        _row(scores, {"stratum": name}, sampling, stratum=name)
-        for name in scores.strata
-        if scores.row(stratum=name)["labelled"]
-    ]
-    summary = {
-        "label": label,
-        "fine_tuned_of": fine_tuned_of,
-        **{key: record[key] for key in record if key != "pairs"},
-        "tiles": len(pairs),
-        "thresholds_px": list(scores.thresholds_px),
-        "bootstrap": bootstrap,
-        "all": total,
-        "cities": cities,
-        "strata": strata,
-    }
-    tiles = [
-        {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
-        for n, pair in enumerate(pairs)
-    ]
-    scratch.mkdir(exist_ok=True, parents=True)
-    _write(scratch / "scores.csv", tiles)
-    _write(scratch / "cities.csv", [*cities, total])
-    _write(scratch / "strata.csv", strata)
-    (scratch / "scores.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    shutil.rmtree(out, ignore_errors=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    scratch.rename(out)
+    with whole_folder(out) as scratch:
+        for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
+            found, truth = read_prediction(predictions, pair), dataset.labels(pair)
+            sums = scorer.sums(found, truth, label_strata(pair, truth, products))
+            for stratum, exact in exact_truth(pair, products).items():
+                sums[stratum] = scorer.sums(found, exact)[ALL]
+            collector.add(pair.name, pair.city, sums)
+            if pair.name in drawn:
+                shown = np.where(scorer.counted(truth), truth, np.float32(np.nan))
+                column = Column(
+                    pair.name, read_image(pair.left), read_image(pair.right), shown, {label: found}
+                )
+                draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
+        scores = collector.scores()
+        sampling = {"times": bootstrap, "seed": seed}
+        cities = [
+            _row(scores, {"city": city}, sampling, scores.in_city(city)) for city in _cities(scores)
+        ]
+        total = _row(scores, {"city": ALL}, sampling)
+        strata = [
+            _row(scores, {"stratum": name}, sampling, stratum=name)
+            for name in scores.strata
+            if scores.row(stratum=name)["labelled"]
+        ]
+        summary = {
+            "label": label,
+            "fine_tuned_of": fine_tuned_of,
+            **{key: record[key] for key in record if key != "pairs"},
+            "tiles": len(pairs),
+            "thresholds_px": list(scores.thresholds_px),
+            "bootstrap": bootstrap,
+            "all": total,
+            "cities": cities,
+            "strata": strata,
+        }
+        tiles = [
+            {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
+            for n, pair in enumerate(pairs)
+        ]
+        write_table(scratch / "scores.csv", tiles)
+        write_table(scratch / "cities.csv", [*cities, total])
+        write_table(scratch / "strata.csv", strata)
+        text = json.dumps(summary, indent=2) + "\n"
+        (scratch / "scores.json").write_text(text, encoding="utf-8")
     log.info("%s: %s", label, describe(summary))
     return summary
 
@@ -171,10 +165,3 @@ def _row(
         if key in intervals:
             row[f"{key}_low"], row[f"{key}_high"] = intervals[key] or (None, None)
     return row
-
-
-def _write(path: Path, rows: Rows) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]) if rows else [], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)

@@ -3,8 +3,8 @@
 Counted are the labelled pixels whose label lies in the disparity range, pooled over the pixels of
 all tiles. EPE is the mean absolute error, D1 the share of pixels with an error above a threshold.
 A method that leaves pixels invalid is scored twice: on the pixels that it says to be valid, and
-with its holes filled (:mod:`holes`); for a method without holes the two agree. Confidence intervals
-(95 %) come from resampling tiles, since pixels of one tile are not independent.
+with its holes filled (:mod:`.holes`); for a method without holes the two agree. Confidence
+intervals (95 %) come from resampling tiles, since pixels of one tile are not independent.
 
 Sums are kept by tile and stratum, in one array, and everything else is made of them.
 """
@@ -42,12 +42,6 @@ class Scores:
     strata: list[str]
     thresholds_px: tuple[float, ...]
     sums: Floats
-
-    @property
-    def quantities(self) -> list[str]:
-        """Names of the last axis of ``sums``."""
-        over = [f"over_{limit:g}_px" for limit in self.thresholds_px]
-        return ["labelled", "valid", *_both(["absolute", *over])]
 
     def row(self, where: Bools | None = None, stratum: str = ALL) -> dict[str, float | None]:
         """Figures pooled over the chosen tiles."""
@@ -114,7 +108,7 @@ class Scorer:
     """Scores predictions of one dataset.
 
     ``disparity_range``: px, first inclusive, second exclusive; ``grows_with_height``: see
-    :func:`holes.fill_holes`.
+    :func:`.holes.fill_holes`.
     """
 
     disparity_range: tuple[int, int]

@@ -27,10 +27,10 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from ...dataset.manifest import Tile
 from ...dataset.stereo_dataset import Pair, match_inside
-from ...disparity.status import Status
 from ...products.grids import require_complete
-from ...products.rasters import read_image
+from ...products.rasters import read_flags
 
 Bools = NDArray[np.bool_]
 
@@ -38,6 +38,7 @@ Bools = NDArray[np.bool_]
 NEAR_PX = 5
 STEP_PX = 3.0
 FAR_PX = np.float32(1e6)  # beyond any disparity
+HIDDEN = ("hidden_in_left", "hidden_in_right")  # of the meanings of a status
 WATER = 5  # of the layer surface of the exact truth
 CLASSES = {"ground": (2,), "vegetation": (3, 4, 5), "building": (6,)}  # ASPRS
 
@@ -50,13 +51,16 @@ class Products:
     project: Path | None = None
     truth: Path | None = None
 
-    def status(self, pair: Pair) -> NDArray[np.uint8] | None:
-        """Why pixels of a tile have no label."""
+    def hidden(self, pair: Pair) -> Bools | None:
+        """Pixels of a tile that only one view sees."""
         if self.tiles is None or not pair.row:
             return None
         prefix, _, number = pair.row["tile"].rpartition("_")
         file = self.tiles / pair.city / "status" / f"{prefix}_status_{number}.tiff"
-        return read_image(file) if file.is_file() else None
+        if not file.is_file():
+            return None
+        status, meanings = read_flags(file)
+        return np.isin(status, [value for value, name in meanings.items() if name in HIDDEN])
 
     def grid(self, folder: Path | None, pair: Pair) -> zarr.Group | None:
         """The store of a pair's scene in one of the folders."""
@@ -69,13 +73,12 @@ class Products:
 def label_strata(pair: Pair, labels: NDArray[np.float32], products: Products) -> dict[str, Bools]:
     """Masks [h, w] of the strata of a pair's labels (float32, NaN unlabelled)."""
     found = {"near_step": near_step(labels), **match_in_tile(labels)}
-    status = products.status(pair)
-    if status is not None:
-        hidden = np.isin(status, (Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT))
+    hidden = products.hidden(pair)
+    if hidden is not None:
         found["near_occlusion"] = cv2.dilate(hidden.astype(np.uint8), _square()) > 0
     grid = products.grid(products.project, pair)
     if grid is not None:
-        classes = grid["surface_class"][window(pair)]
+        classes = grid["surface_class"][Tile.of(pair.row).window]
         for name, codes in CLASSES.items():
             found[name] = np.isin(classes, codes)
         found["other"] = ~np.any([found[name] for name in CLASSES], axis=0)
@@ -87,22 +90,17 @@ def exact_truth(pair: Pair, products: Products) -> dict[str, NDArray[np.float32]
     grid = products.grid(products.truth, pair)
     if grid is None:
         return {}
-    here = window(pair)
+    tile = Tile.of(pair.row)
+    here = tile.window
     layer: dict[str, Any] = {name: grid[name][here] for name in ("changed", "changed_right")}
     same = (
         (layer["changed"] == 0) & (layer["changed_right"] == 0) & (grid["surface"][here] != WATER)
     )
-    disparity = grid["disparity"][here] - np.float32(pair.row["right_offset_px"])
+    disparity = grid["disparity"][here] - np.float32(tile.right_offset_px)
     return {
         f"exact_{name}": np.where(same & (grid[name][here] == 1), disparity, np.nan)
         for name in ("visible", "hidden")
     }
-
-
-def window(pair: Pair) -> tuple[slice, slice]:
-    """Rows and columns of a tile in its scene."""
-    row, col, size = (int(pair.row[key]) for key in ("row0", "col0", "size"))
-    return slice(row, row + size), slice(col, col + size)
 
 
 def match_in_tile(labels: NDArray[np.float32]) -> dict[str, Bools]:

@@ -8,8 +8,6 @@ the real WHU-Stereo, by methods trained on it), Markdown files what fits a page.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...products.files import replacing
+from ...products.files import replacing, write_table
 from ..kinds import LABELS
 from . import published_scores
 
@@ -37,14 +35,10 @@ class Table:
     rows: Sequence[Row]
     shown: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]]
 
-    def csv(self) -> str:
-        """All figures; columns in order of appearance."""
-        stream = io.StringIO()
-        columns = list(dict.fromkeys(key for row in self.rows for key in row)) or ["method"]
-        writer = csv.DictWriter(stream, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        return stream.getvalue()
+    @property
+    def columns(self) -> list[str]:
+        """Of the CSV file, in order of appearance."""
+        return list(dict.fromkeys(key for row in self.rows for key in row)) or ["method"]
 
     def markdown(self) -> str:
         """What is to be read."""
@@ -87,9 +81,9 @@ def make_tables(
 def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
     """``<name>.csv`` and ``<name>.md`` of each."""
     for table in tables:
-        for suffix, text in (("csv", table.csv()), ("md", table.markdown())):
-            with replacing(Path(folder) / f"{table.name}.{suffix}") as scratch:
-                scratch.write_text(text, encoding="utf-8")
+        write_table(Path(folder) / f"{table.name}.csv", table.rows, table.columns)
+        with replacing(Path(folder) / f"{table.name}.md") as scratch:
+            scratch.write_text(table.markdown(), encoding="utf-8")
 
 
 def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:

@@ -59,7 +59,7 @@ def mixed(precision: str, device: torch.device) -> Any:
 
 
 class NetworkMethod:
-    """A network with its weights as a method; see :class:`methods.Matcher`."""
+    """A network with its weights as a method; see :class:`stereotruth.matching.methods.Matcher`."""
 
     def __init__(
         self, model: SavedNetwork, network: nn.Module, device: torch.device, precision: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 
 from ...errors import InputError
-from ...products.files import replacing
+from ...products.files import replacing, write_table
 from .training_state import TrainingJob, read_state
 from .weights import load_weights, save_weights
 
@@ -42,13 +41,7 @@ def publish_training(job: TrainingJob, provenance: dict[str, Any]) -> dict[str, 
     }
     job.out.mkdir(parents=True, exist_ok=True)
     save_weights(job.out / "best.pt", model, network, {**provenance, **best})
-    with (
-        replacing(job.out / "curves.csv") as scratch,
-        scratch.open("w", newline="", encoding="utf-8") as stream,
-    ):
-        writer = csv.DictWriter(stream, CURVE)
-        writer.writeheader()
-        writer.writerows(state["curve"])
+    write_table(job.out / "curves.csv", state["curve"], CURVE, line_end="\r\n")
     with replacing(job.out / "training.json") as scratch:
         scratch.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     _draw(state["curve"], job.out / "curves.png", f"{model.kind}: {job.out.name}")

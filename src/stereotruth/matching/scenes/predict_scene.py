@@ -190,9 +190,9 @@ def predict_scene(
     """Write the disparity of a scene by a method as a Zarr grid; returns its summary.
 
     ``left_store``, ``right_store``: rectified images as `rectify` makes them. ``method``: a name
-    for messages; ``settings``: its configuration entry (:func:`methods.make_method`).
+    for messages; ``settings``: its configuration entry (:func:`..methods.make_method`).
     ``disparity_range``: px, of one tile; ``offset``: of the right image, px, or "auto"
-    (:mod:`offsets`). ``block_px``: a multiple of 256. ``margin_px``: None is the method's own.
+    (:mod:`.offsets`). ``block_px``: a multiple of 256. ``margin_px``: None is the method's own.
     ``workers`` tiles are worked on at once by SGM, while networks and functions get that many
     threads. ``scheduler`` is what Dask's compute takes. ``code``: digest of the source, for the
     provenance.

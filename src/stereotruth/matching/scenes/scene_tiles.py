@@ -23,7 +23,7 @@ SAME_PX, OTHER_PX = 2.0, 4.0
 
 
 def _padded(part: Any, window: Window, shape: tuple[int, int]) -> NDArray[Any]:
-    """A part that :func:`inside` gave as the whole window, 0 beyond the image of ``shape``."""
+    """A part that :func:`.tiling.inside` gave as the whole window, 0 beyond the image's ``shape``."""
     part = np.asarray(part)
     sizes = tuple(w.stop - w.start for w in window)
     if part.shape[:2] == sizes:
@@ -52,7 +52,7 @@ def predict_tile(
 ) -> Disparities:
     """The tile at a place, float32[side, side], NaN where invalid or beyond the grid.
 
-    ``left``, ``right``: the parts of the images that the ``view`` meets (:func:`inside`).
+    ``left``, ``right``: the parts of the images that the ``view`` meets (:func:`.tiling.inside`).
     """
     left = _padded(left, view.left, tiling.shape)
     right = _padded(right, view.right, tiling.shape)

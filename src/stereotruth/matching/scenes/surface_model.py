@@ -318,8 +318,8 @@ def write_dsm(
     """Write the surface model of a predicted scene as a GeoTIFF; returns its summary.
 
     ``disparity_store``: a grid with ``disparity`` and the epipolar model in its attributes, of
-    :func:`scenes.predict_scene` or `project`. ``resolution_m``: side of a cell; None: that of a
-    pixel of the coarser image on the ground, to two digits. Heights are float32 m above the
+    :func:`.predict_scene.predict_scene` or `project`. ``resolution_m``: side of a cell; None: that
+    of a pixel of the coarser image on the ground, to two digits. Heights are float32 m above the
     WGS 84 ellipsoid at the centres of the cells, nodata -9999, in the UTM zone of the scene.
     ``scheduler`` is what Dask's compute takes.
 

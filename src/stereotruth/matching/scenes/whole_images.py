@@ -44,7 +44,7 @@ def match(
     Of NumPy arrays the disparity itself, float32[h, w] px (NaN: invalid); of Dask arrays a lazy
     array in chunks of ``block``, whose memory is that of some tiles. ``offset``: of the right
     image, px; one for all, one for each block [n, m], or "auto": found from the images within the
-    ``search`` range, see :mod:`offsets`.
+    ``search`` range, see :mod:`.offsets`.
     """
     import dask
     import dask.array as da
