@@ -1,117 +1,19 @@
-from __future__ import annotations
+"""Alignments from control points: known biases, blunders, uncertainty, refusals."""
 
-import csv
-import json
-from pathlib import Path
+from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
-import rasterio
 
 from stereotruth.alignment.align import RPC_SHIFT, align, from_rpcs
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.control_points import COLUMNS, read_gcps
-from stereotruth.alignment.robust_fit import System, find_blunders
-from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
 
-SHARED = Path(__file__).parents[3] / "shared"
-MARSEILLE = SHARED / "real" / "marseille"
-LON, LAT, HEIGHT = 115.4, 30.2, 60.0
-SIZES = {"left": (4000, 3000), "right": (3600, 2800)}
-TRUE = {
-    "left": np.array([[1.0002, -0.0001, 6.3], [0.0001, 0.9999, -4.1]]),
-    "right": np.array([[0.9998, 0.0002, -3.7], [-0.0001, 1.0001, 8.8]]),
-}
-
-
-def linear_rpc(gsd: float, angle_deg: float, size: tuple[int, int]) -> RPC:
-    """Parallel rays, no rotation: col to the east, row to the south, parallax along rows."""
-    cols, rows = size
-    east, north = 111320.0 * np.cos(np.radians(LAT)), 110950.0
-    one = np.eye(20)[0]
-    samp, line = np.zeros(20), np.zeros(20)
-    lon_scale, lat_scale, height_scale = 0.02, 0.02, 500.0
-    samp[1] = lon_scale * east / gsd / (cols / 2)
-    line[2] = -lat_scale * north / gsd / (rows / 2)
-    line[3] = height_scale * np.tan(np.radians(angle_deg)) / gsd / (rows / 2)
-    return RPC(
-        line_off=(rows - 1) / 2,
-        samp_off=(cols - 1) / 2,
-        lat_off=LAT,
-        long_off=LON,
-        height_off=HEIGHT,
-        line_scale=rows / 2,
-        samp_scale=cols / 2,
-        lat_scale=lat_scale,
-        long_scale=lon_scale,
-        height_scale=height_scale,
-        line_num_coeff=line,
-        line_den_coeff=one,
-        samp_num_coeff=samp,
-        samp_den_coeff=one,
-    )
-
-
-RPCS = {
-    "left": linear_rpc(0.65, -5.0, SIZES["left"]),
-    "right": linear_rpc(0.80, 26.0, SIZES["right"]),
-}
-
-
-def write_image(path: Path, rpc: RPC, size: tuple[int, int]) -> Path:
-    def text(value) -> str:
-        return " ".join(repr(float(v)) for v in np.atleast_1d(value))
-
-    tags = {name.upper(): text(value) for name, value in rpc.to_dict().items()}
-    options = {"count": 1, "dtype": "uint16", "sparse_ok": True, "tiled": True}
-    with rasterio.open(path, "w", driver="GTiff", width=size[0], height=size[1], **options) as ds:
-        ds.update_tags(ns="RPC", ERR_BIAS="-1", ERR_RAND="-1", **tags)
-    return path
-
-
-@pytest.fixture(scope="module")
-def images(tmp_path_factory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("pair")
-    return {v: write_image(folder / f"{v}.tif", RPCS[v], SIZES[v]) for v in ("left", "right")}
-
-
-def make_gcps(n: int = 15, noise: float = 0.25, seed: int = 1, true=TRUE) -> list[dict]:
-    """GCPs spread over the common ground, as rows of the CSV."""
-    rng = np.random.default_rng(seed)
-    side = int(np.ceil(np.sqrt(n)))
-    cells = rng.permutation(side * side)[:n]
-    u, v = (cells % side + 0.5) / side - 0.5, (cells // side + 0.5) / side - 0.5
-    jitter = rng.uniform(-0.3, 0.3, (2, n)) / side
-    lon, lat = LON + 0.022 * (u + jitter[0]), LAT + 0.014 * (v + jitter[1])
-    height = rng.uniform(30, 110, n)
-    rows = []
-    for i in range(n):
-        row = {"id": f"G{i + 1:02d}", "lon": lon[i], "lat": lat[i], "height": height[i]}
-        for view in ("left", "right"):
-            col_row = SensorModel(RPCS[view], true[view]).project(lon[i], lat[i], height[i])
-            col_row = np.array(col_row) + noise * rng.standard_normal(2)
-            row[f"{view}_col"], row[f"{view}_row"] = col_row
-        rows.append(row)
-    return rows
-
-
-def write_gcps(path: Path, rows: list[dict]) -> Path:
-    with path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS)
-        writer.writeheader()
-        writer.writerows(
-            {k: f"{v:.10f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows
-        )
-    return path
-
-
-def run(images, tmp_path, rows, **options) -> Alignment:
-    file = write_gcps(tmp_path / "gcps.csv", rows)
-    options.setdefault("provenance", {})
-    return align(images["left"], images["right"], file, scene="Test-1", **options)
+from ...synthetic.real_data import MARSEILLE
+from ...synthetic.surveyed_pair import HEIGHT, LAT, LON, RPCS, SIZES, TRUE, change, make_gcps, run
 
 
 def corner_error(affine: np.ndarray, true: np.ndarray, size: tuple[int, int]) -> float:
@@ -151,19 +53,6 @@ def test_same_as_opencv_on_clean_points(images, tmp_path):
         measured = np.array([g.measured for g in fit.gcps])
         theirs, _ = cv2.estimateAffine2D(predicted, measured, refineIters=100)
         assert corner_error(fit.affine, theirs, fit.size) < 0.02
-
-
-def test_good_points_with_noise_are_never_thrown_away():
-    """300 random sets of 4 to 20 points with 0.25 px noise."""
-    rng = np.random.default_rng(5)
-    thrown = 0
-    for k in range(300):
-        n = int(rng.integers(4, 21))
-        predicted = rng.uniform(0, 3000, (n, 2))
-        measured = predicted + [5, -8] + 0.25 * rng.standard_normal((n, 2))
-        used, _, _ = find_blunders(System.of("affine", predicted, measured), floor=1.25, seed=k)
-        thrown += int((~used).sum())
-    assert thrown == 0
 
 
 def test_order_of_the_points_changes_nothing(images, tmp_path):
@@ -250,16 +139,6 @@ def test_too_many_blunders_are_refused(images, tmp_path):
         run(images, tmp_path, rows)
 
 
-def test_points_of_another_place_are_refused(images, tmp_path):
-    rng = np.random.default_rng(3)
-    rows = make_gcps(12)
-    for row in rows:
-        row["left_col"] += rng.normal(0, 30)
-        row["left_row"] += rng.normal(0, 30)
-    with pytest.raises(InputError, match=r"contradict|do not fit"):
-        run(images, tmp_path, rows)
-
-
 # --------------------------------------------------------------------------------- statistics
 
 
@@ -293,38 +172,6 @@ def test_covariance_predicts_the_spread_over_many_measurements(images, tmp_path)
     expected = np.sqrt(np.mean(predicted, axis=0).diagonal())
     assert np.allclose(spread, expected, rtol=0.2)
     assert fit.covariance_at(np.zeros((3, 2)), 5.0).shape == (3, 2, 2, 2)
-
-
-def test_json_keeps_everything(images, tmp_path):
-    rows = make_gcps(10)
-    rows[2]["left_col"] += 20.0
-    rows[3]["right_col"] = rows[3]["right_row"] = ""
-    result = run(images, tmp_path, rows)
-    paths = [tmp_path / f"residuals.{ext}" for ext in ("json", "csv", "png")]
-    write_alignment(result, *paths)
-    again = Alignment.load(paths[0])
-    assert again.to_dict() == result.to_dict()
-    assert np.array_equal(again.left.packed(), result.left.packed())
-    heights = [row["height"] for row in rows]  # each is used in one view at least
-    assert again.reference_height == pytest.approx(np.mean(heights), abs=1e-3)
-    assert json.loads(paths[0].read_text())["left"]["left_out"] == ["G03"]
-    with paths[1].open() as stream:
-        table = list(csv.DictReader(stream))
-    assert len(table) == 19
-    assert [row["id"] for row in table if row["used"] == "no"] == ["G03"]
-    assert abs(float(table[0]["before_col_px"])) > 3 > abs(float(table[0]["after_col_px"]))
-    assert cv2.imread(str(paths[2])).shape[0] > 800
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
-        ["gcps.csv", *(p.name for p in paths)]
-    )
-
-
-# ----------------------------------------------------------------------------------- refusals
-
-
-def change(rows, **cells):
-    rows[5].update(cells)
-    return rows
 
 
 def collinear(n: int = 12) -> list[dict]:
@@ -412,89 +259,6 @@ def test_without_gcps_the_rpcs_stand_with_their_uncertainty(images, tmp_path):
     again = Alignment.load(files[0])
     assert again.to_dict() == alignment.to_dict()
     assert np.isnan(again.left_fit.sigma0) and np.isnan(again.left_fit.rms("after"))
-
-
-def test_swapped_images_are_recognised(images, tmp_path):
-    file = write_gcps(tmp_path / "gcps.csv", make_gcps())
-    with pytest.raises(InputError, match="left_image and right_image seem to be swapped"):
-        align(images["right"], images["left"], file, scene="Test-1")
-
-
-def test_swapped_lon_lat_is_recognised_where_both_are_possible(tmp_path, images):
-    """Near lon 30, lat 30 either could be either: only the images tell."""
-    rpc = RPC.from_dict(RPCS["left"].to_dict() | {"long_off": 35.0})
-    pair = [write_image(tmp_path / f"{v}.tif", rpc, SIZES["left"]) for v in ("left", "right")]
-    rows = make_gcps()
-    for row in rows:
-        row["lon"], row["lat"] = row["lat"], row["lon"] - 80.4
-    with pytest.raises(InputError, match="lon and lat of the GCPs seem to be swapped"):
-        align(*pair, write_gcps(tmp_path / "gcps.csv", rows))
-
-
-def test_single_point_elsewhere_is_left_out(images, tmp_path):
-    rows = make_gcps()
-    rows[5]["lon"] -= 1.0
-    result = run(images, tmp_path, rows)
-    assert len(result.left_fit.gcps) == 14
-    assert any("G06 left out" in text for text in result.warnings)
-
-
-def test_large_shift_and_tilt_are_doubted(images, tmp_path):
-    true = {**TRUE, "left": TRUE["left"] + [[0.008, 0, 250.0], [0, 0, 0]]}
-    result = run(images, tmp_path, make_gcps(true=true))
-    assert any("off by" in text for text in result.warnings)
-    assert any("scale or angle" in text for text in result.warnings)
-
-
-# -------------------------------------------------------------------------------------- files
-
-
-def test_files_of_spreadsheets_are_read(tmp_path):
-    file = tmp_path / "gcps.csv"
-    text = (
-        "id, lon ,lat,height,left_col,left_row,right_col,right_row\r\n"
-        ' B , 115.1,30.2, 5e1 ,"1.5", 2.5,,\r\n\r\n'
-        "A,115.3,30.4,70,,,10,-0.25\r\n,,,,,,,\r\n"
-    )
-    file.write_bytes(b"\xef\xbb\xbf" + text.encode())
-    points = read_gcps(file)
-    assert points.ids == ("A", "B")
-    assert points.line == (4, 2)
-    assert points.lon.tolist() == [115.3, 115.1]
-    assert points.height.tolist() == [70.0, 50.0]
-    assert points.left[1].tolist() == [1.5, 2.5]
-    assert points.in_left.tolist() == [False, True]
-    assert points.in_right.tolist() == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "the file is empty"),
-        ("id;lon;lat;height;left_col;left_row;right_col;right_row\n", "not separated by commas"),
-        ("id,lon,lat,height,left_col,left_row,right_col\n", "'right_row' is missing"),
-        (",".join(COLUMNS) + ",note\n", "'note' is unknown"),
-        (",".join(COLUMNS) + "\nA,1,2,3,4,5,6\n", "line 2 has 7 cells for 8 columns"),
-    ],
-)
-def test_malformed_files_are_refused(tmp_path, content, message):
-    file = tmp_path / "gcps.csv"
-    file.write_text(content)
-    with pytest.raises(InputError, match=message):
-        read_gcps(file, "Test-1")
-
-
-def test_missing_and_binary_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_gcps(tmp_path / "none.csv")
-    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00i")
-    with pytest.raises(InputError, match="UTF-8"):
-        read_gcps(tmp_path / "x.csv")
-    with pytest.raises(InputError, match="no such alignment"):
-        Alignment.load(tmp_path / "none.json")
-    (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(InputError, match="not an alignment"):
-        Alignment.load(tmp_path / "x.json")
 
 
 # ---------------------------------------------------------------------------------- real scene

@@ -10,25 +10,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.alignment.adjustment import estimate
-from stereotruth.alignment.aligned_pair import Alignment, GcpResidual, ViewFit
+from stereotruth.alignment.aligned_pair import Alignment, GcpResidual
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
 
-from .test_disparity import write_points
-from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
-from .test_rpc import write_image
+from ...synthetic.box_scene import write_points
+from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
+from ...synthetic.images import write_image
+from ...synthetic.textured_pair import NONE, SIZE, TRUE, start, surface
 
-SIZE = (760, 700)  # cols, rows of both images
-TRUE = (camera(BACKWARD, size=SIZE), camera(FORWARD, angle=2.0, gsd=0.8, size=SIZE))
 SHIFT = np.array([0.0, 0.0, 1.0])
-
-
-def surface(east: np.ndarray, north: np.ndarray) -> np.ndarray:
-    return HEIGHT + 9.0 * np.sin(east / 80.0) + 7.0 * np.cos(north / 60.0)
 
 
 def texture(east: np.ndarray, north: np.ndarray) -> np.ndarray:
@@ -69,31 +63,6 @@ def points(tmp_path_factory) -> Path:
     return write_points(tmp_path_factory.mktemp("points"), lidar())
 
 
-def start(left: np.ndarray, right: np.ndarray, sigma: float, model: str = "affine") -> Alignment:
-    """The true pair with affine errors [2, 3] for ((u, v, 1) of the frame's half), in px.
-
-    ``sigma`` px: standard deviation of every one of its parameters.
-    """
-    fits, sensors = [], []
-    scale = max(SIZE) / 2
-    for name, true, error in zip(("left", "right"), TRUE, (left, right)):
-        fit = ViewFit(
-            view=name,
-            image=f"{name}.tif",
-            size=SIZE,
-            affine=np.array(true.affine),
-            gcps=(),
-            sigma0=float("nan"),
-            redundancy=0,
-            origin=((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2),
-            scale=scale,
-            covariance=np.eye(6) * sigma**2,
-        )
-        fits.append(replace(fit, affine=fit.moved(np.asarray(error).ravel())))
-        sensors.append(SensorModel(true.rpc, fits[-1].affine))
-    return Alignment("S-1", model, *sensors, *fits, HEIGHT, (), {"inputs": {}})
-
-
 def relative_error(alignment: Alignment) -> tuple[float, float]:
     """Largest error of the disparity and largest y-parallax over the scene, px.
 
@@ -109,7 +78,6 @@ def relative_error(alignment: Alignment) -> tuple[float, float]:
     return float(np.abs(disparity).max()), float(np.abs(y_right - y_left).max())
 
 
-NONE = np.zeros((2, 3))
 PLANTED = np.array([[0.2, -0.1, 0.7], [0.1, 0.15, -0.5]])
 
 
@@ -256,76 +224,3 @@ def test_json_keeps_the_refinement(found, tmp_path):
     assert files[2].stat().st_size > 10_000
     write_refinement(replace(refined, refinement={"applied": False, "reason": "x"}), None, *files)
     assert len(files[1].read_text().splitlines()) == 1
-
-
-# ------------------------------------------------------------------------------- the estimate
-
-
-def system(rng: np.random.Generator, n: int = 600):
-    """Design [n, 2, 12] of places on a plane, and the sites that they belong to."""
-    u, v = rng.uniform(-1, 1, (2, n))
-    basis = np.column_stack([u, v, np.ones(n)])
-    design = np.zeros((n, 2, 12))
-    design[:, 0, :3] = design[:, 1, 3:6] = -basis
-    design[:, 0, 6:9] = design[:, 1, 9:] = basis
-    sites = (np.floor(u * 4) * 100 + np.floor(v * 4)).astype(int)
-    return design, sites
-
-
-def test_uncertainty_of_the_estimate_is_honest():
-    """True parameters drawn from the prior, errors shared in sites, a fifth blunders."""
-    rng = np.random.default_rng(3)
-    ratios, chances = [], []
-    prior = np.eye(12) * 0.2**2
-    for _ in range(60):
-        design, sites = system(rng)
-        truth = rng.normal(0, 0.2, 12)
-        own = rng.uniform(0.02, 0.08, len(design))
-        index = np.unique(sites, return_inverse=True)[1]
-        shared = rng.normal(0, 0.03, (index.max() + 1, 2))[index]
-        errors = rng.normal(0, 1, (len(design), 2)) * own[:, None] + shared
-        errors += rng.normal(0, 0.01, 2)
-        bad = rng.random(len(design)) < 0.2
-        errors[bad] += rng.uniform(-3, 3, (bad.sum(), 2))
-        found = estimate(design, design @ truth + errors, own, sites, prior)
-        at = design[rng.integers(0, len(design))]
-        sigma = np.sqrt(np.diag(at @ found.covariance @ at.T))
-        ratios += list(at @ (found.parameters - truth) / sigma)
-        nothing = estimate(design, errors, own, sites, prior)
-        chances.append(nothing.statistic / nothing.freedom)
-    ratios = np.abs(ratios)
-    assert 0.55 < (ratios < 1).mean() < 0.85
-    assert (ratios < 2).mean() > 0.9
-    assert np.median(chances) < 2.0
-
-
-def test_label_sigma_is_the_spread_of_labels():
-    """Against labels of alignments whose parameters are drawn from the covariance."""
-    planted = start(NONE, NONE, 0.1)
-    rng = np.random.default_rng(0)
-    root = rng.normal(0, 0.05, (12, 12))
-    covariance = root @ root.T
-    fits = [
-        replace(fit, covariance=covariance[k : k + 6, k : k + 6])
-        for fit, k in zip(planted.fits, (0, 6))
-    ]
-    alignment = replace(
-        planted, left_fit=fits[0], right_fit=fits[1], cross_covariance=covariance[:6, 6:]
-    )
-    model = fit_epipolar(alignment.left, alignment.right, SIZE, SIZE, HEIGHT)
-    x, y = np.array([100.0, 350.0, 600.0]), np.array([120.0, 500.0, 300.0])
-    ground = *model.epipolar_to_ground(x, y, HEIGHT), HEIGHT
-    labels = []
-    for _ in range(3000):
-        p = root @ rng.normal(0, 1, 12)
-        left, right = (
-            SensorModel(s.rpc, fit.moved(part))
-            for s, fit, part in zip(
-                (alignment.left, alignment.right), alignment.fits, (p[:6], p[6:])
-            )
-        )
-        x_left, y_left = model.left_to_epipolar(*left.project(*ground))
-        x_right, _ = model.right_to_epipolar(*right.project(*ground))
-        labels.append([x_left - x_right, x_left, y_left])
-    for sigma, spread in zip(alignment.label_sigma(model, x, y), np.std(labels, axis=0)):
-        assert sigma == pytest.approx(spread, rel=0.06)

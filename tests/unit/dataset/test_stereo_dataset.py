@@ -7,26 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 
 from stereotruth.dataset.stereo_dataset import StereoDataset, find_pairs
 from stereotruth.errors import InputError
-from stereotruth.products.rasters import image_shape, read_disparity, read_image
+from stereotruth.products.rasters import read_disparity, read_image
 
-PUBLISHED = Path(__file__).parents[3] / "shared" / "published"
+from ...synthetic.images import write
+from ...synthetic.real_data import PUBLISHED
+
 needs_published = pytest.mark.skipif(not PUBLISHED.is_dir(), reason="no published pairs here")
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-
-
-def write(path: Path, array, nodata=None, **options) -> Path:
-    array = np.atleast_3d(np.asarray(array)).transpose(2, 0, 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    profile = {"dtype": array.dtype.name, "count": len(array), "nodata": nodata, **options}
-    with rasterio.open(
-        path, "w", driver="GTiff", height=array.shape[1], width=array.shape[2], **profile
-    ) as target:
-        target.write(array)
-    return path
 
 
 def whu_pair(folder: Path, name: str, *, kinds=("left", "right", "disparity")) -> None:
@@ -138,30 +128,6 @@ def test_a_split_without_pairs_is_refused(tmp_path):
         dataset.pairs("test", labelled=True)
     with pytest.raises(InputError, match="is empty"):
         StereoDataset.of("mine", settings | {"disparity_range": [8, 8]})
-
-
-def test_images_are_grey_or_colour(tmp_path):
-    grey = np.arange(24, dtype=np.uint16).reshape(4, 6)
-    colour = np.arange(72, dtype=np.uint8).reshape(4, 6, 3)
-    assert np.array_equal(read_image(write(tmp_path / "a.tif", grey)), grey)
-    assert np.array_equal(read_image(write(tmp_path / "b.tif", colour)), colour)
-    assert image_shape(tmp_path / "b.tif") == (4, 6)
-    real = np.array([[1.5, np.nan]], np.float64)
-    found = read_image(write(tmp_path / "c.tif", real))
-    assert found.dtype == np.float32 and found.tolist() == [[1.5, 0.0]]
-    with pytest.raises(InputError, match="2 bands"):
-        read_image(write(tmp_path / "d.tif", colour[..., :2]))
-    (tmp_path / "e.tif").write_bytes(b"no image")
-    with pytest.raises(InputError, match="no image that can be read"):
-        read_image(tmp_path / "e.tif")
-
-
-@pytest.mark.parametrize("bits", [16, 32])  # the published files have 16
-def test_labels_are_nan_where_there_are_none(tmp_path, bits):
-    values = np.array([[1.5, -999], [np.inf, -7]], np.float32)
-    found = read_disparity(write(tmp_path / "d.tif", values, nodata=-7, nbits=bits), -999)
-    assert found.dtype == np.float32
-    assert np.array_equal(found, [[1.5, np.nan], [np.nan, np.nan]], equal_nan=True)
 
 
 @needs_published

@@ -16,7 +16,7 @@ from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
 from stereotruth.evaluation import labels_against_images
 
-from .test_tiles import LAT, LON, METRE_LAT, METRE_LON, make_scene, rows_of, run
+from ...synthetic.tiled_scene import LAT, LON, METRE_LAT, METRE_LON, make_scene, rows_of, run
 
 SIZE = 96
 LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9)

@@ -10,7 +10,7 @@ from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.lidar.lattice import CELL_BITS
 
-from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, camera
+from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, camera
 
 SIZE = (320, 280)
 MIDDLE = np.array([round(LON * 1e9), round(LAT * 1e9), round(HEIGHT * 1e4)])

@@ -15,8 +15,8 @@ from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
 from stereotruth.products.grids import Strip
 
-from .test_block_store import tree
-from .test_disparity import Scene, write_image, write_points
+from ...synthetic.box_scene import Scene, write_image, write_points
+from ...synthetic.stores import tree
 
 
 @pytest.fixture

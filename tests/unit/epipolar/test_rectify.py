@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import Source
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.epipolar.resampling import resample
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
 from stereotruth.products.grids import open_grid
 
-from .test_epipolar import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
-from .test_rpc import write_image
+from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
+from ...synthetic.images import pattern, write_image
 
 SIZE = (520, 460)  # cols, rows
 
@@ -29,17 +25,6 @@ def pair(left_angle: float = 90.0, right_angle: float = 92.0, right_gsd: float =
     left = camera(BACKWARD, angle=left_angle, size=SIZE, bend=3.0)
     right = camera(FORWARD, angle=right_angle, gsd=right_gsd, size=SIZE, bend=-2.0)
     return left, right
-
-
-def pattern(east: np.ndarray, north: np.ndarray) -> np.ndarray:
-    """A smooth texture on the ground (waves of 5 to 40 m), digital numbers near 1000."""
-    rng = np.random.default_rng(5)
-    value = np.full(np.shape(east), 1000.0)
-    for length in (5.0, 6.0, 8.0, 11.0, 17.0, 40.0):
-        angle, phase = rng.uniform(0, np.pi, 2)
-        wave = np.cos(angle) * east + np.sin(angle) * north
-        value += 80.0 * np.sin(2 * np.pi / length * wave + phase)
-    return value
 
 
 def render(sensor: SensorModel, height: float) -> np.ndarray:
@@ -113,122 +98,6 @@ def test_a_higher_plane_moves_to_the_left_in_the_right_image(tmp_path: Path) -> 
     assert np.corrcoef(left[both], right[both])[0, 1] > 0.998
 
 
-def test_interpolation_error_of_the_kernel() -> None:
-    """Against the exact wave; bicubic (a = -0.5) and OpenCV's for comparison, in the comments."""
-    col, row = np.meshgrid(np.arange(200.0), np.arange(200.0))
-    rng = np.random.default_rng(0)
-    at = rng.uniform(5, 190, (2, 9, 9))
-    for length, tolerance in ((4.0, 0.045), (6.0, 0.008), (10.0, 0.0015)):
-        wave = 10000 + 8000 * np.sin(2 * np.pi / length * (col + 0.3 * row))
-        got = np.empty(81)
-        for k in range(81):
-            lattice = np.repeat(np.repeat(at.reshape(2, 81)[:, k, None, None], 2, 1), 2, 2)
-            out = np.zeros((1, 1), dtype=np.uint16)
-            assert resample(wave.astype(np.float32), lattice, 16, (1.0, 1.0), out) == 1
-            got[k] = out[0, 0]
-        c, r = at.reshape(2, 81)
-        exact = 10000 + 8000 * np.sin(2 * np.pi / length * (c + 0.3 * r))
-        assert np.sqrt(np.mean((got - exact) ** 2)) / 8000 < tolerance
-
-
-def keys_value(source: np.ndarray, col: float, row: float, scale: tuple[float, float]) -> float:
-    """Keys (1981), section VI, as a double sum; NaN where a tap with weight has no value."""
-
-    def kernel(s: np.ndarray) -> np.ndarray:
-        s = np.abs(s)
-        pieces = [
-            (s < 1, 4 / 3 * s**3 - 7 / 3 * s**2 + 1),
-            (s < 2, -7 / 12 * s**3 + 3 * s**2 - 59 / 12 * s + 15 / 6),
-            (s < 3, 1 / 12 * s**3 - 2 / 3 * s**2 + 21 / 12 * s - 3 / 2),
-        ]
-        return np.select(*zip(*pieces), 0.0)
-
-    taps = []
-    for axis, at in enumerate((col, row)):
-        reach = int(np.ceil(3 * scale[axis])) + 1
-        first = int(np.floor(at)) - reach
-        numbers = np.arange(first, first + 2 * reach + 1)
-        weights = kernel((at - numbers) / scale[axis])
-        taps.append((numbers, weights / weights.sum()))
-    total = 0.0
-    for c, across in zip(*taps[0]):
-        for r, down in zip(*taps[1]):
-            if min(abs(across), abs(down)) > 1e-6:
-                there = 0 <= c < source.shape[1] and 0 <= r < source.shape[0]
-                total += across * down * source[r, c] if there else np.nan
-    return total
-
-
-@pytest.mark.parametrize("scale", [(1.0, 1.0), (1.7, 1.3)])
-@pytest.mark.parametrize("angle", [0.0, 3.0, 90.4, 200.0])
-def test_values_are_those_of_the_formula(angle: float, scale: tuple[float, float]) -> None:
-    """With holes of nodata, and past all four edges; of white noise over all of uint16."""
-    rng = np.random.default_rng(1)
-    source = rng.integers(1, 65535, (29, 37)).astype(np.float32)
-    source[rng.random(source.shape) < 0.004] = np.nan
-    step = 16
-    x, y = np.meshgrid(*2 * [np.arange(0, 64 + step, step) - 32.0])
-    turn = np.radians(angle)
-    lattice = np.stack(
-        [
-            18.3 + scale[0] * (np.cos(turn) * x - np.sin(turn) * y),
-            14.4 + scale[1] * (np.sin(turn) * x + np.cos(turn) * y),
-        ]
-    )
-    out = np.zeros((58, 61), dtype=np.uint16)
-    count = resample(source, lattice, step, scale, out)
-    assert count == np.count_nonzero(out) > 100
-    y, x = np.indices(out.shape)
-    fine = [np.array([[bilinear(a, i, j, step) for i in x[0]] for j in y[:, 0]]) for a in lattice]
-    expected = np.array(
-        [[keys_value(source, c, r, scale) for c, r in zip(*line)] for line in zip(*fine)]
-    )
-    inside = (
-        (fine[0] >= -0.5)
-        & (fine[1] >= -0.5)
-        & (fine[0] <= source.shape[1] - 0.5)
-        & (fine[1] <= source.shape[0] - 0.5)
-    )
-    assert np.array_equal(out > 0, inside & np.isfinite(expected))
-    error = out[out > 0] - np.clip(expected[out > 0], 1, 65535)
-    assert np.abs(error).max() < 0.53  # float32 sums; measured 0.517
-
-
-def bilinear(nodes: np.ndarray, x: int, y: int, step: int) -> float:
-    (i, f), (j, g) = divmod(x, step), divmod(y, step)
-    f, g = f / step, g / step
-    near, far = ((1 - f) * nodes[k, i] + f * nodes[k, i + 1] for k in (j, j + 1))
-    return (1 - g) * near + g * far
-
-
-def test_the_window_of_the_source_does_not_matter() -> None:
-    """Bits are the same wherever the source's window begins, and where a tile's row does."""
-    rng = np.random.default_rng(3)
-    source = rng.integers(1, 65535, (400, 400)).astype(np.float32)
-    source[150:153, 220] = np.nan
-    x, y = np.meshgrid(*2 * [np.arange(0.0, 208, 16)])
-    lattice = np.stack([320.1 - 1.013 * y + 0.01 * x, 93.7 + 0.987 * x - 0.02 * y])
-    whole = np.zeros((192, 192), dtype=np.uint16)
-    resample(source, lattice, 16, (1.0, 1.0), whole)
-    assert (whole == 0).any()
-    window = np.ascontiguousarray(source[86:300, 105:331])
-    moved = lattice - np.array([105, 86])[:, None, None]
-    part = np.zeros((160, 176), dtype=np.uint16)
-    resample(window, moved[:, 2:, 1:], 16, (1.0, 1.0), part)
-    assert np.array_equal(part, whole[32:, 16:])
-
-
-def test_whole_pixels_are_copied() -> None:
-    """No tap but the pixel's own has weight there: nodata beside it and edges do not matter."""
-    source = np.random.default_rng(0).integers(1, 60000, (16, 16)).astype(np.float32)
-    source[7, 7] = np.nan
-    lattice = np.stack(np.meshgrid([0.0, 16.0], [0.0, 16.0]))
-    out = np.zeros((16, 16), dtype=np.uint16)
-    assert resample(source, lattice, 16, (1.0, 1.0), out) == 255
-    expected = np.nan_to_num(source)
-    assert np.array_equal(out, expected)
-
-
 def test_nodata_spreads_to_whatever_it_touches(tmp_path: Path) -> None:
     hole = constant()
     hole[200:210, 220:240] = 0
@@ -274,20 +143,6 @@ def test_a_finer_view_is_smoothed_before_it_is_thinned(tmp_path: Path) -> None:
     inside = right[right > 0].astype(float)
     assert abs(inside.mean() - 2000) < 2
     assert inside.std() < 30  # of 1000 in the source
-
-
-def test_several_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "rgb.tif"
-    shape = {"width": 9, "height": 8, "count": 3, "dtype": "uint8", "photometric": "RGB"}
-    with (
-        pytest.warns(NotGeoreferencedWarning),
-        rasterio.open(path, "w", driver="GTiff", **shape) as dataset,
-    ):
-        dataset.write(np.full((3, 8, 9), 5, dtype=np.uint8))
-    with caplog.at_level(logging.WARNING, "stereotruth"), Source(path) as source:
-        assert source.size == (9, 8)
-        assert source.read(2, 1, 4, 3).shape == (3, 4)
-    assert "rgb.tif has 3 bands; band 1 (red) is used" in caplog.text
 
 
 def digest(store: Path) -> str:

@@ -3,89 +3,20 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
-from rasterio.rpc import RPC as RasterioRPC
 from rasterio.transform import RPCTransformer
 
 from stereotruth.epipolar.rpc import RPC, SensorModel, localize_point, project_point
 from stereotruth.epipolar.rpc_files import read_rpc
-from stereotruth.errors import InputError
 
-SHARED = Path(__file__).parents[3] / "shared"
-MARSEILLE = SHARED / "real" / "marseille"
+from ...synthetic.cameras import ground_points, make_rpc, to_rasterio
+from ...synthetic.images import write_image
+from ...synthetic.real_data import MARSEILLE
+
 AFFINE = np.array([[1.0001, 2e-4, -3.5], [-1e-4, 0.9998, 4.25]])
-
-
-def make_rpc(seed: int, image_offset: float = 0.0) -> RPC:
-    """A random RPC of realistic size: 20 km, ±500 m, 2 px of cubic terms, image rotated at will.
-
-    ``image_offset`` moves the image away from the RPC's centre, in units of the image scale.
-    """
-    rng = np.random.default_rng(seed)
-    angle = rng.uniform(-np.pi, np.pi)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    numerators = []
-    for axis in range(2):
-        numerator = rng.normal(0, [1e-3, *[1e-2] * 3, *[5e-4] * 6, *[1e-4] * 10])
-        numerator[1:3] += turn[axis] * (1.0, -1.0)
-        numerator[3] += rng.uniform(-0.05, 0.05)
-        numerator[0] += image_offset
-        numerators.append(numerator)
-    denominators = rng.normal(0, 2e-4, (2, 20))
-    denominators[:, 0] = 1.0
-    return RPC(
-        line_off=15000.25 - image_offset * 14000,
-        samp_off=17000.5 - image_offset * 16000,
-        lat_off=rng.uniform(-60, 60),
-        long_off=rng.uniform(-170, 170),
-        height_off=250.0,
-        line_scale=14000.0,
-        samp_scale=16000.0,
-        lat_scale=0.09,
-        long_scale=0.12,
-        height_scale=500.0,
-        line_num_coeff=numerators[1],
-        line_den_coeff=denominators[1],
-        samp_num_coeff=numerators[0],
-        samp_den_coeff=denominators[0],
-    )
-
-
-def to_rasterio(rpc: RPC) -> RasterioRPC:
-    return RasterioRPC(**rpc.to_dict(), err_bias=None, err_rand=None)
-
-
-def write_image(path: Path, rpc: RPC | None, pixels: np.ndarray | None = None, **options) -> Path:
-    pixels = np.full((8, 8), 7, dtype=np.uint16) if pixels is None else pixels
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(
-            path,
-            "w",
-            driver="GTiff",
-            width=pixels.shape[1],
-            height=pixels.shape[0],
-            count=1,
-            dtype=pixels.dtype,
-            **options,
-        ) as dataset:
-            dataset.write(pixels, 1)
-            if rpc is not None:
-                dataset.rpcs = to_rasterio(rpc)
-    return path
-
-
-def ground_points(rpc: RPC, n: int = 500) -> np.ndarray:
-    box = rpc.ground_box
-    t = np.random.default_rng(1).random((3, n))
-    low, high = np.array([box[0], box[1], box[4]]), np.array([box[2], box[3], box[5]])
-    return low[:, None] + t * (high - low)[:, None]
 
 
 def rpcs() -> list:
@@ -192,129 +123,3 @@ def test_models_survive_json() -> None:
     model = SensorModel(make_rpc(9), AFFINE)
     again = SensorModel.from_dict(json.loads(json.dumps(model.to_dict())))
     assert np.array_equal(again.packed(), model.packed())
-
-
-# -------------------------------------------------------------------------------------- readers
-
-
-def rpc_text(rpc: RPC) -> str:
-    units = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
-    lines = []
-    for name, value in rpc.to_dict().items():
-        if isinstance(value, list):
-            lines += [f"{name.upper()}_{i}: {v:+.15E}" for i, v in enumerate(value, start=1)]
-        else:
-            unit = units.get(name.split("_")[0], "meters")
-            lines.append(f"{name.upper()}: {value:+017.10f} {unit}")
-    return "\r\n".join(lines) + "\r\n"
-
-
-def rpb_text(rpc: RPC, spec: str = "RPC00B") -> str:
-    values = rpc.to_dict()
-    lines = ['satId = "GF7";', 'bandId = "PAN";', f'SpecId = "{spec}";', "BEGIN_GROUP = IMAGE"]
-    lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
-    for ours, theirs in (("line", "line"), ("samp", "samp"), ("lat", "lat"), ("long", "long")):
-        lines.append(f"\t{theirs}Offset = {values[f'{ours}_off']!r};")
-        lines.append(f"\t{theirs}Scale = {values[f'{ours}_scale']!r};")
-    lines.append(f"\theightOffset = {values['height_off']!r};")
-    lines.append(f"\theightScale = {values['height_scale']!r};")
-    for name in ("line_num", "line_den", "samp_num", "samp_den"):
-        kind, part = name.split("_")
-        body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
-        lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
-    return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
-
-
-def assert_same(a: RPC, b: RPC) -> None:
-    lon, lat, height = ground_points(b, 50)
-    difference = np.subtract(a.project(lon, lat, height), b.project(lon, lat, height))
-    assert np.abs(difference).max() < 1e-5  # offsets are written with ten decimals
-
-
-@pytest.mark.parametrize(
-    ("name", "writer"),
-    [
-        ("GF7_scene-BWD_RPC.TXT", rpc_text),
-        ("GF7_scene-BWD_rpc.txt", rpc_text),
-        ("GF7_scene-BWD.RPB", rpb_text),
-        ("GF7_scene-BWD.rpb", rpb_text),
-    ],
-)
-def test_files_beside_the_image(tmp_path: Path, name: str, writer) -> None:
-    rpc = make_rpc(10)
-    image = write_image(tmp_path / "GF7_scene-BWD.tiff", None)
-    (tmp_path / name).write_text(writer(rpc))
-    assert_same(read_rpc(image), rpc)
-
-
-def test_tiff_tag(tmp_path: Path) -> None:
-    rpc = make_rpc(11)
-    assert_same(read_rpc(write_image(tmp_path / "a.tif", rpc)), rpc)
-
-
-@pytest.mark.parametrize("option", ["RPCTXT", "RPB"])
-def test_files_written_by_gdal(tmp_path: Path, option: str) -> None:
-    rpc = make_rpc(12)
-    image = write_image(tmp_path / "a.tif", rpc, **{option: "YES"})
-    assert len(list(tmp_path.iterdir())) > 1
-    assert_same(read_rpc(image), rpc)
-
-
-def test_a_file_goes_before_the_tag(tmp_path: Path) -> None:
-    image = write_image(tmp_path / "a.tif", make_rpc(13))
-    better = make_rpc(14)
-    (tmp_path / "a_RPC.TXT").write_text(rpc_text(better))
-    assert_same(read_rpc(image), better)
-
-
-def spoiled(name: str, old: str, new: str):
-    def change(text: str) -> str:
-        assert old in text
-        return text.replace(old, new, 1)
-
-    return pytest.param(change, id=name)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        spoiled("missing-offset", "LINE_OFF:", "LINE:"),
-        spoiled("missing-coefficient", "SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
-        spoiled("not-a-number", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
-        spoiled("not-finite", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: nan "),
-        spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
-        spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
-        spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
-    ],
-)
-def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
-    image = write_image(tmp_path / "a.tif", None)
-    (tmp_path / "a_RPC.TXT").write_text(change(rpc_text(make_rpc(15))))
-    with pytest.raises(InputError, match=r"a_RPC.TXT: malformed RPC .*Remedy"):
-        read_rpc(image)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        spoiled("19-coefficients", "lineNumCoef = (\n", "lineNumCoef = (\n //"),
-        spoiled("missing-scale", "sampScale", "sampScal"),
-        spoiled("RPC00A", "RPC00B", "RPC00A"),
-        spoiled("cut-short", "sampDenCoef = (", "sampDenCoef = "),
-    ],
-)
-def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
-    image = write_image(tmp_path / "a.tif", None)
-    (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
-    with pytest.raises(InputError, match=r"a.rpb: malformed RPC .*Remedy"):
-        read_rpc(image)
-
-
-def test_images_without_rpc_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a.tif: image has no RPC metadata.*a_RPC.TXT"):
-        read_rpc(write_image(tmp_path / "a.tif", None))
-    with pytest.raises(InputError, match=r"b.tif: no such image"):
-        read_rpc(tmp_path / "b.tif")
-    (tmp_path / "c.tif").write_text("no raster")
-    with pytest.raises(InputError, match=r"c.tif: not a raster"):
-        read_rpc(tmp_path / "c.tif")

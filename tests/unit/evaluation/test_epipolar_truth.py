@@ -18,8 +18,8 @@ from stereotruth.simulate.render import prepare
 from stereotruth.simulate.surfaces import terrain_heights
 from stereotruth.simulate.truth import open_truth, simulate_truth
 
-from .test_alignment import linear_rpc
-from .test_simulate import ONE_BOX, TOWN
+from ...synthetic.small_cities import ONE_BOX, TOWN
+from ...synthetic.surveyed_pair import linear_rpc
 
 GROUND, ROOF, WALL = 1, 2, 3
 

@@ -2,75 +2,21 @@
 
 from __future__ import annotations
 
-import errno
-import hashlib
 import struct
-from pathlib import Path
 
 import laspy
 import numpy as np
 import pyproj
 import pytest
-import zarr
 
 from stereotruth.errors import InputError
 from stereotruth.lidar import cell_sort, lattice, point_store
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import Points, PointStore, coverage, query_points, summary
+from stereotruth.lidar.point_store import PointStore
 
-SHARED = Path(__file__).parents[3] / "shared"
-UTM = pyproj.CRS("EPSG:32650").to_3d()
-WEST, SOUTH = 500_000.0, 3_300_000.0
-
-
-def write_las(
-    path: Path,
-    n: int = 3000,
-    *,
-    pdrf: int = 6,
-    version: str = "1.4",
-    system: pyproj.CRS | None = UTM,
-    side: float = 700.0,
-    scale: float = 0.001,
-    seed: int = 0,
-    xyz: np.ndarray | None = None,
-    **fields: np.ndarray,
-) -> np.ndarray:
-    """Random points on a square; returns their coordinates as stored, float64[n, 3]."""
-    rng = np.random.default_rng(seed)
-    if xyz is None:
-        xyz = np.column_stack(
-            [WEST + rng.uniform(0, side, n), SOUTH + rng.uniform(0, side, n), rng.normal(50, 9, n)]
-        )
-    header = laspy.LasHeader(point_format=pdrf, version=version)
-    header.scales = [scale] * 3
-    header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else [0, 0, 0]
-    if system is not None:
-        header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", system.to_wkt().encode() + b"\0"))
-        header.global_encoding.wkt = pdrf >= 6
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = xyz.T
-    values = {
-        "classification": np.full(len(xyz), 2, np.uint8),
-        "return_number": rng.integers(1, 4, len(xyz)),
-        "number_of_returns": np.full(len(xyz), 3),
-        **fields,
-    }
-    for name, value in values.items():
-        setattr(las, name, value)
-    las.write(path)
-    return np.column_stack([las.x, las.y, las.z])
-
-
-def tree_digest(folder: Path) -> str:
-    digest = hashlib.sha256()
-    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(f"{file.relative_to(folder)}\0".encode() + file.read_bytes())
-    return digest.hexdigest()
-
-
-def everything(store: PointStore) -> Points:
-    return store.query(*store.bounds[:4])
+from ...synthetic.las import SOUTH, WEST, everything, refused, write_las
+from ...synthetic.real_data import SHARED
+from ...synthetic.stores import tree_digest
 
 
 def by_position(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np.ndarray:
@@ -153,17 +99,6 @@ def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch
     assert PointStore(tmp_path / "0.zarr").count == 20_000
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_a_full_disk_says_so() -> None:
-    with Path("/dev/full").open("wb", buffering=0) as disk:
-        runs = cell_sort.SortedRuns(np.empty((1000, 4), np.int32), disk)
-        lattice, attributes = np.zeros((3, 1000), np.int64), np.zeros(1000, np.uint32)
-        runs.add(lattice, attributes)
-        with pytest.raises(OSError, match="No space left") as error:
-            runs.add(lattice, attributes)
-    assert error.value.errno == errno.ENOSPC
-
-
 def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
     xyz = np.random.default_rng(0).uniform(0, 700, (5000, 3)) + np.array([WEST, SOUTH, 0])
     xyz[:, 2] = np.arange(5000) * 0.1  # the height tells the place in the file
@@ -177,81 +112,6 @@ def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
     assert np.array_equal(np.lexsort(visited.T[::-1]), np.arange(len(visited)))  # row-major
     for part in np.split(got.h_q, changes):
         assert (np.diff(part) > 0).all()
-
-
-# ------------------------------------------------------------------ queries
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory) -> PointStore:
-    folder = tmp_path_factory.mktemp("points")
-    write_las(folder / "a.laz", 30_000)
-    ingest(folder / "a.laz", folder / "a.zarr")
-    return PointStore(folder / "a.zarr")
-
-
-def test_query_is_exact_inclusive_and_in_stored_order(store) -> None:
-    got = everything(store)
-    rng = np.random.default_rng(2)
-    for _ in range(30):
-        corners = rng.integers(0, len(got), 2)  # boxes whose edges pass through points
-        lon_min, lon_max = np.sort(got.lon[corners])
-        lat_min, lat_max = np.sort(got.lat[corners])
-        inside = (got.lon >= lon_min) & (got.lon <= lon_max)
-        inside &= (got.lat >= lat_min) & (got.lat <= lat_max)
-        part = store.query(lon_min, lat_min, lon_max, lat_max)
-        for name in ("lon_q", "lat_q", "h_q", "classification", "return_number"):
-            assert np.array_equal(getattr(part, name), getattr(got, name)[inside])
-        lowest, highest = store.height_range(lon_min, lat_min, lon_max, lat_max)
-        assert lowest <= part.height.min() <= part.height.max() <= highest
-
-
-def test_edges_between_lattice_points(store) -> None:
-    lon, lat = (value[123] for value in (everything(store).lon, everything(store).lat))
-    assert len(store.query(lon, lat, lon, lat)) == 1
-    assert len(store.query(np.nextafter(lon, 180), lat, lon + 4e-10, lat)) == 0
-    assert len(store.query(-np.inf, -np.inf, np.inf, np.inf)) == store.count
-
-
-def test_empty_queries(store) -> None:
-    lon_min, lat_min, lon_max, lat_max = store.bounds[:4]
-    for box in [
-        (lon_max + 1, lat_min, lon_max + 2, lat_max),
-        (lon_min, lat_max + 1e-8, lon_max, lat_max + 1),
-        (lon_max, lat_max, lon_min, lat_min),
-    ]:
-        got = store.query(*box)
-        assert len(got) == len(got.lon) == 0
-        assert got.h_q.dtype == np.int64
-    assert store.height_range(10, 10, 11, 11) is None
-    assert len(query_points([], 0, 0, 1, 1)) == 0
-
-
-def test_two_stores_hold_what_one_does(tmp_path) -> None:
-    """Split a file in two: the same points, and the same exact sums in either order."""
-    xyz = write_las(tmp_path / "all.laz", 4000)
-    write_las(tmp_path / "a.laz", xyz=xyz[:1500])
-    write_las(tmp_path / "b.laz", xyz=xyz[1500:])
-    for name in ("all", "a", "b"):
-        ingest(tmp_path / f"{name}.laz", tmp_path / f"{name}.zarr")
-    whole = PointStore(tmp_path / "all.zarr")
-    lon_min, lat_min, lon_max, lat_max = whole.bounds[:4]
-    box = (lon_min, lat_min, (lon_min + lon_max) / 2, (lat_min + lat_max) / 2)
-    expected = whole.query(*box)
-    for names in ("ab", "ba"):
-        got = query_points([tmp_path / f"{name}.zarr" for name in names], *box)
-        assert len(got) == len(expected) > 500
-        for name in ("lon_q", "lat_q", "h_q"):
-            assert np.array_equal(np.sort(getattr(got, name)), np.sort(getattr(expected, name)))
-    parts = [PointStore(tmp_path / f"{name}.zarr") for name in "ab"]
-    assert summary(parts)["points"]["kept"] == 4000
-    assert summary(parts)["bounds"] == list(whole.bounds)
-    assert np.array_equal(coverage(parts), coverage([whole]))
-    assert summary(parts)["covered_km2"] == pytest.approx(0.49, abs=0.2)  # whole cells
-    boxes = coverage([whole])
-    inside = (expected.lon[:, None] >= boxes[:, 0]) & (expected.lon[:, None] < boxes[:, 2])
-    inside &= (expected.lat[:, None] >= boxes[:, 1]) & (expected.lat[:, None] < boxes[:, 3])
-    assert (inside.sum(axis=1) == 1).all()
 
 
 def test_southern_and_western_hemisphere(tmp_path) -> None:
@@ -306,92 +166,6 @@ def test_producers_own_classes_are_kept_unless_listed(tmp_path) -> None:
     assert dropped["points"]["dropped"]["class 65"] == 40
 
 
-# ------------------------------------------------------------------ refused by name
-
-
-def refused(file: Path, match: str, **arguments) -> str:
-    """Ingest must fail with a message that names the file, and leave nothing behind."""
-    store = file.with_name("refused.zarr")
-    with pytest.raises(InputError, match=match) as error:
-        ingest(file, store, **arguments)
-    assert file.name in str(error.value)
-    assert "Remedy: " in str(error.value)
-    assert not list(file.parent.glob("refused.zarr*"))
-    return str(error.value)
-
-
-@pytest.mark.parametrize("version", ["1.2", "1.4"])
-def test_truncated_las_names_both_counts(tmp_path, version) -> None:
-    file = tmp_path / "a.las"
-    write_las(file, 1000, pdrf=1 if version == "1.2" else 6, version=version)
-    with laspy.open(file) as reader:
-        size = reader.header.point_format.size
-    data = file.read_bytes()
-    file.write_bytes(data[: len(data) - 10 * size - 3])
-    refused(file, "announces 1000 points, the file holds 989")
-
-
-@pytest.mark.parametrize("share", [0.2, 0.7, 0.999])
-def test_truncated_laz_names_both_counts(tmp_path, share) -> None:
-    file = tmp_path / "a.laz"
-    write_las(file, 60_000)
-    data = file.read_bytes()
-    file.write_bytes(data[: int(len(data) * share)])
-    refused(file, "announces 60000 points, 0 can be read")
-
-
-@pytest.mark.parametrize("count", [70_000, 150_000])
-def test_laz_whose_header_and_chunk_table_disagree(tmp_path, count) -> None:
-    file = tmp_path / "a.laz"
-    write_las(file, 120_000, pdrf=1, version="1.2")  # chunks of 50 000
-    data = bytearray(file.read_bytes())
-    struct.pack_into("<I", data, 107, count)
-    file.write_bytes(data)
-    if count == 150_000:  # within the last chunk, as far as the table goes: decoding finds out
-        refused(file, f"announces {count} points")
-    else:
-        refused(file, f"announces {count} points, its chunks hold 150000")
-
-
-def test_damaged_laz(tmp_path) -> None:
-    file = tmp_path / "a.laz"
-    write_las(file, 100_000)
-    data = bytearray(file.read_bytes())
-    middle = len(data) // 4
-    data[middle : middle + 4000] = np.random.default_rng(0).bytes(4000)
-    file.write_bytes(data)
-    refused(file, "damaged|no place on Earth")
-
-
-@pytest.mark.parametrize("content", [b"", b"LASF", b"not a LAS file" * 100])
-def test_no_las_file(tmp_path, content) -> None:
-    (tmp_path / "a.las").write_bytes(content)
-    refused(tmp_path / "a.las", "no readable LAS")
-
-
-def test_missing_and_empty_files(tmp_path) -> None:
-    refused(tmp_path / "none.laz", "no such LiDAR file")
-    write_las(tmp_path / "empty.laz", 0)
-    refused(tmp_path / "empty.laz", "announces 0 points")
-    write_las(tmp_path / "unfinished.las", 50, pdrf=1, version="1.2")
-    data = bytearray((tmp_path / "unfinished.las").read_bytes())
-    struct.pack_into("<I", data, 107, 0)
-    (tmp_path / "unfinished.las").write_bytes(data)
-    refused(tmp_path / "unfinished.las", "never completed")
-
-
-def test_stale_header_is_remarked(tmp_path) -> None:
-    file = tmp_path / "a.las"
-    write_las(file, 100, pdrf=1, version="1.2")
-    assert not ingest(file, tmp_path / "a.zarr")["notes"]
-    data = bytearray(file.read_bytes())
-    struct.pack_into("<I", data, 107, 80)
-    file.write_bytes(data)
-    result = ingest(file, tmp_path / "a.zarr")
-    assert result["points"]["kept"] == 80
-    assert "announces 80 points, which are read; 100 would fit" in result["notes"][0]
-
-
 def test_nothing_left(tmp_path) -> None:
     write_las(tmp_path / "a.laz", 100, classification=np.full(100, 7, np.uint8))
     refused(tmp_path / "a.laz", "no point is left of 100.*100 class 7")
@@ -444,18 +218,6 @@ def test_heights_with_a_geoid_and_survey_feet(tmp_path) -> None:
     expected = np.sort(xyz[1000:, 2]) * 1200 / 3937 - 12.5
     np.testing.assert_allclose(np.sort(got.height), expected, rtol=0, atol=6e-5)
     assert result["crs"]["geoid"] == "n.gtx"
-
-
-def test_only_finished_point_stores_open(tmp_path) -> None:
-    with pytest.raises(InputError, match="no such"):
-        PointStore(tmp_path / "none.zarr")
-    write_las(tmp_path / "a.laz")
-    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
-    zarr.open_group(tmp_path / "a.zarr").attrs["complete"] = False
-    group = zarr.open_group(tmp_path / "other.zarr", mode="w")
-    group.attrs["complete"] = True
-    with pytest.raises(InputError, match="no point store"):
-        PointStore(tmp_path / "other.zarr")
 
 
 # ------------------------------------------------------------------ real files

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import multiprocessing
 from pathlib import Path
@@ -14,6 +13,8 @@ import zarr
 from stereotruth.products.grids import Layer, Strip, blocks, open_grid
 from stereotruth.products.resumable_grids import making
 
+from ...synthetic.stores import Killed, tree
+
 SHAPE = (70, 100)
 LAYERS = {
     "disparity": Layer("float32", np.nan, {"units": "px", "long_name": "disparity"}),
@@ -22,10 +23,6 @@ LAYERS = {
 SIZES = {"chunk": 16, "shard": 32}
 BLOCKS = blocks(SHAPE, SIZES["shard"])
 ATTRS = {"kind": "disparity", "scene": "test"}
-
-
-class Killed(BaseException):
-    """As if the process had ended here: nothing of the package catches it."""
 
 
 def work(
@@ -60,14 +57,6 @@ def write(store, block, key: str) -> None:
     y, x = np.mgrid[rows, cols]
     values = (y * 1000.0 + x + len(key) * 1e6).astype(np.float32)
     store.write(block, key, {"disparity": values, "status": (y % 3).astype(np.uint8)}, values.size)
-
-
-def tree(path: Path) -> dict[str, str]:
-    return {
-        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(path.rglob("*"))
-        if file.is_file()
-    }
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import csv
 import json
 import re
 from pathlib import Path
@@ -13,102 +11,12 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products import html_tables, pictures
-from stereotruth.products.rasters import write_tiff
-from stereotruth.report import drawings, page, tile_pictures
+from stereotruth.report import page
 
-from ..browser import look, needs_chromium, screenshot
+from ...browser import look, needs_chromium, screenshot
+from ...synthetic.reported_city import CITY, REASON, alignment, write_city
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-
-SIZE = 96
-SHIFT = 7  # px of disparity, of every tile
-HOLE = np.s_[10:30, 20:50]  # pixels without a label
-FLAGS = {0: "no_points", 1: "labelled", 2: "hidden_in_left", 9: "a_new_reason"}
-CITY = 'Ville <b>"A & B"</b>'
-REASON = "<script>window.broken = true</script> 9.1 px off"
-
-
-def texture(seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE + 2 * SHIFT)).astype(np.float32)
-    return np.clip(cv2.GaussianBlur(noise, (0, 0), 2.5) * 900 + 600, 1, 2000).astype(np.uint16)
-
-
-def row_of(name: str, number: int, **values: object) -> dict[str, object]:
-    row = {
-        "tile": name,
-        "number": number,
-        "city": CITY,
-        "scene": f"S-{1 + number % 2}",
-        "row0": SIZE * (number // 2),
-        "col0": 0,
-        "size": SIZE,
-        "right_offset_px": -3,
-        "complete": "yes",
-        "split": ("train", "test", "val")[number % 3],
-        "labelled_share": f"{1 - 600 / SIZE**2:.6f}",
-        "disparity_min_px": f"{SHIFT:.4f}",
-        "disparity_mean_px": f"{(13 * number) % 10 + 0.5:.4f}",
-        "disparity_max_px": f"{SHIFT:.4f}",
-        "count_no_points": 0,
-        "count_labelled": SIZE**2 - 600,
-        "count_hidden_in_left": 0,
-        "count_a_new_reason": 600,
-        "left": f"left/{name}.tiff",
-        "right": f"right/{name}.tiff",
-        "disp": f"disp/{name}.tiff",
-        "status": f"status/{name}.tiff",
-        "left_sha256": "0" * 64,
-    }
-    return row | values
-
-
-def write_city(folder: Path, count: int, **columns: list[object]) -> list[dict[str, object]]:
-    """tiles/<City> of ``count`` labelled tiles and one without labels; ``columns`` by tile."""
-    rows = []
-    for kind in ("left", "right", "disp", "status"):
-        (folder / kind).mkdir(parents=True)
-    for k in range(count + 1):
-        name = f"T_{k}"
-        row = row_of(name, k, **{key: values[k] for key, values in columns.items()})
-        whole = texture(k)
-        write_tiff(folder / row["left"], whole[:, SHIFT:-SHIFT], nodata=0)
-        write_tiff(folder / row["right"], whole[:, 2 * SHIFT :], nodata=0)
-        disparity = np.full((SIZE, SIZE), SHIFT, np.float32)
-        disparity[HOLE] = -999
-        status = np.where(disparity == -999, 9, 1).astype(np.uint8)
-        if k < count:
-            write_tiff(folder / row["disp"], disparity, nodata=-999)
-            text = ", ".join(f"{value} {name}" for value, name in FLAGS.items())
-            write_tiff(folder / row["status"], status, description=text)
-        else:
-            row |= {"complete": "no", "split": "none", "disp": "", "status": ""}
-        rows.append(row)
-    with (folder / "manifest.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    (folder / "export.json").write_text(
-        json.dumps({"size_px": SIZE, "provenance": {"code": "<i>c0de</i>", "inputs": {"x": "y"}}})
-    )
-    return rows
-
-
-def alignment(path: Path) -> Path:
-    """Two GCPs off by (3, 4) and (−6, 8) px before, a tenth of it after; a third left out."""
-    gcps = [
-        {"id": "G1", "measured": [100.0, 50.0], "before": [3.0, 4.0], "used": True, "reason": ""},
-        {"id": "G2", "measured": [10.0, 180.0], "before": [-6.0, 8.0], "used": True, "reason": ""},
-        {"id": "G3", "measured": [150.0, 90.0], "before": [90.0, 0.0], "used": False,
-         "reason": REASON},
-    ]  # fmt: skip
-    for gcp in gcps:
-        gcp["after"] = [v / 10 for v in gcp["before"]]
-        gcp["leave_one_out"] = [None, None]
-    view = {"size": [200, 200], "gcps": gcps, "rms": {"before": 7.91, "after": 0.79}}
-    record = {"model": "shift", "left": view, "right": view, "warnings": [f"left image: {REASON}"]}
-    path.write_text(json.dumps(record))
-    return path
 
 
 def refinement(path: Path, applied: bool) -> Path:
@@ -177,54 +85,6 @@ def made(tmp_path_factory) -> Path:
         workers=2,
     )
     return out
-
-
-def picture(uri: str) -> np.ndarray:
-    data = base64.b64decode(uri.removeprefix("data:image/webp;base64,"))
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
-
-
-def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
-    rows = write_city(tmp_path, 1)
-    made = tile_pictures.tile_pictures(
-        tmp_path, rows[0], thumbnail=(SIZE, 10**6), slider=(SIZE, 10**6)
-    )
-    assert made.histogram == {SHIFT: SIZE**2 - 600}
-    assert made.disparity_px == (SHIFT, SHIFT)
-    assert made.correlation == pytest.approx(1.0)
-    left, warped = picture(made.uris["slider_left"]), picture(made.uris["slider_warped"])
-    inner = np.s_[40:, 2 * SHIFT : -SHIFT]
-    assert np.abs(left - warped)[inner].mean() < 3  # grey values: compression
-    assert left[inner].std() > 20
-    difference = picture(made.uris["slider_difference"])
-    assert difference[inner].min() > 235
-    assert np.abs(warped[15:25, 26:44] - tile_pictures.NO_MATCH).max() < 25
-    assert np.abs(difference[15:25, 26:44] - tile_pictures.NO_DIFFERENCE).max() < 25
-    status = picture(made.uris["status"])
-    colours = tile_pictures.status_colours(list(FLAGS.values()))
-    for place, name in ((status[60:, 60:], "labelled"), (status[15:25, 26:44], "a_new_reason")):
-        assert np.abs(place - tuple(bytes.fromhex(colours[name][1:]))).max() < 25
-
-
-def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
-    rows = write_city(tmp_path, 1)
-    write_tiff(tmp_path / rows[0]["disp"], np.full((SIZE, SIZE), 4, np.float32), nodata=-999)
-    made = tile_pictures.tile_pictures(
-        tmp_path, rows[0], thumbnail=(9, 10**6), slider=(SIZE, 10**6)
-    )
-    assert made.correlation < 0.9
-    assert picture(made.uris["slider_difference"])[40:, 20:80].min(axis=2).mean() < 150
-
-
-@pytest.mark.parametrize("limit", [200, 2000, 20_000, 10**6])
-def test_pictures_keep_within_their_bytes(limit):
-    noise = np.random.default_rng(0).integers(0, 255, (300, 200, 3)).astype(np.uint8)
-    for image in (noise, noise[..., 0]):
-        data = base64.b64decode(pictures.encode(image, limit).partition(",")[2])
-        assert len(data) <= limit
-    shape = picture(pictures.encode(noise, limit)).shape
-    assert shape[0] / shape[1] == pytest.approx(1.5, rel=0.2)
-    assert (shape == noise.shape) == (limit == 10**6)
 
 
 def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch):
@@ -349,19 +209,6 @@ def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
     assert "and S-1 as a whole" in text
 
 
-def test_calibrated_groups_lie_on_the_lines():
-    deciles = [
-        {"mean_uncertainty": sigma, "share_below_1": once, "share_below_2": twice}
-        for sigma, once, twice in ((0.1, 0.683, 0.954), (0.3, 0.25, 1.0))
-    ]
-    drawn = drawings.calibration(deciles)
-    right, wrong = drawn.groups
-    assert [y for y, _ in drawn.right] == pytest.approx([right[1], right[2]], abs=0.11)
-    assert wrong[:3] == (0.75 * drawings.WIDTH, 0.75 * drawings.HEIGHT, 0.0)
-    assert (right[3], wrong[3]) == ("0.100", "0.300")
-    assert drawings.calibration([]) is None
-
-
 def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path):
     write_city(tmp_path / "tiles", 2)
     page.write_report(
@@ -378,56 +225,6 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
 def test_without_a_manifest_it_says_what_to_do(tmp_path):
     with pytest.raises(InputError, match="no manifest"):
         page.write_report("None", tmp_path, tmp_path / "index.html")
-
-
-def test_arrows_have_the_length_of_their_key(tmp_path):
-    record = json.loads(alignment(tmp_path / "a.json").read_text())
-    view = record["left"]
-    longest = drawings.longest_residual(view["gcps"], "before")
-    assert longest == 10.0  # not that of the point left out
-    frame = drawings.arrow_frame("", view["size"], view["gcps"], "before", longest)
-    assert frame.key_px == 10.0
-    per_px = frame.key_length / frame.key_px
-    first, second, out = frame.arrows
-    assert (first.dx / per_px, first.dy / per_px) == pytest.approx((3, 4), abs=0.05)
-    assert (second.dx / per_px, second.dy / per_px) == pytest.approx((-6, 8), abs=0.05)
-    assert (first.x, first.y) == (150.0, 75.0)  # 100, 50 of 200 px in a frame of 300
-    assert not out.used and out.dx == pytest.approx(
-        20 * per_px, abs=0.1
-    )  # cut to twice the longest
-
-
-def test_histograms_share_their_axis_and_keep_every_label():
-    one, two = {0: 10, 5: 30}, {-40: 60, 59: 20}
-    first, second = drawings.histograms([("one", "red", one), ("two", "red", two)])
-    assert first.count == 40 and second.count == 80
-    assert first.mean == pytest.approx((0.5 * 10 + 5.5 * 30) / 40)
-    assert first.ticks == second.ticks
-    bar = drawings.WIDTH / 50  # px of two: −40 … 60
-    heights = [float(y) for y in re.findall(r"V([\d.]+)H", first.path)]
-    assert len(heights) == 50
-    assert heights[20] == pytest.approx(drawings.HEIGHT * (1 - 10 / 30), abs=0.1)
-    assert heights[22] == 0
-    assert re.findall(r"H([\d.]+)", first.path)[0] == f"{bar:.1f}"
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "shown"),
-    [
-        ("labelled_share", "0.123456", "12.35 %"),
-        ("mean_px", "-0.1", "−0.100"),
-        ("mean_px", "-0.0001", "0.000"),
-        ("labelled_share", "-0.00001", "0.00 %"),
-        ("row0", "1024", "1024"),
-        ("labels", "5061336", "5 061 336"),
-        ("class", "building", "building"),
-        ("lon", "114.30004567", "114.30005"),
-        ("rms", "nan", "nan"),
-        ("rms", "", ""),
-    ],
-)
-def test_values_are_shown_as_people_read_them(name, text, shown):
-    assert html_tables.show(name, text) == shown
 
 
 # ------------------------------------------------------------------------------ in a browser

@@ -14,12 +14,11 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.evaluation.audit import audit, sharing
+from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
-from stereotruth.evaluation.audit.estimates import Estimate
-from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits, judge
+from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits
 
-from .audit_scene import make, sample, texture
+from ....synthetic.pair_with_block import make
 
 LIMITS = Limits(0.3, 0.3, 0.05, 0.01, 0.01)
 
@@ -205,78 +204,3 @@ def test_an_unreadable_file_is_named(tmp_path):
     (tmp_path / "test/left/KM_left_1.tiff").write_bytes(b"no image")
     with pytest.raises(InputError, match="KM_left_1"):
         audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
-
-
-def overlapping(shift, seed, angle=0.0):
-    """Two looks at one ground, ``shift`` px apart, and one at another."""
-    rng = np.random.default_rng(seed)
-    ground, other = texture(rng, 800), texture(rng, 800)
-    y, x = np.mgrid[:300, :300].astype(float)
-    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-    looks = [
-        sample(ground, x, y),
-        0.7 * sample(ground, c * x - s * y + shift, s * x + c * y) + 90,
-        sample(other, x, y),
-    ]
-    return [np.rint(look + rng.normal(0, 4, look.shape)).astype(np.uint16) for look in looks]
-
-
-@pytest.mark.parametrize("shift, angle", [(0, 0), (140, 0), (210, 0), (110, 12)])
-def test_shared_ground(shift, angle):
-    images = [sharing.features(image) for image in overlapping(shift, 60, angle)]
-    (found,) = sharing.find_shared(images)
-    assert (found.first, found.second) == (0, 1)
-    if not angle:
-        assert found.share == pytest.approx(1 - shift / 300, abs=0.02)
-
-
-def test_of_many_images_only_likely_pairs_are_compared(monkeypatch):
-    monkeypatch.setattr(sharing, "ALL", 0)
-    rng = np.random.default_rng(63)
-    others = [texture(rng, 200).astype(np.uint16) for _ in range(20)]
-    images = [sharing.features(image) for image in overlapping(110, 64) + others]
-    assert len(sharing._candidates(images)) < 60  # of 253
-    (found,) = sharing.find_shared(images)
-    assert (found.first, found.second) == (0, 1)
-
-
-def test_unrelated_images_share_nothing():
-    rng = np.random.default_rng(61)
-    images = [texture(rng, 300).astype(np.uint16) for _ in range(4)]
-    assert sharing.find_shared([sharing.features(image) for image in images]) == []
-    assert max(sharing.chance_inliers(images)) < sharing.MIN_INLIERS
-    assert sharing.find_shared([sharing.features(np.zeros((64, 64), np.uint16))] * 2) == []
-
-
-def figures(bias, error, freedom=40):
-    plain = [0.0, 0.01, freedom]
-    return {
-        "same_shape": True,
-        "identical_images": False,
-        "images": {},
-        "dtype": ["uint16"],
-        "matches": 500,
-        "rows": {"parallax": plain, "tilt_x": plain, "tilt_y": plain},
-        "labels": {"labelled": 0.8, "strays": [], "outside": 0.0, "spikes": [], "step": None},
-        "convention": {"taken": "as stated"},
-        "bias": {"matches": 500, "bias": [bias, error, freedom], "tilt_x": plain, "tilt_y": plain},
-        "contradicted": {"share": [0.001, 0.001, freedom], "labels": 5000},
-        "hidden": {"share": 0.0},
-        "registration": {"move": [1, 0], "gain": [-0.1, 0.01, freedom]},
-    }
-
-
-def test_verdicts_have_the_error_rate_that_is_stated():
-    """Biases at the very edge of what is tolerated, many datasets of 20 pairs."""
-    rng = np.random.default_rng(62)
-    limits = Limits(0.3, 0.3, 0.05, 0.02, 0.2)
-    alarms = 0
-    for _ in range(120):
-        seen = 0.3 + 0.05 * rng.standard_normal(20)
-        spread = 0.05 * np.sqrt(rng.chisquare(40, 20) / 40)
-        alarms += any(judge(figures(b, e), limits, 20).word == FAULT for b, e in zip(seen, spread))
-    assert alarms / 120 <= 0.2
-    assert judge(figures(2.0, 0.05), limits, 20).word == FAULT
-    assert judge(figures(0.0, 0.02), limits, 20).word == GOOD
-    assert judge(figures(0.3, 0.05), limits, 20).word == "undecided"
-    assert Estimate(0.3, 0.05, 40).beyond(0.3, 0.2) is None

@@ -16,7 +16,7 @@ from stereotruth.errors import InputError
 from stereotruth.matching.benchmark.predictions import predict, read_prediction, read_record
 from stereotruth.products.rasters import read_disparity
 
-from .test_layouts import write
+from ....synthetic.images import write
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 SHAPE = (8, 12)

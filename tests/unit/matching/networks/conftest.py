@@ -13,7 +13,6 @@ from rasterio.errors import NotGeoreferencedWarning
 from stereotruth.dataset.stereo_dataset import StereoDataset
 
 SIZE, RANGE = 64, (-16, 16)
-SHARED = Path(__file__).parents[3] / "shared" / "published"
 
 
 def random_pair(rng: np.random.Generator, disparity: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,13 +15,9 @@ from pathlib import Path
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-from stereotruth.matching.networks import training_state
-
-pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
-
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.networks.losses import loss_of
+from stereotruth.matching.networks import training_state
 from stereotruth.matching.networks.training import train
 from stereotruth.matching.networks.training_settings import TrainingSettings
 from stereotruth.matching.networks.training_state import start
@@ -29,6 +25,7 @@ from stereotruth.matching.networks.weights import SavedNetwork, load_weights, sa
 
 from .conftest import RANGE
 
+pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 MODEL = SavedNetwork("stereonet", RANGE)
 SHORT = TrainingSettings(epochs=2, crop_px=(32, 64), device="cpu", threads=1, seed=4)
 
@@ -39,23 +36,6 @@ def weights(out: Path) -> dict[str, torch.Tensor]:
 
 def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(a[name], b[name]) for name in a)
-
-
-def test_the_loss_counts_labelled_pixels_only() -> None:
-    disparity = torch.full((1, 4, 4), float("nan"))
-    disparity[0, 0, 0], disparity[0, 0, 1] = 4.0, 10.0
-    output = torch.zeros(1, 4, 4)
-    # smooth L1: |e| - 1/2 beyond one pixel
-    assert loss_of([output], disparity, [1.0]).item() == pytest.approx((3.5 + 9.5) / 2)
-    assert loss_of([output] * 2, disparity, [1.0, 0.5]).item() == pytest.approx(1.5 * 6.5)
-    # at half the size: one pixel is labelled, by the mean of its two labels, in its own pixels
-    assert loss_of([torch.zeros(1, 2, 2)], disparity, [1.0]).item() == pytest.approx(3.5 - 0.5)
-    assert loss_of([output], torch.full((1, 4, 4), float("nan")), [1.0]).item() == 0
-
-
-def test_the_learning_rate_is_halved_every_ten_epochs() -> None:
-    rates = [training_state.learning_rate_of(TrainingSettings(), epoch) for epoch in (0, 9, 10, 25)]
-    assert rates == [1e-3, 1e-3, 5e-4, 2.5e-4]
 
 
 def test_training_lowers_the_loss_and_keeps_the_best(
@@ -198,10 +178,3 @@ def test_mistakes_are_named(dataset: StereoDataset, tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="weights of psmnet with 1 channels, not of stereonet"):
         start(MODEL, replace(SHORT, initial_weights=str(tmp_path / "p.pt")))
-
-
-def test_settings_of_a_method_precede_the_general_ones() -> None:
-    made = TrainingSettings.of(
-        {"epochs": 120, "crop_px": [64, 64], "augmentation": {"noise": 0.1}}, {"epochs": 3}
-    )
-    assert (made.epochs, made.crop_px, made.augmentation.noise) == (3, (64, 64), 0.1)

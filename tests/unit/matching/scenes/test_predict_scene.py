@@ -16,8 +16,8 @@ from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.whole_images import match
 from stereotruth.products.grids import Layer, building, create_grid, open_grid
 
-from .test_block_store import Killed, tree
-from .test_blocks import textured
+from ....synthetic.images import textured
+from ....synthetic.stores import Killed, tree
 
 SHAPE = (600, 900)
 SETTINGS = {"kind": "sgm", "mode": "sgbm"}

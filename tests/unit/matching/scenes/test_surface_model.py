@@ -5,12 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pyproj
 import pytest
 import rasterio
-from scipy.optimize import least_squares
 
-from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
@@ -26,44 +23,14 @@ from stereotruth.matching.scenes.surface_model import (
 )
 from stereotruth.products.grids import Layer, building, create_grid
 
-from .test_block_store import Killed
-from .test_epipolar import HEIGHT, LAT, LON, camera
-
-SIZE = (420, 380)
-EPSG = 32650
-UTM = pyproj.Transformer.from_crs(4326, EPSG, always_xy=True)
+from ....synthetic.cameras import HEIGHT
+from ....synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
+from ....synthetic.stores import Killed
 
 
 @pytest.fixture(scope="module")
 def model() -> EpipolarModel:
-    left, right = (
-        camera(tilt, size=SIZE, angle=angle, gsd=gsd_m)
-        for tilt, angle, gsd_m in (((0.03, -0.1), 12.0, 0.65), ((-0.05, 0.5), 10.0, 0.8))
-    )
-    return fit_epipolar(left, right, SIZE, SIZE, HEIGHT)
-
-
-def disparity_of(model: EpipolarModel, surface) -> np.ndarray:
-    """The grid's disparities of a surface, height (m) of (lon, lat), along the rays."""
-    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
-    h = np.full(x.shape, HEIGHT)
-    for _ in range(30):
-        lon, lat = model.epipolar_to_ground(x, y, h)
-        h = surface(lon, lat)
-    x_right = model.ground_to_epipolar(lon, lat, h)[2].reshape(x.shape)
-    return (x - x_right).astype(np.float32)
-
-
-def metres(lon, lat):
-    """East and north of the middle of the scene, m."""
-    east, north = UTM.transform(np.ravel(lon), np.ravel(lat))
-    middle = UTM.transform(LON, LAT)
-    return (np.reshape(v - m, np.shape(lon)) for v, m in zip((east, north), middle))
-
-
-def plane(lon, lat):
-    east, north = metres(lon, lat)
-    return HEIGHT + 0.3 * east - 0.15 * north
+    return make_model()
 
 
 @pytest.fixture(scope="module")
@@ -88,47 +55,6 @@ def read(path: Path) -> tuple[np.ndarray, Raster, dict]:
         t = dataset.transform
         raster = Raster(dataset.crs.to_epsg(), t.c, t.f, t.a, dataset.shape)
         return values, raster, dataset.tags() | {"profile": dataset.profile}
-
-
-def test_intersections_project_back_and_lie_on_the_surface(model, of_plane):
-    d = of_plane.copy()
-    d[10:14, 20:30] = np.nan
-    d[200:, 300:] += 40.0  # a jump
-    lon, lat, h = intersect(model, d[5:], row=5)
-    assert np.array_equal(np.isfinite(h), np.isfinite(d[5:]))
-    y, x = np.mgrid[5 : model.shape[0], : model.shape[1]]
-    xl, yl, xr, yr = model.ground_to_epipolar(lon, lat, h).reshape(4, *h.shape)
-    known = np.isfinite(h)
-    for found, wanted in ((xl, x), (xr, x - d[5:].astype(float)), (yl, y), (yr, y)):
-        assert np.abs(found - wanted)[known].max() < 1e-4
-    flat = known.copy()
-    flat[195:, 300:] = False
-    assert np.abs(h - plane(lon, lat))[flat].max() < 1e-4
-
-
-def test_rays_that_miss_are_brought_together_by_least_squares(model):
-    """Against a general solver, at places where the epipolar rows were moved apart."""
-    moved = model.right_image.shifted(0.0, -0.7)
-    apart = EpipolarModel(**{**vars_of(model), "right_image": moved})
-    for row, col, d in ((40, 50, 3.0), (200, 200, -20.0), (300, 120, 60.0)):
-        found = intersect(apart, np.full((1, 1), d, np.float32), row, col)[:, 0, 0]
-        places = np.array(
-            [*model.left_image.inverse(col, row), *moved.inverse(col - d, row)]
-        ).ravel()
-
-        def residuals(p, places=places):
-            lon, lat = LON + p[0] * 1e-5, LAT + p[1] * 1e-5
-            both = [*model.left.project(lon, lat, p[2]), *model.right.project(lon, lat, p[2])]
-            return np.array(both).ravel() - places
-
-        best = least_squares(residuals, [0.0, 0.0, HEIGHT], xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        wanted = np.array([LON + best.x[0] * 1e-5, LAT + best.x[1] * 1e-5, best.x[2]])
-        assert np.abs(best.fun).max() > 0.1
-        assert np.abs((found - wanted) * (1e5, 1e5, 1.0)).max() < 2e-3
-
-
-def vars_of(model: EpipolarModel) -> dict:
-    return {name: getattr(model, name) for name in EpipolarModel.__dataclass_fields__}
 
 
 def test_the_model_of_a_plane_is_the_plane(model, of_plane, tmp_path):
