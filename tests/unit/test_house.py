@@ -150,7 +150,9 @@ def test_tests_mirror_the_house():
         if not module.startswith("unit.") or not module.rpartition(".")[2].startswith("test_"):
             continue
         of = module.removeprefix("unit.").replace("test_", "")
-        assert any(of == m or of.startswith(f"{m}_") for m in modules) or of in NOT_OF_A_FILE, module
+        assert any(of == m or of.startswith(f"{m}_") for m in modules) or of in NOT_OF_A_FILE, (
+            module
+        )
 
 
 NOT_OF_A_FILE = {"house", "simulate.simulated_scene"}

@@ -11,17 +11,16 @@ import yaml
 pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
-
-from ..workflow.conftest import Project, copy_project
-from .conftest import RANGE
+from ..synthetic.project import Project, copy_project
+from ..synthetic.small_pairs import RANGE, small_dataset
 
 TRAINING = {"epochs": 1, "crop_px": [32, 64], "device": "cpu"}
 
 
 @pytest.fixture(scope="module")
-def made(dataset: StereoDataset, tmp_path_factory: pytest.TempPathFactory) -> Project:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Project:
     """Methods first (from scratch) and second (from first's weights on another dataset)."""
+    dataset = small_dataset(tmp_path_factory.mktemp("pairs"))
     project = copy_project(tmp_path_factory.mktemp("made") / "project")
     for name in ("one", "two"):
         shutil.copytree(dataset.root, project.folder / name)

@@ -23,7 +23,7 @@ from stereotruth.matching.networks.training_settings import TrainingSettings
 from stereotruth.matching.networks.training_state import start
 from stereotruth.matching.networks.weights import SavedNetwork, load_weights, save_weights
 
-from .conftest import RANGE
+from ....synthetic.small_pairs import RANGE
 
 pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 MODEL = SavedNetwork("stereonet", RANGE)

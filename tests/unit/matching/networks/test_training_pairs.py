@@ -16,7 +16,7 @@ from stereotruth.matching.networks.image_scaling import scaled
 from stereotruth.matching.networks.training_pairs import Augmentation, LabelledPairs
 from stereotruth.products.rasters import read_image
 
-from .conftest import SIZE
+from ....synthetic.small_pairs import SIZE
 
 
 def test_pairs_are_scaled_and_unlabelled_pixels_are_nan(dataset: StereoDataset) -> None:
