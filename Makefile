@@ -1,5 +1,6 @@
 # make tiles/<City>   set up, then make the tiles of a city of config/cities.tsv
-# make test           set up, then pass the tests
+# make test           set up, then pass the tests that every change needs
+# make test-all       set up, then pass all: kills and restarts, browsers, benchmarks, real scenes too
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 PYTHON ?= python3
@@ -7,7 +8,7 @@ CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup networks test test-networks test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -26,13 +27,16 @@ dataset verify: %: $(READY) FORCE
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
 
 test: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup -m "not slow"
+
+test-all: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup
 
 networks: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/networks
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py
 
 test-cluster: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" tests/cluster/run.sh
@@ -42,7 +46,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/snakefmt --check Snakefile workflow
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --lint
-	$(BIN)/python tests/check_lock.py
+	$(BIN)/python envs/check_lock.py
 
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:

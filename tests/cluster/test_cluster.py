@@ -15,8 +15,7 @@ import pytest
 
 from stereotruth.simulate.__main__ import make_scene
 
-from ..workflow.conftest import SIZE, TINY, Project, copy_project, row_of
-from ..workflow.test_end_to_end import hashes
+from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
 pytestmark = pytest.mark.skipif(
     "TEST_CLUSTER" not in os.environ, reason="starts a SLURM: run make test-cluster"

@@ -1,137 +1,16 @@
-"""A copy of the workflow that a test may run and edit, fed with a small synthetic city."""
+"""Projects of a small synthetic city, for the tests of the workflow."""
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 
 from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
 
-ROOT = Path(__file__).parents[2]
-SHEET_COLUMNS = [
-    "scene",
-    "city",
-    "left_image",
-    "right_image",
-    "lidar",
-    "lidar_crs",
-    "geoid",
-    "gcps",
-]
-
-TINY = CitySpec(
-    name="Tiny",
-    lon=114.3,
-    lat=30.6,
-    epsg=32650,
-    base_height_m=20.0,
-    world_seed=7,
-    character=Character(
-        relief_m=8,
-        valley=0.2,
-        wavelength_m=900,
-        max_slope_deg=10,
-        river_m=0,
-        lakes=0,
-        zones={"slabs": 3, "lowrise": 2, "park": 1},
-        towers_m=(30, 40),
-        trees=0.4,
-        zone_m=150.0,
-    ),
-    scenes=(
-        SceneSpec("Tiny-1", (0.0, 0.0), 560, 560, 5, lidar_grid=(2, 1), ragged_m=(20.0, 20.0)),
-    ),
-)
-SIZE = {"tiles": {"size": 128, "min_labelled": 0.5}}
-
-
-@dataclass
-class Run:
-    """What a call of snakemake said."""
-
-    status: int
-    text: str
-
-    @property
-    def jobs(self) -> dict[str, int]:
-        """Planned jobs by rule, from the last table of job counts."""
-        tables = self.text.split("Job stats:")
-        if len(tables) == 1:
-            return {}
-        found = re.findall(r"^(\w+)\s+(\d+)$", tables[-1], flags=re.MULTILINE)
-        return {rule: int(n) for rule, n in found if rule != "total"}
-
-
-@dataclass
-class Project:
-    """A working directory with the workflow's files, and a source tree of its own.
-
-    ``edited``: use that source tree, instead of the installed package, whose code is compiled.
-    """
-
-    folder: Path
-    edited: bool = False
-
-    def snakemake(self, *arguments: str, cores: int = 2) -> Run:
-        environment = dict(os.environ)
-        if self.edited:
-            environment["PYTHONPATH"] = str(self.folder / "src")
-            environment.pop("NUMBA_CACHE_DIR", None)
-        done = subprocess.run(
-            [sys.executable, "-m", "snakemake", "--cores", str(cores), *arguments],
-            cwd=self.folder,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=900,
-        )
-        return Run(done.returncode, done.stdout)
-
-    def plan(self, *arguments: str) -> dict[str, int]:
-        """Jobs by rule that a call would run."""
-        run = self.snakemake("--dry-run", *arguments)
-        assert run.status == 0, run.text
-        return run.jobs
-
-    def edit(self, file: str, old: str, new: str) -> None:
-        path = self.folder / file
-        text = path.read_text()
-        assert old in text, f"{old!r} is not in {file}"
-        path.write_text(text.replace(old, new, 1))
-
-    def add_scene(self, name: str, rows: list[dict[str, str]], **overrides: object) -> str:
-        """Write sheets and a config for a city of one's own; returns the config's file name."""
-        import yaml
-
-        lines = ["\t".join(SHEET_COLUMNS)]
-        lines += ["\t".join(row.get(c, "") for c in SHEET_COLUMNS) for row in rows]
-        (self.folder / f"{name}_scenes.tsv").write_text("\n".join(lines) + "\n")
-        cities = ["city\tprefix\ttraining\tvalidation\ttesting"]
-        for n, city in enumerate(dict.fromkeys(row["city"] for row in rows)):
-            cities.append(f"{city}\tC{n}\t6\t1\t3")
-        (self.folder / f"{name}_cities.tsv").write_text("\n".join(cities) + "\n")
-        config = {"scenes": f"{name}_scenes.tsv", "cities": f"{name}_cities.tsv", **overrides}
-        (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(config))
-        return f"{name}.yaml"
-
-
-def copy_project(folder: Path) -> Project:
-    """Copy what a clone holds of the workflow and the package into ``folder``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(ROOT / "Snakefile", folder)
-    for name in ("workflow", "config", "profiles", "envs", "src"):
-        ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
-        shutil.copytree(ROOT / name, folder / name, ignore=ignore)
-    return Project(folder)
+from ..synthetic.project import SIZE, TINY, Project, copy_project, row_of
 
 
 @pytest.fixture
@@ -147,18 +26,6 @@ def data(tmp_path_factory) -> Path:
     return folder
 
 
-def row_of(folder: Path, **changes: str) -> dict[str, str]:
-    return {
-        "scene": "Tiny-1",
-        "city": "Tiny",
-        "left_image": str(folder / "left.tif"),
-        "right_image": str(folder / "right.tif"),
-        "lidar": str(folder / "lidar"),
-        "gcps": str(folder / "gcps.csv"),
-        **changes,
-    }
-
-
 @pytest.fixture(scope="session")
 def made(data, tmp_path_factory) -> Project:
     """A project in which tiles/Tiny has been made, by two cores; config in tiny.yaml."""
@@ -168,4 +35,55 @@ def made(data, tmp_path_factory) -> Project:
     run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
     assert run.status == 0, run.text[-4000:]
     assert "Look at tiles/Tiny/manifest.csv" in run.text
+    return project
+
+
+FUNCTION = """
+import cv2
+import numpy as np
+
+def match(left, right, disparity_range, block):
+    low = -16  # OpenCV leaves as many columns out as the range is wide
+    matcher = cv2.StereoSGBM.create(low, 48, block)
+    eight = [cv2.convertScaleAbs(image, alpha=0.1) for image in (left, right)]
+    disparity = matcher.compute(*eight) / np.float32(16)
+    return np.where(disparity < low, np.nan, disparity)
+"""
+OF_OWN = {"disparity_range": [-64, 64], "methods": ["sgm", "mine", "theirs"]}
+FAULTY = {"root": "faulty", "layout": "stereotruth", "disparity_range": [-64, 64]}
+SETTINGS = {
+    "benchmark": {
+        "datasets": {"synthetic": OF_OWN, "faulty": FAULTY},
+        "methods": {
+            "mine": {"kind": "function", "function": "mine.py:match", "options": {"block": 5}},
+            "theirs": {"kind": "folder", "folder": "theirs", "label": "Theirs"},
+        },
+        "split": None,
+        "bootstrap": 100,
+    },
+    "predict": {"block_px": 256, "overlap_px": 32},
+}
+
+
+@pytest.fixture(scope="session")
+def tiled(made, tmp_path_factory) -> Project:
+    """The project with the city's tiles, and later.yaml beside tiny.yaml: nothing made of it."""
+    project = made.copy(tmp_path_factory.mktemp("tiled") / "project")
+    (project.folder / "later.yaml").write_text(yaml.safe_dump(SETTINGS))
+    (project.folder / "mine.py").write_text(FUNCTION)
+    (project.folder / "faulty").mkdir()
+    return project
+
+
+@pytest.fixture(scope="session")
+def later(tiled, tmp_path_factory) -> Project:
+    """The project in which the stages after the tiles have run, by one call."""
+    project = tiled.copy(tmp_path_factory.mktemp("later") / "project")
+    run = project.snakemake(
+        *("dataset", "report", "audit/synthetic", "benchmark/synthetic/sgm"),
+        "results/predict/Tiny/Tiny-1/sgm_dsm.tif",
+        *("--configfile", "tiny.yaml", "later.yaml"),
+    )
+    assert run.status == 0, run.text[-4000:]
+    assert "Traceback" not in run.text
     return project

@@ -7,44 +7,27 @@ import json
 import shutil
 
 import pytest
-import yaml
 
-from .conftest import Project
+pytestmark = pytest.mark.xdist_group("tiny")
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
-
-ARGUMENTS = ["--configfile", "tiny.yaml", "mine.yaml"]
-FAULTY = {"root": "faulty", "layout": "stereotruth", "disparity_range": [-64, 64]}
-
-
-@pytest.fixture(scope="module")
-def audited(made, tmp_path_factory):
-    """A copy of the project with the city's tiles, of which the dataset has been audited."""
-    folder = tmp_path_factory.mktemp("audited") / "project"
-    shutil.copytree(made.folder, folder)
-    settings = {"benchmark": {"datasets": {"faulty": FAULTY}}}
-    (folder / "mine.yaml").write_text(yaml.safe_dump(settings))
-    (folder / "faulty").mkdir()
-    project = Project(folder)
-    run = project.snakemake("audit/synthetic", *ARGUMENTS)
-    assert run.status == 0, run.text[-4000:]
-    assert run.jobs == {"dataset": 1, "audit": 1}
-    return project
+ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 
 def summary(project, dataset):
     return json.loads((project.folder / f"audit/{dataset}/summary.json").read_text())
 
 
-def test_the_workflow_s_own_dataset_has_no_faults(audited):
-    found = summary(audited, "synthetic")
+def test_the_workflow_s_own_dataset_has_no_faults(tiled, later):
+    assert tiled.plan("audit/synthetic", *ARGUMENTS) == {"dataset": 1, "audit": 1}
+    found = summary(later, "synthetic")
     assert found["pairs"] >= 4 and found["labelled_pairs"] >= 4
     assert found["verdicts"]["fault"] == 0, found["statements"]
     assert abs(found["pooled"]["label_bias_px"]["median"]) < 0.1
-    assert audited.plan("audit/synthetic", *ARGUMENTS) == {}
+    assert later.plan("audit/synthetic", *ARGUMENTS) == {}
 
 
-def test_a_limit_judges_again_and_a_changed_dataset_is_audited(audited):
+def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
+    audited = later.copy(tmp_path / "audited")
     (audited.folder / "limit.yaml").write_text("audit: {parallax_px: 0.2}\n")
     assert audited.plan("audit/synthetic", *ARGUMENTS, "limit.yaml") == {"audit": 1}
     faulty = audited.folder / "faulty"
@@ -60,6 +43,6 @@ def test_a_limit_judges_again_and_a_changed_dataset_is_audited(audited):
     assert faults == {rows[0]["tile"]: "left and right image are the same"}
 
 
-def test_an_unknown_dataset_is_named(audited):
-    run = audited.snakemake("audit/nothing", *ARGUMENTS)
+def test_an_unknown_dataset_is_named(tiled):
+    run = tiled.snakemake("audit/nothing", *ARGUMENTS)
     assert run.status != 0 and "no dataset 'nothing'" in run.text

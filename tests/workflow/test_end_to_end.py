@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import os
 import shutil
@@ -14,24 +13,15 @@ import pytest
 import rasterio
 import rioxarray
 
-from .conftest import SIZE, TINY, Project, copy_project, row_of
+from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+pytestmark = pytest.mark.xdist_group("tiny")
 
 STAGES = {"align", "refine", "rectify", "project", "export"}
 
 
 def plan(project: Project, *arguments: str) -> dict[str, int]:
     return project.plan("tiles/Tiny", "--configfile", "tiny.yaml", *arguments)
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """Checksum of each file below, but for Snakemake's own time stamps."""
-    return {
-        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and file.name != ".snakemake_timestamp"
-    }
 
 
 def manifest(project: Project) -> list[dict[str, str]]:
@@ -81,87 +71,96 @@ def test_a_second_call_runs_nothing(made):
     assert plan(made) == {}
 
 
-def test_touching_inputs_runs_nothing(made):
-    for file in (made.folder / "in").rglob("*"):
+def test_touching_inputs_runs_nothing(made, tmp_path):
+    other = made.copy(tmp_path / "other")
+    for file in (other.folder / "in").rglob("*"):
         if file.is_file() and "truth" not in str(file):
             os.utime(file)
-    assert plan(made) == {}
+    assert plan(other) == {}
 
 
-def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made):
-    file = made.folder / "in/gcps.csv"
+def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made, tmp_path):
+    other = made.copy(tmp_path / "other")
+    file = other.folder / "in/gcps.csv"
     before = file.read_text()
     lines = before.splitlines()
     cells = lines[1].split(",")
     cells[4] = f"{float(cells[4]) + 0.1:.3f}"
     file.write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
-    assert set(plan(made)) == STAGES
+    assert set(plan(other)) == STAGES
     file.write_text(before)
-    assert plan(made) == {}
+    assert plan(other) == {}
 
 
-def test_another_tile_size_runs_export_only(made):
-    made.edit("tiny.yaml", "size: 128", "size: 96")
-    assert set(plan(made)) == {"export"}
-    made.edit("tiny.yaml", "size: 96", "size: 128")
-    assert plan(made) == {}
+def test_another_tile_size_runs_export_only(made, tmp_path):
+    other = made.copy(tmp_path / "other")
+    other.edit("tiny.yaml", "size: 128", "size: 96")
+    assert set(plan(other)) == {"export"}
+    other.edit("tiny.yaml", "size: 96", "size: 128")
+    assert plan(other) == {}
 
 
-@pytest.mark.parametrize(
-    ("module", "rules"),
-    [
-        ("tiles", {"export"}),
-        ("disparity", {"project", "export"}),
-        ("rectification", {"refine", "rectify", "project", "export"}),
-        ("alignment", STAGES),
-        ("points", STAGES - {"align"} | {"ingest"}),
-        ("sheets", set()),
-        ("simulate/render", set()),
-    ],
-)
-def test_edited_code_runs_its_stage_and_what_follows(made, module, rules):
-    file = made.folder / f"src/stereotruth/{module}.py"
+EDITED = {
+    "dataset/export": {"export"},
+    "disparity/project": {"project", "export"},
+    "epipolar/rectify": {"rectify", "project", "export"},
+    "epipolar/image_reader": {"refine", "rectify", "project", "export"},
+    "alignment/align": STAGES,
+    "lidar/ingest": STAGES - {"align"} | {"ingest"},
+    "sheets": set(),
+    "simulate/render": set(),
+}
+
+
+@pytest.fixture(scope="module")
+def edited(made, tmp_path_factory) -> Project:
+    """A project that runs its own source, in which every module of EDITED has one more remark."""
+    project = made.copy(tmp_path_factory.mktemp("edited") / "project")
+    project.edited = True
+    for module in EDITED:
+        with (project.folder / f"src/stereotruth/{module}.py").open("a") as stream:
+            stream.write("\n# a remark is no change\n")
+    return project
+
+
+def test_remarks_in_the_code_run_nothing(edited):
+    assert plan(edited) == {}
+
+
+@pytest.mark.parametrize(("module", "rules"), EDITED.items())
+def test_edited_code_runs_its_stage_and_what_follows(edited, module, rules):
+    file = edited.folder / f"src/stereotruth/{module}.py"
     before = file.read_text()
-    made.edited = True
     try:
-        file.write_text(before + "\n# a remark is no change\n")
-        assert plan(made) == {}
         file.write_text(before + "\nADDED = 1\n")
-        assert set(plan(made)) == rules
+        assert set(plan(edited)) == rules
     finally:
         file.write_text(before)
-        made.edited = False
 
 
-def test_a_new_lidar_file_is_the_only_one_read(made):
-    new = made.folder / "in/lidar/new.laz"
-    shutil.copy(next((made.folder / "in/lidar").glob("*_0_1.laz")), new)
-    try:
-        after = {"refine": 1, "rectify": 1, "project": 1, "export": 1}
-        assert plan(made) == {"ingest": 1, **after}
-    finally:
-        new.unlink()
+def test_a_new_lidar_file_is_the_only_one_read(made, tmp_path):
+    other = made.copy(tmp_path / "other")
+    new = other.folder / "in/lidar/new.laz"
+    shutil.copy(next((other.folder / "in/lidar").glob("*_0_1.laz")), new)
+    after = {"refine": 1, "rectify": 1, "project": 1, "export": 1}
+    assert plan(other) == {"ingest": 1, **after}
 
 
-def test_one_core_gives_the_same_bytes(made, tmp_path):
-    other = Project(tmp_path / "other")
-    results = ("results", "tiles", "dataset", "logs", "benchmarks", ".snakemake")
-    shutil.copytree(made.folder, other.folder, ignore=shutil.ignore_patterns(*results))
-    run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml", cores=1)
-    assert run.status == 0, run.text[-4000:]
-    for product in ("results/project", "tiles"):
-        assert hashes(made.folder / product) == hashes(other.folder / product)
-
-
-def test_the_right_view_is_a_second_product(made, tmp_path):
-    """Asked for later, it adds files and leaves the others; both views name each other's pixels."""
-    other = Project(tmp_path / "other")
-    shutil.copytree(made.folder, other.folder)
+@pytest.fixture(scope="module")
+def both_views(made, tmp_path_factory) -> Project:
+    """The project in which the right view has been asked for later."""
+    other = made.copy(tmp_path_factory.mktemp("both") / "project")
     config = other.folder / "tiny.yaml"
     config.write_text(config.read_text() + "project: {right_view: true}\n")
     assert plan(other) == {"project_right": 1, "export": 1}
     run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
     assert run.status == 0, run.text[-4000:]
+    return other
+
+
+def test_the_right_view_is_a_second_product(made, both_views):
+    """Asked for later, it adds files and leaves the others; both views name each other's pixels."""
+    other = both_views
     row = next(row for row in manifest(other) if row["complete"] == "yes")
     folder = other.folder / "tiles/Tiny"
     left, right = (
@@ -177,25 +176,21 @@ def test_the_right_view_is_a_second_product(made, tmp_path):
     miss = np.abs(back - right[rows[inside], cols[inside]])[np.isfinite(back)]
     assert miss.size > 0.3 * left.size
     assert (miss < 0.2).mean() > 0.95
+
+
+def test_verify_finds_an_edited_tile(both_views, tmp_path):
+    other = both_views.copy(tmp_path / "other")
     assert other.snakemake("verify", "--configfile", "tiny.yaml").status == 0
-
-
-def test_verify_finds_an_edited_tile(made, tmp_path):
-    assert made.snakemake("verify", "--configfile", "tiny.yaml").status == 0
-    tile = next((made.folder / "tiles/Tiny/left").iterdir())
-    before = tile.read_bytes()
-    tile.write_bytes(before[:-1] + b"x")
-    run = made.snakemake("verify", "--configfile", "tiny.yaml")
-    tile.write_bytes(before)
+    tile = next((other.folder / "tiles/Tiny/left").iterdir())
+    tile.write_bytes(tile.read_bytes()[:-1] + b"x")
+    run = other.snakemake("verify", "--configfile", "tiny.yaml")
     assert run.status != 0
     assert tile.name in run.text
 
 
-def test_the_dataset_has_the_published_layout(made):
-    run = made.snakemake("dataset", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    root = made.folder / "dataset"
-    labelled = [row for row in manifest(made) if row["split"] in ("train", "val", "test")]
+def test_the_dataset_has_the_published_layout(later):
+    root = later.folder / "dataset"
+    labelled = [row for row in manifest(later) if row["split"] in ("train", "val", "test")]
     for kind in ("left", "right", "disp"):
         files = list(root.glob(f"with ground truth/*/{kind}/*.tiff"))
         assert len(files) == len(labelled)
@@ -284,36 +279,58 @@ def lidar_elsewhere(folder: Path) -> dict[str, str]:
     return other_lidar(folder, 32650, 20_000.0)
 
 
-@pytest.mark.parametrize(
-    ("mistake", "words"),
-    [
-        (image_without_rpc, ["plain.tif", "RPC"]),
-        (nodata_only_image, ["empty.tif", "nodata"]),
-        (gcp_outside, ["edited.csv", "outside", "left.tif"]),
-        (two_gcps, ["edited.csv", "affine", "shift"]),
-        (swapped_images, ["swapped"]),
-        (lidar_without_crs, ["other", "lidar_crs"]),
-        (lidar_of_another_zone, ["CRS"]),
-        (lidar_elsewhere, ["overlap"]),
-    ],
-)
-def test_a_mistake_ends_in_one_clear_message(data, tmp_path, mistake, words):
-    folder = tmp_path / "in"
-    shutil.copytree(data, folder, ignore=shutil.ignore_patterns("truth.zarr"))
-    project = copy_project(tmp_path / "project")
-    project.add_scene("wrong", [row_of(folder, **mistake(folder))], **SIZE)
-    run = project.snakemake("tiles/Tiny", "--configfile", "wrong.yaml")
+MISTAKES = {
+    image_without_rpc: ["plain.tif", "RPC"],
+    nodata_only_image: ["empty.tif", "nodata"],
+    gcp_outside: ["edited.csv", "outside", "left.tif"],
+    two_gcps: ["edited.csv", "affine", "shift"],
+    swapped_images: ["swapped"],
+    lidar_without_crs: ["other", "lidar_crs"],
+    lidar_of_another_zone: ["CRS"],
+    lidar_elsewhere: ["overlap"],
+}
+OF_LIDAR = (lidar_without_crs, lidar_of_another_zone, lidar_elsewhere)
+
+
+def name_of(mistake) -> str:
+    """The scene, and its city, in which it is made."""
+    return mistake.__name__.replace("_", "-")
+
+
+@pytest.fixture(scope="module")
+def mistaken(data, tmp_path_factory):
+    """One run of a scene for each mistake; a failing one does not stop the others."""
+    top = tmp_path_factory.mktemp("mistaken")
+    rows = []
+    for mistake in MISTAKES:
+        folder = top / name_of(mistake)
+        shutil.copytree(data, folder, ignore=shutil.ignore_patterns("truth.zarr"))
+        if mistake not in OF_LIDAR:  # one file will do
+            next((folder / "lidar").glob("*_0_1.laz")).unlink()
+        name = name_of(mistake)
+        rows.append(row_of(folder, scene=name, city=name, **mistake(folder)))
+    project = copy_project(top / "project")
+    project.add_scene("wrong", rows, **SIZE)
+    targets = [f"tiles/{row['city']}" for row in rows]
+    return project, project.snakemake("--keep-going", *targets, "--configfile", "wrong.yaml")
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=name_of)
+def test_a_mistake_ends_in_one_clear_message(mistaken, mistake):
+    project, run = mistaken
     assert run.status != 0
     message = run.text.strip().splitlines()
-    errors = {line.partition("error: ")[2] for line in message if "error: " in line}
+    scene = f"{name_of(mistake)}: error: "  # named at the time and at the end
+    said = [line for line in message if scene in line]
+    errors = {line.partition("error: ")[2] for line in said}
     # one, or one for each of the two LiDAR files that are read at the same time
     assert 1 <= len(errors) <= (2 if mistake is lidar_without_crs else 1), run.text[-3000:]
-    said = [line for line in message if "error: " in line]
-    assert all("Tiny-1: error: " in line for line in said)  # the scene, at the time and at the end
     assert len(said) == 2 * len(errors)
     for error in errors:
-        for word in ["Remedy:", *words]:
+        for word in ["Remedy:", *MISTAKES[mistake]]:
             assert word in error, error
+    scenes = [f"{name_of(other)}: error: " for other in MISTAKES]
+    assert all(any(of in line for of in scenes) for line in message if "error: " in line)
     assert "Traceback" not in run.text
     left = [f for f in (project.folder / "results").rglob("*") if f.suffix == ".partial"]
     assert left == []

@@ -7,9 +7,7 @@ import sys
 
 import pytest
 
-from stereotruth.products.provenance import source_modules
-
-from .conftest import ROOT
+from ..synthetic.project import ROOT
 
 
 def test_a_city_is_planned_from_nothing(project):
@@ -99,29 +97,3 @@ def test_lint_passes():
         [sys.executable, "-m", "snakemake", "--lint"], cwd=ROOT, capture_output=True, text=True
     )
     assert lint.returncode == 0, lint.stderr
-
-
-def test_every_script_has_its_rule_and_log(project):
-    rules = "".join(file.read_text() for file in (project.folder / "workflow/rules").iterdir())
-    for script in (project.folder / "workflow/scripts").glob("*.py"):
-        assert f"rule {script.stem}:" in rules
-        assert f"../scripts/{script.name}" in rules
-
-
-def test_code_digests_name_the_modules_that_the_scripts_import(project):
-    """Otherwise an edit of a module would leave stale results standing."""
-    import ast
-    import re
-
-    rules = "".join(file.read_text() for file in (project.folder / "workflow/rules").iterdir())
-    for rule, body in re.findall(r"^rule (\w+):(.*?)(?=^rule |\Z)", rules, flags=re.S | re.M):
-        digests = re.findall(r"source_digest\(([^)]*)\)", body)
-        if not digests:
-            continue
-        covered = set(source_modules(*re.findall(r'"([\w.]+)"', " ".join(digests))))
-        tree = ast.parse((project.folder / f"workflow/scripts/{rule}.py").read_text())
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth."):
-                module = node.module.removeprefix("stereotruth.")
-                # who reports and records does not change what is computed
-                assert module in covered | {"runlog", "provenance", "workers"}, (rule, module)

@@ -11,26 +11,15 @@ from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.matching.scenes.surface_model import Raster
 from stereotruth.products.grids import open_grid
 
-from .conftest import TINY, copy_project, row_of
+from ..synthetic.project import TINY
 
-pytestmark = pytest.mark.slow
-SETTINGS = {
-    "alignment": {"refine": False},  # so that no LiDAR is read
-    "predict": {"block_px": 256, "overlap_px": 32},
-}
+pytestmark = pytest.mark.xdist_group("tiny")
 TARGET = "results/predict/Tiny/Tiny-1/sgm_dsm.tif"
+ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 
-@pytest.fixture(scope="module")
-def predicted(data, tmp_path_factory):
-    project = copy_project(tmp_path_factory.mktemp("predicted") / "project")
-    project.add_scene("tiny", [row_of(data)], **SETTINGS)
-    return project, project.snakemake(TARGET, "--configfile", "tiny.yaml")
-
-
-def test_a_scene_becomes_disparities_and_a_surface_model(predicted):
-    project, run = predicted
-    assert run.status == 0, run.text[-3000:]
+def test_a_scene_becomes_disparities_and_a_surface_model(later):
+    project = later
     folder = project.folder / "results"
     found = open_grid(folder / "predict/Tiny/Tiny-1/sgm.zarr")
     model = EpipolarModel.load(folder / "rectify/Tiny/Tiny-1/epipolar.json")
@@ -53,9 +42,9 @@ def test_a_scene_becomes_disparities_and_a_surface_model(predicted):
     assert TINY.base_height_m - 5 < np.ma.median(heights) < TINY.base_height_m + 30
 
 
-def test_a_second_call_runs_nothing_and_a_resolution_only_the_model(predicted):
-    project, _ = predicted
-    assert project.plan(TARGET, "--configfile", "tiny.yaml") == {}
+def test_a_second_call_runs_nothing_and_a_resolution_only_the_model(later):
+    project = later
+    assert project.plan(TARGET, *ARGUMENTS) == {}
     (project.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
-    jobs = project.plan(TARGET, "--configfile", "tiny.yaml", "coarse.yaml")
+    jobs = project.plan(TARGET, *ARGUMENTS, "coarse.yaml")
     assert jobs == {"dsm": 1}

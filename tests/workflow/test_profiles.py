@@ -6,7 +6,7 @@ import re
 
 import yaml
 
-from .conftest import ROOT
+from ..synthetic.project import ROOT
 
 PROFILE = yaml.safe_load((ROOT / "profiles/slurm/config.yaml").read_text())
 OVERHEAD_MB = 300  # of the Snakemakes in a job

@@ -7,7 +7,7 @@ import pytest
 from stereotruth.evaluation.checkpoints import evaluate_checkpoints
 from stereotruth.evaluation.scene_warping import evaluate_warping
 
-from .conftest import ROOT
+from ..synthetic.project import ROOT
 
 SCENE = ROOT.parent / "shared" / "real" / "marseille"
 

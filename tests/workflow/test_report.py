@@ -9,20 +9,22 @@ import pytest
 
 from ..browser import look, needs_chromium, screenshot
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+pytestmark = pytest.mark.xdist_group("tiny")
 
 PAGE = "results/report/Tiny/index.html"
 
 
-@pytest.fixture(scope="session")
-def reported(made):
-    """The project in which tiles/Tiny has been made, with the city's page."""
-    run = made.snakemake("report", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    assert made.plan("report", "--configfile", "tiny.yaml") == {}
-    return made
+ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 
+@pytest.fixture(scope="module")
+def reported(later):
+    """The project with the city's page."""
+    assert later.plan("report", *ARGUMENTS) == {}
+    return later
+
+
+@pytest.mark.slow
 @needs_chromium
 def test_the_page_of_a_city_shows_every_tile(reported, tmp_path):
     page = reported.folder / PAGE
@@ -61,14 +63,13 @@ def test_the_page_of_a_city_shows_every_tile(reported, tmp_path):
 
 
 def test_another_number_of_large_pictures_makes_the_page_alone(reported):
-    settings = (reported.folder / "tiny.yaml").read_text() + "report: {sliders: 1}\n"
-    (reported.folder / "fewer.yaml").write_text(settings)
-    jobs = reported.plan("report", "--configfile", "fewer.yaml")
+    (reported.folder / "fewer.yaml").write_text("report: {sliders: 1}\n")
+    jobs = reported.plan("report", *ARGUMENTS, "fewer.yaml")
     assert set(jobs) == {"report_city", "report"}
 
 
 def test_snakemake_makes_its_own_report_of_all_that_it_marks(reported):
-    run = reported.snakemake("report", "--configfile", "tiny.yaml", "--report", "all.html")
+    run = reported.snakemake("report", *ARGUMENTS, "--report", "all.html")
     assert run.status == 0, run.text[-4000:]
     text = (reported.folder / "all.html").read_text(encoding="utf-8")
     for word in ("coverage.png", "contact_sheet.png", "residuals.png", "index.html"):

@@ -11,21 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import Project
+from ..synthetic.project import MADE, Project
 from .killing import disturb, hashes, kill, start
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 ARGUMENTS = ["tiles/Tiny", "--configfile", "tiny.yaml"]
-RESULTS = ("results", "tiles", "logs", "benchmarks", ".snakemake")
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
 
 @pytest.fixture
 def fresh(made, tmp_path) -> Project:
     """The city's input and workflow, nothing made yet."""
-    folder = tmp_path / "fresh"
-    shutil.copytree(made.folder, folder, ignore=shutil.ignore_patterns(*RESULTS))
-    return Project(folder)
+    return made.copy(tmp_path / "fresh", without=MADE)
 
 
 @pytest.fixture
@@ -72,8 +69,7 @@ def test_control_points_edited_between_kill_and_restart(made, fresh, begin):
     plan = fresh.plan(*ARGUMENTS)
     assert "ingest" not in plan and {"align", "rectify", "project"} <= set(plan)
     assert fresh.snakemake(*ARGUMENTS).status == 0
-    other = Project(fresh.folder.with_name("other"))
-    shutil.copytree(fresh.folder, other.folder, ignore=shutil.ignore_patterns(*RESULTS))
+    other = fresh.copy(fresh.folder.with_name("other"), without=MADE)
     assert other.snakemake(*ARGUMENTS).status == 0
     assert hashes(fresh.folder) == hashes(other.folder)
     assert hashes(fresh.folder) != hashes(made.folder)
@@ -130,6 +126,12 @@ def test_a_full_disk_is_told_and_space_is_all_it_needs(made, fresh, small_disk, 
     assert hashes(fresh.folder) == hashes(made.folder)
 
 
+def test_one_core_gives_the_same_bytes(made, fresh):
+    run = fresh.snakemake(*ARGUMENTS, cores=1)
+    assert run.status == 0, run.text[-4000:]
+    assert hashes(fresh.folder) == hashes(made.folder)
+
+
 def test_strips_by_jobs_of_their_own_give_the_same_bytes(made, fresh):
     config = fresh.folder / "tiny.yaml"
     config.write_text(config.read_text() + "strips: {Tiny-1: 2}\n")
@@ -143,8 +145,7 @@ def test_strips_by_jobs_of_their_own_give_the_same_bytes(made, fresh):
 
 def test_a_fixed_alignment_keeps_what_one_more_file_does_not_touch(made, tmp_path):
     """With it neither align nor refine run, and a LiDAR file has no say in the images."""
-    other = Project(tmp_path / "other")
-    shutil.copytree(made.folder, other.folder)
+    other = made.copy(tmp_path / "other")
     fixed = Path("Tiny-1.json")
     shutil.copy(other.folder / "results/refine/Tiny/Tiny-1/alignment.json", other.folder / fixed)
     config = other.folder / "tiny.yaml"

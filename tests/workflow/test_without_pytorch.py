@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import pytest
 import yaml
 
-from .conftest import Project
+from ..synthetic.project import Project
 
 
 @pytest.mark.skipif(find_spec("torch") is not None, reason="PyTorch is installed here")

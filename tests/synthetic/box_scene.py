@@ -1,0 +1,133 @@
+"""A plane with or without a box on it: rectified images, points, exact disparity."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.lidar.ingest import ingest
+from stereotruth.products.grids import Layer, building, create_grid, open_grid
+
+from .cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
+from .images import pattern
+from .las import write_las
+
+SIZE = (320, 280)  # cols, rows of both original images
+HALF = (16.0, 13.0)  # m east, north: half sides of the box
+ROOF = HEIGHT + 30.0
+UTM = pyproj.CRS("EPSG:32650").to_3d()
+
+
+def model_of(left_angle: float = 90.0) -> EpipolarModel:
+    left = camera(BACKWARD, angle=left_angle, size=SIZE)
+    right = camera(FORWARD, angle=left_angle + 2.0, gsd=0.8, size=SIZE)
+    return fit_epipolar(left, right, SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 50, HEIGHT + 100))
+
+
+def on_ground(sensor, col: np.ndarray, row: np.ndarray, height: float) -> np.ndarray:
+    """[2, ...] east, north (m) of where rays meet a height; the cameras are affine."""
+    lon, lat = sensor.localize(col, row, np.full(col.shape, height))
+    return np.stack([(lon - LON) * METRES[0], (lat - LAT) * METRES[1]])
+
+
+def seen(model: EpipolarModel, view: str, box: bool) -> tuple[np.ndarray, ...]:
+    """East, north, height of the surface that every pixel of a rectified image shows."""
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    to_image, sensor = (
+        (model.epipolar_to_left, model.left)
+        if view == "left"
+        else (model.epipolar_to_right, model.right)
+    )
+    col, row = to_image(x, y)
+    low, high = on_ground(sensor, col, row, HEIGHT), on_ground(sensor, col, row, ROOF)
+    east, north, height = *low, np.full(col.shape, np.nan)
+    for h in np.linspace(ROOF, HEIGHT, 301) if box else [HEIGHT]:
+        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
+        hit = np.isnan(height)
+        if h > HEIGHT:
+            hit &= (abs(e) < HALF[0]) & (abs(n) < HALF[1])
+        east[hit], north[hit], height[hit] = e[hit], n[hit], h
+    return east, north, height
+
+
+def image_of(surface: tuple[np.ndarray, ...]) -> np.ndarray:
+    east, north, height = surface
+    return np.round(pattern(east + 3.0 * height, north - 2.0 * height)).astype(np.uint16)
+
+
+def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray) -> Path:
+    with building(path) as scratch:
+        layer = Layer("uint16", 0, {"units": "1", "long_name": "image"})
+        array = create_grid(
+            scratch,
+            model.shape,
+            {"image": layer},
+            chunk=256,
+            shard=1024,
+            attrs={"epipolar": model.to_dict(), "provenance": {"made": path.name}},
+        )["image"]
+        array[:] = pixels
+    return path
+
+
+def points_on(box: bool, noise: float = 0.0, spacing: float = 0.4) -> np.ndarray:
+    """lon, lat, height of points on the plane and the roof [n, 3]; none on walls.
+
+    A jittered grid without a gap of a pixel.
+    """
+    rng = np.random.default_rng(0)
+    east, north = np.mgrid[-115:115:spacing, -115:115:spacing].reshape(2, -1)
+    east, north = np.stack([east, north]) + rng.uniform(-0.25, 0.25, (2, east.size)) * spacing
+    height = np.full(east.size, HEIGHT)
+    if box:
+        height[(abs(east) < HALF[0]) & (abs(north) < HALF[1])] = ROOF
+    height += rng.normal(0, noise, east.size)
+    return np.column_stack([LON + east / METRES[0], LAT + north / METRES[1], height])
+
+
+def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path:
+    to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
+    folder.mkdir(exist_ok=True)
+    write_las(folder / f"{name}.las", xyz=np.column_stack(to_utm.transform(*points.T)))
+    ingest(folder / f"{name}.las", folder / f"{name}.zarr")
+    return folder / f"{name}.zarr"
+
+
+RUN = ("code", "view", "workers", "scheduler", "scene", "max_points", "strip")
+
+
+def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):
+    """project_scene; ``options`` are its own and those of its settings."""
+    run = {name: options.pop(name) for name in RUN if name in options}
+    return project_scene(left, right, stores, out, Settings(**options), **{"code": "test", **run})
+
+
+class Scene:
+    """Rectified images and points of the plane, with or without the box."""
+
+    def __init__(self, folder: Path, box: bool, **options: float) -> None:
+        self.folder = folder
+        self.model = model_of()
+        self.surface = seen(self.model, "left", box)
+        self.images = [
+            write_image(folder / "left.zarr", self.model, image_of(self.surface)),
+            write_image(
+                folder / "right.zarr", self.model, image_of(seen(self.model, "right", box))
+            ),
+        ]
+        self.points = points_on(box, **options)
+        self.store = write_points(folder, self.points)
+        east, north, height = self.surface
+        xy = self.model.ground_to_epipolar(LON + east / METRES[0], LAT + north / METRES[1], height)
+        self.truth = (xy[0] - xy[2]).reshape(self.model.shape)
+
+    def project(self, name: str = "out.zarr", stores: list[Path] | None = None, **options):
+        out = self.folder / name
+        self.summary = project_with(*self.images, stores or [self.store], out, **options)
+        return open_grid(out)

@@ -1,0 +1,144 @@
+"""Stores of a scene with analytic cameras, terrain and texture, to be cut into tiles."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from stereotruth.dataset.export import export_city
+from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.products.grids import Layer, building, create_grid
+
+SIZE = 64
+PIXELS = 360  # side of the original images
+FLAGS = ["no_points", "labelled", "hidden_in_left", "hidden_in_right", "low_correlation"]
+LAT, LON = 30.2, 115.4
+METRE_LAT = 1 / 111_000.0
+METRE_LON = METRE_LAT / np.cos(np.radians(LAT))
+
+
+def camera(lean: float, turn: float, metres_per_px: float) -> SensorModel:
+    """Parallel camera that looks north, ``lean`` m of row shift per m of height, with some bend."""
+    half = PIXELS / 2
+    reach = half * 0.7
+    zero = np.zeros(20)
+    one = zero.copy()
+    one[0] = 1.0
+    samp, line = zero.copy(), zero.copy()
+    samp[[1, 2, 3, 7]] = np.cos(turn), np.sin(turn), 0.002, 0.0005
+    line[[1, 2, 3, 8]] = np.sin(turn), -np.cos(turn), lean * 60.0 / reach, 0.0004
+    scale = reach / metres_per_px
+    rpc = RPC(
+        half, half, LAT, LON, 50.0,
+        scale, scale, reach * METRE_LAT, reach * METRE_LON, 60.0,
+        line, one, samp, one,
+    )  # fmt: skip
+    return SensorModel(rpc, np.array([[1.0, 1e-4, 3.25], [-2e-4, 1.0, -4.5]]))
+
+
+def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    east, north = (lon - LON) / METRE_LON, (lat - LAT) / METRE_LAT
+    return 40.0 + 12.0 * np.sin(east / 45.0) * np.cos(north / 60.0)
+
+
+def texture(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    east, north = (lon - LON) / METRE_LON, (lat - LAT) / METRE_LAT
+    waves = np.sin(east / 2.9) + np.sin(north / 3.7) + np.sin((east + 1.7 * north) / 6.1)
+    return 500.0 + 120.0 * waves
+
+
+def surface(sensor: SensorModel, col: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Ground point of each pixel's ray on the terrain, by fixed-point iteration."""
+    height = np.full(col.shape, 40.0)
+    for _ in range(12):
+        lon, lat = sensor.localize(col, row, height)
+        height = terrain(lon, lat)
+    return lon, lat, height
+
+
+def make_scene(
+    folder: Path,
+    *,
+    bare_from: int = 10**6,
+    turn: float = 0.02,
+    texture: Callable[[np.ndarray, np.ndarray], np.ndarray] = texture,
+    label_offset: float = 0.0,
+    row_shift: float = 0.0,
+) -> SceneFiles:
+    """Stores of one scene; labels end at epipolar row ``bare_from``.
+
+    Planted errors: of the labels (px), and of the right image's rows (px, down).
+    """
+    left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
+    model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
+    attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
+    layers = {"image": Layer("uint16", 0, {"units": "1", "long_name": "grey value"})}
+    frames = []
+    for name, to_sensor, sensor, shift in (
+        ("left", model.epipolar_to_left, left, 0.0),
+        ("right", model.epipolar_to_right, right, row_shift),
+    ):
+        col, row = to_sensor(x, y - shift)
+        lon, lat, height = surface(sensor, col, row)
+        inside = (abs(col - PIXELS / 2) < PIXELS / 2) & (abs(row - PIXELS / 2) < PIXELS / 2)
+        grey = np.where(inside, np.rint(texture(lon, lat)), 0).astype(np.uint16)
+        with building(folder / f"{name}.zarr") as path:
+            array = create_grid(path, model.shape, layers, chunk=64, shard=128, attrs=attrs)
+            array["image"][:] = grey
+        frames.append((inside, lon, lat, height))
+    inside, lon, lat, height = frames[0]
+    ground = model.ground_to_epipolar(lon.ravel(), lat.ravel(), height.ravel())
+    disparity = (ground[0] - ground[2]).reshape(model.shape)
+    rng = np.random.default_rng(3)
+    known = inside & (rng.random(model.shape) < 0.9) & (y < bare_from)
+    meta = {"units": "px", "long_name": "test"}
+    with building(folder / "scene.zarr") as path:
+        arrays = create_grid(
+            path,
+            model.shape,
+            {
+                "disparity": Layer("float32", np.nan, meta),
+                "height": Layer("float32", np.nan, meta | {"units": "m"}),
+                "status": Layer(
+                    "uint8",
+                    0,
+                    meta | {"flag_values": list(range(5)), "flag_meanings": " ".join(FLAGS)},
+                ),
+            },
+            chunk=64,
+            shard=128,
+            attrs=attrs,
+        )
+        arrays["disparity"][:] = np.where(known, disparity + label_offset, np.nan)
+        arrays["height"][:] = np.where(known, height, np.nan)
+        arrays["status"][:] = np.where(known, 1, np.where(inside & (y < bare_from), 4, 0))
+    stores = (folder / f"{name}.zarr" for name in ("scene", "left", "right"))
+    return SceneFiles(folder.name, *stores)
+
+
+run = partial(
+    export_city, "Town", "TN", size=SIZE, training=600, validation=80, testing=200, seed=1
+)
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "manifest.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def read(path: Path) -> np.ndarray:
+    with rasterio.open(path) as dataset:
+        return dataset.read(1)
+
+
+def labels(path: Path) -> np.ndarray:
+    values = read(path).astype(np.float64)
+    return np.where(values == -999, np.nan, values)

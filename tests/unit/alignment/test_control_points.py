@@ -1,0 +1,59 @@
+"""Files of control points."""
+
+from __future__ import annotations
+
+import pytest
+
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.control_points import COLUMNS, read_gcps
+from stereotruth.errors import InputError
+
+# -------------------------------------------------------------------------------------- files
+
+
+def test_files_of_spreadsheets_are_read(tmp_path):
+    file = tmp_path / "gcps.csv"
+    text = (
+        "id, lon ,lat,height,left_col,left_row,right_col,right_row\r\n"
+        ' B , 115.1,30.2, 5e1 ,"1.5", 2.5,,\r\n\r\n'
+        "A,115.3,30.4,70,,,10,-0.25\r\n,,,,,,,\r\n"
+    )
+    file.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    points = read_gcps(file)
+    assert points.ids == ("A", "B")
+    assert points.line == (4, 2)
+    assert points.lon.tolist() == [115.3, 115.1]
+    assert points.height.tolist() == [70.0, 50.0]
+    assert points.left[1].tolist() == [1.5, 2.5]
+    assert points.in_left.tolist() == [False, True]
+    assert points.in_right.tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "the file is empty"),
+        ("id;lon;lat;height;left_col;left_row;right_col;right_row\n", "not separated by commas"),
+        ("id,lon,lat,height,left_col,left_row,right_col\n", "'right_row' is missing"),
+        (",".join(COLUMNS) + ",note\n", "'note' is unknown"),
+        (",".join(COLUMNS) + "\nA,1,2,3,4,5,6\n", "line 2 has 7 cells for 8 columns"),
+    ],
+)
+def test_malformed_files_are_refused(tmp_path, content, message):
+    file = tmp_path / "gcps.csv"
+    file.write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_gcps(file, "Test-1")
+
+
+def test_missing_and_binary_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_gcps(tmp_path / "none.csv")
+    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00i")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_gcps(tmp_path / "x.csv")
+    with pytest.raises(InputError, match="no such alignment"):
+        Alignment.load(tmp_path / "none.json")
+    (tmp_path / "x.json").write_text("{}")
+    with pytest.raises(InputError, match="not an alignment"):
+        Alignment.load(tmp_path / "x.json")

@@ -1,0 +1,69 @@
+"""Sidecars of tiles lead back to the sensors and the ground."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereotruth.dataset.orientation import evaluate
+from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import RPC
+
+from ...synthetic.tiled_scene import LAT, LON, SIZE, labels, rows_of, terrain
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_sidecar_leads_back_to_sensor_pixels_and_ground(
+    exported: tuple[Path, dict], scene: SceneFiles
+) -> None:
+    folder, _ = exported
+    import zarr
+
+    model = EpipolarModel.from_dict(zarr.open_group(scene.disparity).attrs["epipolar"])
+    for row in rows_of(folder)[::5]:
+        record = json.loads((folder / row["orientation"]).read_text())
+        row0, col0, offset = (int(row[k]) for k in ("row0", "col0", "right_offset_px"))
+        rng = np.random.default_rng(int(row["number"]))
+        x, y = rng.uniform(-0.5, SIZE - 0.5, (2, 200))
+        truth = {
+            "left": model.epipolar_to_left(x + col0, y + row0),
+            "right": model.epipolar_to_right(x + col0 - offset, y + row0),
+        }
+        for view, (col, line) in truth.items():
+            got = evaluate(record[view]["tile_to_sensor"], x, y)
+            assert np.abs(got["col"] - col).max() <= 0.01
+            assert np.abs(got["row"] - line).max() <= 0.01
+            back = evaluate(record[view]["sensor_to_tile"], col, line)
+            assert max(np.abs(back["x"] - x).max(), np.abs(back["y"] - y).max()) <= 0.01
+            rpc = RPC.from_dict(record[view]["corrected_rpc"])
+            sensor = model.left if view == "left" else model.right
+            point = (LON + 1e-4, LAT - 2e-4, 45.0)
+            assert np.allclose(rpc.project(*point), sensor.project(*point), atol=1e-3)
+        lon, lat = model.epipolar_to_ground(x + col0, y + row0, 44.0)
+        xl, _, xr, _ = model.ground_to_epipolar(lon, lat, np.full(200, 44.0))
+        ground = evaluate(record["ground"], x, y, xl - xr - offset)
+        assert np.abs(ground["height"] - 44.0).max() < 0.01
+        assert np.abs(ground["lon"] - lon).max() < 1e-8 and np.abs(ground["lat"] - lat).max() < 1e-8
+        ring = np.array(record["footprint"]["coordinates"][0])
+        assert np.array_equal(ring[0], ring[-1])
+        corner = model.epipolar_to_ground(
+            col0 - 0.5, row0 - 0.5, record["footprint"]["heights_m"][0]
+        )
+        assert np.allclose(ring[0], corner, atol=1e-7)
+
+
+def test_height_from_stored_disparity(exported: tuple[Path, dict]) -> None:
+    """From files and the polynomial alone: the terrain, within float16's rounding."""
+    folder, _ = exported
+    row = rows_of(folder)[0]
+    record = json.loads((folder / row["orientation"]).read_text())
+    disparity = labels(folder / row["disp"])
+    y, x = np.nonzero(np.isfinite(disparity))
+    got = evaluate(record["ground"], x, y, disparity[y, x])
+    error = got["height"] - terrain(got["lon"], got["lat"])
+    assert np.abs(error).max() < 0.03

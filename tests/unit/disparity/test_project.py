@@ -1,0 +1,470 @@
+"""Projection of points on a textured plane with a box: disparity and hidden parts are known."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import zarr
+
+from stereotruth.disparity.label_window import label_window
+from stereotruth.disparity.pixel_labels import RIDGE
+from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.disparity.settings import Settings
+from stereotruth.disparity.status import Status
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.errors import InputError
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore, query_points
+from stereotruth.products.grids import open_grid
+
+from ...synthetic.box_scene import (
+    HALF,
+    ROOF,
+    UTM,
+    Scene,
+    on_ground,
+    project_with,
+    seen,
+    write_image,
+    write_points,
+)
+from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES
+from ...synthetic.las import write_las
+from ...synthetic.stores import tree_digest
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("plane"), box=False)
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("box"), box=True)
+
+
+@pytest.fixture(scope="module")
+def noisy_box(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("noisy"), box=True, noise=0.1)
+
+
+@pytest.mark.parametrize("method", ["none", "correlation", "geometric", "both"])
+@pytest.mark.parametrize("representative", ["top", "paper"])
+def test_disparity_of_a_plane(plane, method, representative) -> None:
+    """Within 1e-3 px at every pixel's centre; all labelled but a frame of half a window."""
+    grid = plane.project(method=method, representative=representative)
+    disparity, status = grid["disparity"].values, grid["status"].values
+    labelled = status == Status.LABELLED
+    assert np.array_equal(labelled, np.isfinite(disparity))
+    assert np.abs(disparity - plane.truth)[labelled].max() < 1e-3
+    has_points = status != Status.NO_POINTS
+    inner = has_points & (plane.truth > -np.inf)
+    edge = 6 + int(np.ceil(np.abs(plane.truth).max()))
+    inner[:edge] = inner[-edge:] = inner[:, :edge] = inner[:, -edge:] = False
+    assert inner.sum() > 30_000
+    assert labelled[inner].mean() > 0.999
+    correlation = grid["correlation"].values[labelled]
+    if method in ("correlation", "both"):
+        assert np.median(correlation) > 0.99
+    else:
+        assert np.isnan(correlation).all()
+
+
+def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, float, int]]:
+    """Disparity, height and count by pixel, point by point in Python from the definition.
+
+    With ``top``, only pixels around which all points are of one surface.
+    """
+    points = query_points([scene.store], -180, -90, 180, 90)
+    xy = scene.model.ground_to_epipolar(points.lon, points.lat, points.height)
+    pixels: dict[tuple[int, int], list[int]] = {}
+    for k, (x, y) in enumerate(zip(xy[0], xy[1])):
+        pixels.setdefault((int(np.floor(y + 0.5)), int(np.floor(x + 0.5))), []).append(k)
+
+    def place(members: list[int], height: float) -> np.ndarray:
+        ground = points.lon[members].mean(), points.lat[members].mean(), height
+        x, y, x_right, _ = scene.model.ground_to_epipolar(*ground)[:, 0]
+        return np.array([x, y, x - x_right])
+
+    found = {}
+    for (row, col), members in pixels.items():
+        if not 110 < row < 200 or not 90 < col < 220:
+            continue
+        highest = float(points.height[members].max())
+        if not top:
+            found[row, col] = float(place(members, highest)[2]), highest, len(members)
+            continue
+        blocks = [
+            pixels.get((r, c), []) for r in range(row - 3, row + 4) for c in range(col - 3, col + 4)
+        ]
+        if min(len(block) for block in blocks) == 0:
+            continue
+        around = [k for block in blocks for k in block]
+        if np.ptp(xy[0, around] - xy[2, around]) > 0.9:
+            continue
+        near = [pixels[r, c] for r in range(row - 1, row + 2) for c in range(col - 1, col + 2)]
+        places = np.array([place(m, points.height[m].mean()) for m in near])
+        here = places[4]
+        centred = places - places.mean(axis=0)
+        normal = centred[:, :2].T @ centred[:, :2] + RIDGE * np.eye(2)
+        slope = np.linalg.solve(normal, centred[:, :2].T @ centred[:, 2])
+        label = here[2] + slope @ (np.array([col, row]) - here[:2])
+        found[row, col] = float(label), highest, len(members)
+    return found
+
+
+@pytest.mark.parametrize("representative", ["top", "paper"])
+def test_representative_is_that_of_its_definition(noisy_box, representative) -> None:
+    """Points of 0.1 m noise on plane and roof, against sums in Python: 1e-5 px."""
+    grid = noisy_box.project(method="none", representative=representative)
+    disparity, height, count = (
+        grid[name].values for name in ("disparity", "height", "point_count")
+    )
+    expected = brute_force(noisy_box, representative == "top")
+    assert len(expected) > 4000
+    for pixel, (d, h, n) in expected.items():
+        assert disparity[pixel] == pytest.approx(d, abs=1e-5)
+        assert height[pixel] == pytest.approx(h, abs=1e-4)
+        assert count[pixel] == n
+
+
+def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
+    """Each label is that of the roof or of the ground, and the wrong one less often."""
+    levels = [box.truth[box.surface[2] == h].mean() for h in (HEIGHT, ROOF)]
+    off = {}
+    for representative in ("top", "paper"):
+        grid = box.project(method="none", representative=representative)
+        d = grid["disparity"].values
+        d = d[np.isfinite(d)]
+        off[representative] = (np.minimum(abs(d - levels[0]), abs(d - levels[1])) > 0.05).sum()
+        right = abs(grid["disparity"].values - box.truth) < 1
+        seen_by_both = (box.surface[2] == HEIGHT) | (box.surface[2] == ROOF)
+        known = np.isfinite(grid["disparity"].values) & seen_by_both
+        off[representative + " wrong"] = (known & ~right).sum()
+    assert off["top"] == 0
+    assert off["top wrong"] < 0.5 * off["paper wrong"]
+
+
+def hidden_truth(scene: Scene) -> np.ndarray:
+    """Pixels of the left image whose surface the box hides from the right camera."""
+    model = scene.model
+    east, north, height = scene.surface
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = model.ground_to_epipolar(lon, lat, height)
+    col, row = model.epipolar_to_right(xy[2], xy[3])
+    hidden = np.zeros(col.size, dtype=bool)
+    low, high = (on_ground(model.right, col, row, h) for h in (HEIGHT, ROOF))
+    for h in np.linspace(HEIGHT, ROOF, 301)[1:]:
+        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
+        inside = (np.abs(e) < HALF[0] - 1e-6) & (np.abs(n) < HALF[1] - 1e-6)
+        hidden |= inside & (h > height.reshape(-1) + 0.11)
+    return hidden.reshape(model.shape)
+
+
+def dilated(mask: np.ndarray, by: int = 1) -> np.ndarray:
+    padded = np.pad(mask, by)
+    out = np.zeros_like(mask)
+    for r in range(2 * by + 1):
+        for c in range(2 * by + 1):
+            out |= padded[r : r + mask.shape[0], c : c + mask.shape[1]]
+    return out
+
+
+@pytest.mark.parametrize("method", ["geometric", "both"])
+def test_box_hides_a_run_of_the_ground(box, method) -> None:
+    """Hidden ground beside the box, walls without points included, to 2 px at its border."""
+    grid = box.project(method=method)
+    status = grid["status"].values
+    hidden = hidden_truth(box)
+    assert 800 < hidden.sum() < 20_000
+    sure = hidden & ~dilated(~hidden, 2)
+    labelled = status == Status.LABELLED
+    assert not labelled[sure].any()
+    with_points = sure & (status != Status.NO_POINTS)
+    assert (status[with_points] == Status.HIDDEN_IN_RIGHT).mean() > 0.99
+    wall = (box.surface[2] > HEIGHT) & (box.surface[2] < ROOF)
+    clear = ~dilated(hidden | wall) & (status != Status.NO_POINTS)
+    assert (status == Status.HIDDEN_IN_RIGHT)[clear].mean() < 1e-3
+    roof = box.surface[2] == ROOF
+    inner = roof & ~dilated(~roof, 5) & (status != Status.NO_POINTS)
+    assert labelled[inner].mean() > 0.999
+    # Along a row: as many px without a label, wall included, as the roof has more disparity.
+    cols = np.flatnonzero((hidden | wall).any(axis=0))
+    run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
+    rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
+    tolerance = 1.5 if method == "geometric" else 4.5  # windows reach over edges
+    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=tolerance)
+
+
+@pytest.mark.parametrize("only_in", ["lidar", "images"])
+def test_building_in_one_world_only_is_masked_as_changed(plane, box, only_in, tmp_path) -> None:
+    """What LiDAR and images do not share has no label; its surroundings keep theirs."""
+    if only_in == "lidar":
+        shown, scanned = plane, box
+        there = box.surface[2] == ROOF
+    else:
+        shown, scanned = box, plane
+        there = (box.surface[2] > HEIGHT) & (np.abs(box.truth - plane.truth) > 1)
+    project_with(*shown.images, [scanned.store], tmp_path / "out.zarr", method="both")
+    status = open_grid(tmp_path / "out.zarr")["status"].values
+    labelled = status == Status.LABELLED
+    inner = there & ~dilated(~there, 2)
+    assert inner.sum() > 1000
+    # The ground where a building is missing goes on around it, and votes near the border.
+    assert labelled[inner].mean() < (0.02 if only_in == "lidar" else 0.1)
+    assert (status == Status.CHANGED)[inner].mean() > 0.9
+    reach = int(np.ptp(box.truth[np.isfinite(box.truth)])) + 8
+    away = ~dilated(box.surface[2] > HEIGHT, 16)
+    away[:, : 2 * reach] = away[:, -reach:] = away[:reach] = away[-reach:] = False
+    hidden = hidden_truth(box)
+    clear = away & ~dilated(hidden, 16) & (status != Status.NO_POINTS)
+    assert labelled[clear].mean() > 0.995
+    without = project_and_open(
+        scanned,
+        tmp_path / "same",
+        *(zarr.open_group(path)["image"][:] for path in scanned.images),
+        method="both",
+    )
+    assert not (without["status"].values == Status.CHANGED).any()
+
+
+def test_right_view_has_its_own_labels(box) -> None:
+    """Against the rays of the right camera; and both views name each other's pixels."""
+    east, north, height = seen(box.model, "right", box=True)
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = box.model.ground_to_epipolar(lon, lat, height)
+    truth = (xy[0] - xy[2]).reshape(box.model.shape)
+    right = box.project("of_right.zarr", method="both", view="right")
+    left = box.project("of_left.zarr", method="both")
+    disparity, status = right["disparity"].values, right["status"].values
+    labelled = np.isfinite(disparity)
+    surface = np.isin(height, (HEIGHT, ROOF))
+    assert (np.abs(disparity - truth) < 1e-3)[labelled & surface].mean() > 0.999
+    inner = surface.copy()
+    edge = 10 + int(np.ceil(np.abs(box.truth).max()))
+    inner[:edge] = inner[-edge:] = inner[:, :edge] = inner[:, -edge:] = False
+    assert labelled[inner].mean() > 0.9
+    assert right["disparity"].attrs["match"].endswith("(x + disparity, y)")
+    # Where the left image shows the box at the place of ground that the right one sees:
+    x = np.clip(np.rint(np.arange(truth.shape[1]) + truth), 0, truth.shape[1] - 1).astype(int)
+    in_left = np.take_along_axis(box.surface[2], x, axis=1)
+    hidden = (height == HEIGHT) & (in_left > HEIGHT)
+    assert hidden.sum() > 150
+    assert labelled[hidden].mean() < 0.1
+    wall = (height > HEIGHT) & (height < ROOF)
+    assert labelled[wall & ~dilated(~wall)].mean() < 0.01
+    assert (status[hidden] == Status.HIDDEN_IN_LEFT).mean() > 0.5
+    rows, cols = np.nonzero(labelled)
+    there = np.rint(cols + disparity[rows, cols]).astype(int)
+    ok = (there >= 0) & (there < left.sizes["x"])
+    back = left["disparity"].values[rows[ok], there[ok]]
+    both = np.isfinite(back)
+    assert both.mean() > 0.9
+    assert (np.abs(back - disparity[rows[ok], cols[ok]])[both] < 0.05).mean() > 0.99
+
+
+def test_water_is_masked_as_changed(plane, tmp_path) -> None:
+    to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
+    points = plane.points
+    water = (points[:, 0] > LON).astype(np.uint8) * 9
+    write_las(
+        tmp_path / "water.las",
+        xyz=np.column_stack(to_utm.transform(*points.T)),
+        classification=water,
+    )
+    ingest(tmp_path / "water.las", tmp_path / "water.zarr")
+    project_with(*plane.images, [tmp_path / "water.zarr"], tmp_path / "out.zarr", method="both")
+    grid = open_grid(tmp_path / "out.zarr")
+    status, east = grid["status"].values, plane.surface[0]
+    assert not (status == Status.LABELLED)[east > 1.0].any()
+    assert not (status == Status.CHANGED)[east < -1.0].any()
+    assert (grid["surface_class"].values == 0).all()
+
+
+def test_correlation_removes_most_of_what_is_hidden(box) -> None:
+    grid = box.project(method="correlation")
+    labelled = grid["status"].values == Status.LABELLED
+    hidden = hidden_truth(box)
+    assert labelled[hidden].mean() < 0.25
+    none = box.project(method="none")["status"].values == Status.LABELLED
+    assert none[hidden & (box.surface[2] == HEIGHT)].mean() > 0.95
+
+
+def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
+    """Workers, windows, order of stores and of points leave no trace."""
+    middle = LON + 3.0 / METRES[0]
+    west = box.points[box.points[:, 0] < middle]
+    east = box.points[box.points[:, 0] >= middle]
+    shuffled = np.random.default_rng(3).permutation(west)
+    first = [write_points(tmp_path / "first", p, n) for p, n in ((west, "a"), (east, "b"))]
+    second = [write_points(tmp_path / "second", p, n) for p, n in ((shuffled, "a"), (east, "b"))]
+    digests = set()
+    for number, (stores, options) in enumerate(
+        [
+            (first, {"workers": 1}),
+            (first[::-1], {"workers": 2}),
+            (second, {"workers": 2, "max_points": 20_000}),
+            (second, {"scheduler": "sync"}),
+        ]
+    ):
+        box.project(f"{number}.zarr", stores, method="both", **options)
+        digests.add(tree_digest(box.folder / f"{number}.zarr"))
+    assert len(digests) == 1
+
+
+def test_blocks_can_go_to_other_processes(plane) -> None:
+    """A block's task is made of plain values, whatever has been opened before."""
+    scene = SceneInputs(*plane.images, (plane.store,), Settings())
+    window = slice(100, 140), slice(120, 170)
+    first = label_window(scene, *window)
+    second = label_window(pickle.loads(pickle.dumps(scene)), *window)
+    assert len(pickle.dumps(scene)) < 2000
+    for name, layer in first[0].items():
+        assert np.array_equal(layer, second[0][name], equal_nan=True)
+
+
+def test_edge_margin_trades_labels_for_certainty(box) -> None:
+    """Wider margins leave fewer labels and none of the wrong surface."""
+    shares, wrong, edges = [], [], []
+    for margin in (0.0, 0.1, 0.25, 0.5):
+        grid = box.project(method="geometric", edge_margin_px=margin)
+        disparity = grid["disparity"].values
+        known = np.isfinite(disparity) & np.isin(box.surface[2], (HEIGHT, ROOF))
+        shares.append(known.mean())
+        wrong.append(int((np.abs(disparity - box.truth)[known] > 1).sum()))
+        edge = grid["status"].values == Status.EDGE_IN_PIXEL
+        edges.append(int(edge.sum()))
+        assert np.isnan(disparity[edge]).all()
+    assert edges == sorted(edges)
+    assert shares == sorted(shares, reverse=True)
+    assert wrong == sorted(wrong, reverse=True)
+    assert wrong[-1] == 0
+
+
+def test_reasons_and_their_order(plane) -> None:
+    """Nodata in either image, constant windows, too few points."""
+    model = plane.model
+    left = zarr.open_group(plane.images[0])["image"][:]
+    right = zarr.open_group(plane.images[1])["image"][:]
+    flat = right.copy()
+    flat[:] = 700
+    folder = plane.folder / "others"
+    grid = project_and_open(plane, folder / "flat", left, flat, method="correlation")
+    assert not (grid["status"].values == Status.LABELLED).any()
+    assert (grid["status"].values == Status.LOW_CORRELATION).sum() > 30_000
+
+    holed = left.copy()
+    holed[100:110, 150:170] = 0
+    grid = project_and_open(plane, folder / "holed", holed, right, method="correlation")
+    status = grid["status"].values
+    # The window reaches 4 px to all sides, and one more for the interpolation.
+    assert (status[96:114, 146:174] == Status.OUT_OF_FRAME).all()
+    assert (status[90:120, 140:180] == Status.LABELLED)[[0, -1]].all()
+    count = grid["point_count"].values
+    assert (count[status == Status.OUT_OF_FRAME] == 0).all()
+
+    grid = project_and_open(plane, folder / "few", left, right, method="none", min_points=4)
+    status, count = grid["status"].values, grid["point_count"].values
+    assert (count[status == Status.LABELLED] >= 4).all()
+    few = status == Status.BELOW_MINIMUM_COUNT
+    assert few.any() and ((count[few] > 0) & (count[few] < 4)).all()
+    assert np.isnan(grid["disparity"].values[few]).all()
+    assert model.shape == status.shape
+
+
+def project_and_open(scene: Scene, folder: Path, left, right, **options):
+    folder.mkdir(parents=True)
+    images = [
+        write_image(folder / f"{name}.zarr", scene.model, pixels)
+        for name, pixels in (("left", left), ("right", right))
+    ]
+    project_with(*images, [scene.store], folder / "out.zarr", **options)
+    return open_grid(folder / "out.zarr")
+
+
+def test_attributes_and_summary(plane) -> None:
+    grid = plane.project(method="correlation", code="abc", scene="plane-1")
+    for name in ("disparity", "status", "height", "point_count", "correlation", "uncertainty"):
+        assert grid[name].dims == ("y", "x")
+        assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
+    status = grid["status"]
+    assert status.attrs["flag_values"] == list(range(9))
+    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status]
+    assert grid.attrs["provenance"]["code"] == "abc"
+    assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}
+    assert EpipolarModel.from_dict(grid.attrs["epipolar"]).shape == plane.model.shape
+    pixels = plane.summary["pixels"]
+    assert pixels == grid.attrs["summary"]["pixels"]
+    for meaning, value in zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"]):
+        assert pixels[meaning] == int((status.values == value).sum())
+    assert plane.summary["points"]["used"] == int(grid["point_count"].values.sum())
+    json.dumps(dict(grid.attrs))
+
+
+def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box) -> None:
+    """Noise of 0.1 m is 0.09 px: uncertainty as known from it, and as the errors are."""
+    grid = noisy_box.project(method="none")
+    sigma, count = grid["uncertainty"].values, grid["point_count"].values
+    roof = noisy_box.surface[2] == ROOF
+    clear = np.isfinite(sigma) & ~dilated(roof | (noisy_box.surface[2] > HEIGHT), 30)
+    known = 0.1 * (FORWARD[1] - BACKWARD[1]) / 0.65  # px, of one point
+    assert np.median((sigma * np.sqrt(count))[clear]) == pytest.approx(abs(known), rel=0.05)
+    ratio = np.abs(grid["disparity"].values - noisy_box.truth)[clear] / sigma[clear]
+    assert (ratio < 1).mean() == pytest.approx(0.68, abs=0.04)
+    assert (ratio < 2).mean() == pytest.approx(0.95, abs=0.03)
+
+
+def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path) -> None:
+    """Nodes in the left image's attributes, bilinear between them, added in squares."""
+    images = [
+        write_image(tmp_path / f"{name}.zarr", plane.model, zarr.open_group(path)["image"][:])
+        for name, path in zip(("left", "right"), plane.images)
+    ]
+    none = plane.project(method="none")["uncertainty"].values.astype(float)
+    flat = [[0.0, 0.0], [0.0, 0.0]]
+    nodes = {"step_px": 100, "disparity": [[0.1, 0.3], [0.1, 0.3]], "x": flat, "y": flat}
+    zarr.open_group(images[0], mode="r+").attrs["alignment_sigma"] = nodes
+    project_with(*images, [plane.store], tmp_path / "out.zarr", method="none")
+    sigma = open_grid(tmp_path / "out.zarr")["uncertainty"].values
+    col = np.broadcast_to(np.arange(sigma.shape[1]), sigma.shape)
+    expected = np.hypot(none, 0.1 + 0.2 * np.clip(col / 100.0, 0, 1))
+    known = np.isfinite(none)
+    assert known.sum() > 30_000
+    assert np.allclose(sigma[known], expected[known], atol=1e-5)
+
+
+def refused(scene: Scene, store: Path, match: str) -> None:
+    out = scene.folder / "refused.zarr"
+    with pytest.raises(InputError, match=match):
+        project_with(*scene.images, [store], out, method="none")
+    assert not list(scene.folder.glob("refused*"))
+
+
+def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
+    """The message tells a survey of another place from a wrong coordinate system."""
+    near = plane.points[:2000] + np.array([0.1, 0, 0])
+    refused(plane, write_points(tmp_path / "near", near), "no overlap between LiDAR and images")
+    far = plane.points[:2000] + np.array([1.5, 3.0, 0])
+    refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
+    with pytest.raises(InputError, match=r"114\.3.*30\.6"):
+        project_with(
+            *plane.images, [tmp_path / "far" / "points.zarr"], tmp_path / "x.zarr", method="none"
+        )
+
+
+def test_settings_are_checked(plane) -> None:
+    for options in ({"method": "guess"}, {"representative": "mean"}, {"window": 8}):
+        with pytest.raises(InputError, match="Remedy"):
+            plane.project(**options)
+    with pytest.raises(InputError, match="no point store"):
+        project_with(*plane.images, [], plane.folder / "x.zarr")
+
+
+def test_store_bounds_are_kept(plane) -> None:
+    grid = plane.project(method="none")
+    assert grid.attrs["points_bounds"] == list(PointStore(plane.store).bounds)

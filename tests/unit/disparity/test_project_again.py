@@ -1,0 +1,121 @@
+"""Stages that are asked again: what they take over, what they make anew, always the same bytes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from stereotruth.errors import InputError
+from stereotruth.job import dask_scheduler
+from stereotruth.products.grids import Strip
+
+from ...synthetic.box_scene import Scene, project_with, write_image, write_points
+from ...synthetic.stores import tree
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch) -> Scene:
+    """Small blocks, so that there are many; stores that say what they are made of."""
+    monkeypatch.setattr("stereotruth.disparity.project.SHARD", 96)
+    monkeypatch.setattr("stereotruth.disparity.project.CHUNK", 24)
+    (tmp_path / "scene").mkdir()
+    scene = Scene(tmp_path / "scene", box=True)
+    name(scene.store, "points")
+    for path in scene.images:
+        name(path, path.stem)
+    return scene
+
+
+def name(store: Path, text: str) -> Path:
+    zarr.open_group(store, mode="r+").attrs["provenance"] = {"made of": text}
+    return store
+
+
+def project(scene: Scene, stores: list[Path], out: Path, **options) -> set[str]:
+    """Project; names of the blocks that were made."""
+    done = out.with_name(f".{out.name}.work") / "done"
+    before = {file.name: file.stat().st_mtime_ns for file in done.glob("*.json")}
+    project_with(*scene.images, stores, out, **{"method": "both", **options})
+    return {
+        file.name
+        for file in done.glob("*.json")
+        if file.stat().st_mtime_ns != before.get(file.name)
+    }
+
+
+def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path):
+    """And the bytes are those of a run from scratch with both files."""
+    out = tmp_path / "out.zarr"
+    everything = project(scene, [scene.store], out)
+    assert project(scene, [scene.store], out) == set()
+    lon, lat, _ = scene.points.T
+    corner = scene.points[(lon < lon.min() + 2e-4) & (lat < lat.min() + 2e-4)] + [0.0, 0.0, 4.0]
+    more = name(write_points(tmp_path / "more", corner, name="more"), "more")
+    touched = project(scene, [scene.store, more], out)
+    assert touched and len(touched) < 0.7 * len(everything), (len(touched), len(everything))
+    other = tmp_path / "other.zarr"
+    assert project(scene, [more, scene.store], other) == everything
+    assert tree(out) == tree(other)
+    assert project(scene, [scene.store], out) == touched  # and without the file again
+
+
+def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
+    out = tmp_path / "out.zarr"
+    everything = project(scene, [scene.store], out)
+    assert project(scene, [scene.store], out, min_points=3) == everything
+    assert project(scene, [scene.store], out) == everything
+    left = zarr.open_group(scene.images[0], mode="r")["image"][:]
+    shutil.rmtree(scene.images[0])
+    name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
+    assert project(scene, [scene.store], out) == everything
+
+
+def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
+    for view in ("left", "right"):
+        whole = tmp_path / f"{view}.zarr"
+        everything = project(scene, [scene.store], whole, view=view)
+        out = tmp_path / f"{view}-strips.zarr"
+        parts = [
+            project(scene, [scene.store], out, view=view, strip=Strip(k, 3)) for k in (2, 0, 1)
+        ]
+        assert not out.exists()
+        assert set.union(*parts) == everything and sum(map(len, parts)) == len(everything)
+        assert project(scene, [scene.store], out, view=view) == set()
+        assert tree(out) == tree(whole)
+
+
+def test_a_store_that_does_not_say_what_it_is_made_of_is_never_taken_over(scene, tmp_path):
+    zarr.open_group(scene.store, mode="r+").attrs["provenance"] = {}
+    out = tmp_path / "out.zarr"
+    everything = project(scene, [scene.store], out)
+    record = json.loads((tmp_path / ".out.zarr.work/done/0-0.json").read_text())
+    assert {"key", "sha256", "result", "format"} == set(record)
+    assert project(scene, [scene.store], out) >= everything - {"0-0.json"}
+
+
+def test_workers_of_a_dask_cluster_write_the_same_bytes(scene, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    project(scene, [scene.store], tmp_path / "out.zarr")
+    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
+        dask_scheduler(cluster.scheduler_address) as client,
+    ):
+        project(scene, [scene.store], tmp_path / "other.zarr", scheduler=client)
+    assert tree(tmp_path / "out.zarr") == tree(tmp_path / "other.zarr")
+
+
+def test_a_scheduler_that_is_not_there_is_named():
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with (
+        pytest.raises(InputError, match=r"tcp://127.0.0.1:9: no Dask scheduler answers.*start it"),
+        dask_scheduler("tcp://127.0.0.1:9", seconds=1),
+    ):
+        pass
+    with dask_scheduler(None) as scheduler:
+        assert scheduler == "threads"

@@ -1,0 +1,140 @@
+"""The readers of each format of RPC files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereotruth.epipolar.rpc import RPC
+from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.errors import InputError
+
+from ...synthetic.cameras import ground_points, make_rpc
+from ...synthetic.images import write_image
+
+# -------------------------------------------------------------------------------------- readers
+
+
+def rpc_text(rpc: RPC) -> str:
+    units = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
+    lines = []
+    for name, value in rpc.to_dict().items():
+        if isinstance(value, list):
+            lines += [f"{name.upper()}_{i}: {v:+.15E}" for i, v in enumerate(value, start=1)]
+        else:
+            unit = units.get(name.split("_")[0], "meters")
+            lines.append(f"{name.upper()}: {value:+017.10f} {unit}")
+    return "\r\n".join(lines) + "\r\n"
+
+
+def rpb_text(rpc: RPC, spec: str = "RPC00B") -> str:
+    values = rpc.to_dict()
+    lines = ['satId = "GF7";', 'bandId = "PAN";', f'SpecId = "{spec}";', "BEGIN_GROUP = IMAGE"]
+    lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
+    for ours, theirs in (("line", "line"), ("samp", "samp"), ("lat", "lat"), ("long", "long")):
+        lines.append(f"\t{theirs}Offset = {values[f'{ours}_off']!r};")
+        lines.append(f"\t{theirs}Scale = {values[f'{ours}_scale']!r};")
+    lines.append(f"\theightOffset = {values['height_off']!r};")
+    lines.append(f"\theightScale = {values['height_scale']!r};")
+    for name in ("line_num", "line_den", "samp_num", "samp_den"):
+        kind, part = name.split("_")
+        body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
+        lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
+    return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
+
+
+def assert_same(a: RPC, b: RPC) -> None:
+    lon, lat, height = ground_points(b, 50)
+    difference = np.subtract(a.project(lon, lat, height), b.project(lon, lat, height))
+    assert np.abs(difference).max() < 1e-5  # offsets are written with ten decimals
+
+
+@pytest.mark.parametrize(
+    ("name", "writer"),
+    [
+        ("GF7_scene-BWD_RPC.TXT", rpc_text),
+        ("GF7_scene-BWD_rpc.txt", rpc_text),
+        ("GF7_scene-BWD.RPB", rpb_text),
+        ("GF7_scene-BWD.rpb", rpb_text),
+    ],
+)
+def test_files_beside_the_image(tmp_path: Path, name: str, writer) -> None:
+    rpc = make_rpc(10)
+    image = write_image(tmp_path / "GF7_scene-BWD.tiff", None)
+    (tmp_path / name).write_text(writer(rpc))
+    assert_same(read_rpc(image), rpc)
+
+
+def test_tiff_tag(tmp_path: Path) -> None:
+    rpc = make_rpc(11)
+    assert_same(read_rpc(write_image(tmp_path / "a.tif", rpc)), rpc)
+
+
+@pytest.mark.parametrize("option", ["RPCTXT", "RPB"])
+def test_files_written_by_gdal(tmp_path: Path, option: str) -> None:
+    rpc = make_rpc(12)
+    image = write_image(tmp_path / "a.tif", rpc, **{option: "YES"})
+    assert len(list(tmp_path.iterdir())) > 1
+    assert_same(read_rpc(image), rpc)
+
+
+def test_a_file_goes_before_the_tag(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", make_rpc(13))
+    better = make_rpc(14)
+    (tmp_path / "a_RPC.TXT").write_text(rpc_text(better))
+    assert_same(read_rpc(image), better)
+
+
+def spoiled(name: str, old: str, new: str):
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return pytest.param(change, id=name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        spoiled("missing-offset", "LINE_OFF:", "LINE:"),
+        spoiled("missing-coefficient", "SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
+        spoiled("not-a-number", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
+        spoiled("not-finite", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: nan "),
+        spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
+        spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
+        spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
+    ],
+)
+def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
+    image = write_image(tmp_path / "a.tif", None)
+    (tmp_path / "a_RPC.TXT").write_text(change(rpc_text(make_rpc(15))))
+    with pytest.raises(InputError, match=r"a_RPC.TXT: malformed RPC .*Remedy"):
+        read_rpc(image)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        spoiled("19-coefficients", "lineNumCoef = (\n", "lineNumCoef = (\n //"),
+        spoiled("missing-scale", "sampScale", "sampScal"),
+        spoiled("RPC00A", "RPC00B", "RPC00A"),
+        spoiled("cut-short", "sampDenCoef = (", "sampDenCoef = "),
+    ],
+)
+def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
+    image = write_image(tmp_path / "a.tif", None)
+    (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
+    with pytest.raises(InputError, match=r"a.rpb: malformed RPC .*Remedy"):
+        read_rpc(image)
+
+
+def test_images_without_rpc_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a.tif: image has no RPC metadata.*a_RPC.TXT"):
+        read_rpc(write_image(tmp_path / "a.tif", None))
+    with pytest.raises(InputError, match=r"b.tif: no such image"):
+        read_rpc(tmp_path / "b.tif")
+    (tmp_path / "c.tif").write_text("no raster")
+    with pytest.raises(InputError, match=r"c.tif: not a raster"):
+        read_rpc(tmp_path / "c.tif")

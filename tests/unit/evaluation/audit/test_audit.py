@@ -1,0 +1,206 @@
+"""The audit of a dataset: planted faults are found, good pairs pass, killed runs are carried on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.errors import InputError
+from stereotruth.evaluation.audit import audit
+from stereotruth.evaluation.audit import audit as run
+from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits
+
+from ....synthetic.pair_with_block import make
+
+LIMITS = Limits(0.3, 0.3, 0.05, 0.01, 0.01)
+
+
+def write(path, values, nodata=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    profile = {
+        "driver": "GTiff",
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "count": 1,
+        "dtype": values.dtype,
+        "nodata": nodata,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", **profile) as file:
+            file.write(values, 1)
+
+
+def add(root, number, scene, *, split="test", labels=None, nodata=-999.0):
+    folder = root / split
+    write(folder / "left" / f"KM_left_{number}.tiff", scene.left)
+    write(folder / "right" / f"KM_right_{number}.tiff", scene.right)
+    values = scene.labels if labels is None else labels
+    stored = np.where(np.isfinite(values), values, np.float32(nodata))
+    write(folder / "disp" / f"KM_disparity_{number}.tiff", stored, -999.0)
+
+
+def dataset(root):
+    return StereoDataset("mine", root, "whu", (-64, 64))
+
+
+def read(out):
+    with (out / "pairs.csv").open(newline="") as stream:
+        rows = {row["pair"]: row for row in csv.DictReader(stream)}
+    return rows, json.loads((out / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def audited(tmp_path_factory):
+    """A good pair, and one for each of many faults."""
+    root = tmp_path_factory.mktemp("data")
+    good = make(20)
+    add(root, 0, good)
+    add(root, 1, make(21), labels=make(21).labels + 2)
+    add(root, 2, make(22, shift=(0.0, 1.0)))
+    add(root, 3, make(23), labels=-make(23).labels)
+    swapped = make(24, slope=0.15)
+    swapped.left, swapped.right = swapped.right, swapped.left
+    add(root, 4, swapped)
+    add(root, 6, good, split="train")
+    holes = make(27, offset=9.0)
+    holes.labels[:, :90] = np.nan
+    add(root, 7, holes, nodata=0.0)
+    add(root, 8, make(28), nodata=-9999.0)
+    add(root, 9, make(29), labels=make(29).exact)
+    wrong = make(30)
+    wrong.labels[195:285, 20:270] += 6
+    add(root, 10, wrong)
+    same = make(32)
+    same.right = same.left
+    add(root, 12, same)
+    out = root / "audit" / "mine"
+    summary = audit.audit(dataset(root), out, LIMITS, work=root / "work", worst=3, workers=2)
+    return root, out, summary
+
+
+@pytest.mark.parametrize(
+    "pair, check",
+    [
+        ("KM_1", "bias"),
+        ("KM_2", "rows"),
+        ("KM_3", "convention"),
+        ("KM_4", "convention"),
+        ("KM_7", "values"),
+        ("KM_8", "values"),
+        ("KM_9", "hidden"),
+        ("KM_10", "contradicted"),
+        ("KM_12", "files"),
+    ],
+)
+def test_a_planted_fault_is_found_by_its_check(audited, pair, check):
+    figures = json.loads((audited[1] / "summary.json").read_text())
+    assert figures["checks"][check]["fault"]
+    rows, _ = read(audited[1])
+    assert rows[pair]["verdict"] == FAULT
+    words = {
+        "bias": "labels less matches",
+        "rows": "vertical parallax",
+        "convention": "agree with the images as",
+        "values": "nodata?",
+        "hidden": "behind others",
+        "contradicted": "contradict",
+        "files": "same",
+    }
+    assert words[check] in rows[pair]["faults"]
+
+
+def test_a_duplicate_in_another_split_is_found(audited):
+    rows, summary = read(audited[1])
+    assert "the same image as" in rows["KM_6"]["faults"]
+    assert "the same image as" in rows["KM_0"]["faults"]
+    (shared,) = summary["shared"]
+    assert {shared["first"], shared["second"]} == {"KM_0", "KM_6"}
+    assert shared["share"] == pytest.approx(1, abs=0.01)
+
+
+def test_what_is_written(audited):
+    _, out, summary = audited
+    assert sorted(f.name for f in out.iterdir()) == [
+        "README.txt",
+        "index.html",
+        "pairs.csv",
+        "summary.json",
+    ]
+    page = (out / "index.html").read_text()
+    assert page.count("<section") == 3 and "data:image/webp" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert not list(out.parent.glob(".*"))
+    assert summary["verdicts"] == {"good": 0, "undecided": 0, "fault": 11}
+
+
+def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
+    root, out = tmp_path / "data", tmp_path / "out"
+    for seed in range(3):
+        add(root, seed, make(40 + seed), split=("train", "test")[seed % 2])
+    whole = run.measure
+    seen = []
+
+    def killed(of, pair):
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        seen.append(pair.name)
+        return whole(of, pair)
+
+    monkeypatch.setattr(run, "measure", killed)
+    with pytest.raises(KeyboardInterrupt):
+        audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+    assert not out.exists()
+    seen.clear()
+    monkeypatch.setattr(run, "measure", lambda of, p: (seen.append(p.name), whole(of, p))[1])
+    summary = audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+    assert len(seen) == 1
+    assert summary["verdicts"][GOOD] == 3 and not summary["shared"]
+    seen.clear()
+    strict = replace(LIMITS, parallax_px=0.001)
+    work = tmp_path / "work"
+    assert audit.audit(dataset(root), out, strict, work=work)["verdicts"][GOOD] < 3
+    audit.audit(dataset(root), out, LIMITS, work=work, worst=1)
+    assert not seen
+    fresh = {"work": tmp_path / "fresh", "worst": 1, "workers": 2}
+    again = audit.audit(dataset(root), tmp_path / "again", LIMITS, **fresh)
+    assert again == summary
+    for file in out.iterdir():
+        assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes(), file.name
+
+
+def test_pairs_without_labels(tmp_path):
+    scene = make(50, shift=(0.0, 0.6))
+    write(tmp_path / "KM_left_1.tiff", scene.left)
+    write(tmp_path / "KM_right_1.tiff", scene.right)
+    audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+    rows, summary = read(tmp_path / "out")
+    assert rows["KM_1"]["verdict"] == FAULT and "vertical parallax" in rows["KM_1"]["faults"]
+    assert summary["labelled_pairs"] == 0
+
+
+def test_files_that_do_not_fit_and_empty_images(tmp_path):
+    scene = make(51)
+    add(tmp_path, 1, scene, labels=scene.labels[:-5])
+    scene.right[:] = 7
+    add(tmp_path, 2, scene)
+    audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+    rows, _ = read(tmp_path / "out")
+    assert "differ in size" in rows["KM_1"]["faults"]
+    assert "the right image is empty" in rows["KM_2"]["faults"]
+
+
+def test_an_unreadable_file_is_named(tmp_path):
+    scene = make(52)
+    add(tmp_path, 1, scene)
+    (tmp_path / "test/left/KM_left_1.tiff").write_bytes(b"no image")
+    with pytest.raises(InputError, match="KM_left_1"):
+        audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")

@@ -1,0 +1,53 @@
+"""The right image warped by the labels of a scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereotruth.dataset import warped_tile
+from stereotruth.epipolar import warping
+from stereotruth.evaluation import scene_warping
+from stereotruth.products import grids
+
+from ...synthetic.truth_scene import write_disparity
+
+# ------------------------------------------------------------------------------------ warping
+
+
+def texture(x, y):
+    return 1000 + 200 * np.sin(x / 5.0 + 0.02 * y) + 150 * np.cos(y / 7.0 - x / 11.0)
+
+
+def test_warping_finds_the_left_image_again(scene, tmp_path):
+    shape = scene.model.shape
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
+    disparity = 3.3 + 0.02 * x
+    disparity[:, 50:60] = np.nan
+    right_x = x  # right(x_r) = texture at the left position x with x − d(x) = x_r
+    right = texture((right_x + 3.3) / 0.98, y)
+    layer = grids.Layer("uint16", 0, {"units": "DN", "long_name": "image"})
+    stores = []
+    for name, image in (("left", texture(x, y)), ("right", right)):
+        with grids.building(tmp_path / f"{name}.zarr") as scratch:
+            arrays = grids.create_grid(
+                scratch, shape, {"image": layer}, chunk=128, shard=256, attrs={}
+            )
+            arrays["image"][:] = np.rint(image).astype("uint16")
+        stores.append(tmp_path / f"{name}.zarr")
+    right_way = write_disparity(scene, tmp_path / "d.zarr", disparity)
+    figures = scene_warping.evaluate_warping(*stores, right_way)
+    assert figures["correlation"] > 0.9999
+    assert figures["pixels"] > 0.9 * disparity.size * (shape[1] - 20) / shape[1]
+    wrong_way = write_disparity(scene, tmp_path / "e.zarr", -disparity)
+    assert scene_warping.evaluate_warping(*stores, wrong_way)["correlation"] < 0.9
+
+    values = np.rint(texture(x, y))[:64, :64]
+    tile = warped_tile.WarpedTile(
+        "T_1",
+        values,
+        warping.warp_rows(np.rint(right)[:64], (x - disparity)[:64, :64]),
+        disparity[:64, :64],
+    )
+    assert tile.correlation > 0.9999
+    scene_warping.draw_panels(tile, tmp_path / "panels" / "T_1.png")
+    assert [p.name for p in (tmp_path / "panels").iterdir()] == ["T_1.png"]

@@ -1,0 +1,30 @@
+"""From predictions to scores, tables, figure 10 and the page."""
+
+from __future__ import annotations
+
+import pytest
+
+from stereotruth.dataset.stereo_dataset import find_pairs
+
+from ....browser import look, needs_chromium
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@needs_chromium
+def test_the_page_is_whole_and_needs_no_network(compared, tmp_path):
+    seen = look(
+        compared / "compared/index.html",
+        tmp_path,
+        "return [document.images.length, [...document.images].every((i) => i.naturalWidth > 0),"
+        " document.querySelectorAll('table').length, document.body.innerText]",
+    )
+    assert seen.wrong == [] and seen.requests == []
+    count, loaded, tables, text = seen.found
+    assert count == 5 and loaded and tables == 5
+    for word in ("Table 5", "Half", "Kunming", "EPE"):
+        assert word in text
+
+
+def test_the_toy_dataset_is_as_meant(compared):
+    assert len(find_pairs(compared / "data", "whu")) == 7

@@ -1,0 +1,31 @@
+"""Pictures of disparities and errors."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stereotruth.matching.benchmark import panels
+from stereotruth.matching.benchmark.panels import Column, draw_columns, error_picture
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_errors_have_one_scale_and_holes_a_colour():
+    truth = np.array([[0, 0, 0, np.nan]], np.float32)
+    found = np.array([[0, 6, np.nan, 1]], np.float32)
+    none, full, hole, unlabelled = error_picture(found, truth)[0].tolist()
+    assert sum(none) < 20 and sum(full) > 600
+    assert tuple(hole) == panels.INVALID
+    assert tuple(unlabelled) == panels.NO_VALUE
+
+
+def test_pictures_without_truth_have_no_errors(tmp_path):
+    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
+    flat = np.full((8, 8), 3.0, np.float32)
+    columns = [Column(name, image, image, None, {"M": flat}) for name in ("a", "b")]
+    draw_columns(tmp_path / "a.png", columns)
+    draw_columns(tmp_path / "b.png", columns, across=True)
+    tall, wide = (cv2.imread(str(tmp_path / f"{n}.png")).shape for n in "ab")
+    assert tall[0] > tall[1] and wide[1] > wide[0]

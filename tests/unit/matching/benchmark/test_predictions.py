@@ -1,0 +1,165 @@
+"""A method over a dataset: what is kept, what is made again, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.errors import InputError
+from stereotruth.matching.benchmark.prediction_files import read_prediction, read_record
+from stereotruth.matching.benchmark.predictions import predict
+from stereotruth.products.rasters import read_disparity
+
+from ....synthetic.images import write
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+SHAPE = (8, 12)
+CODE = """
+import numpy as np
+from pathlib import Path
+
+def match(left, right, disparity_range, fail_at=None):
+    log = Path("calls.txt")
+    log.write_text((log.read_text() if log.exists() else "") + f"{int(left[0, 0])} ")
+    if fail_at == left[0, 0]:
+        raise KeyboardInterrupt
+    disparity = left.astype(np.float32) / 8
+    disparity[0] = np.nan
+    return disparity
+"""
+METHOD = {"kind": "function", "function": "mine.py:match"}
+
+
+@pytest.fixture
+def dataset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(CODE)
+    for n in (1, 2, 3):
+        image = np.full(SHAPE, n, np.uint16)
+        image[:, 3] += 40
+        for kind in ("left", "right"):
+            write(Path(f"data/test/{kind}/KM_{kind}_{n}.tiff"), image)
+        write(Path(f"data/test/disp/KM_disparity_{n}.tiff"), np.full(SHAPE, n, np.float32))
+    return StereoDataset("toy", Path("data"), "whu", (-8, 8))
+
+
+def run(dataset, settings=METHOD, **more):
+    return predict(dataset, "test", "mine", settings, "out", work=".work", **more)
+
+
+def calls():
+    file = Path("calls.txt")
+    found = file.read_text().split() if file.exists() else []
+    file.unlink(missing_ok=True)
+    return found
+
+
+def test_every_pair_is_matched_and_the_first_one_twice(dataset):
+    record = run(dataset)
+    assert calls() == ["1", "1", "2", "3"]
+    assert {p.name for p in Path("out").iterdir()} == {
+        *(f"KM_{n}.tiff" for n in (1, 2, 3)),
+        "predictions.json",
+    }
+    for pair in dataset.pairs():
+        found = read_prediction("out", pair)
+        assert np.isnan(found[0]).all()
+        assert found[1, 3] == (int(pair.name[-1]) + 40) / 8
+    assert record == read_record("out") == json.loads(Path("out/predictions.json").read_text())
+    assert record["median_seconds"] >= 0 and record["peak_memory_mb"] > 10
+    assert set(record["pairs"]) == {"KM_1", "KM_2", "KM_3"}
+
+
+def test_an_interrupted_run_is_carried_on(dataset):
+    with pytest.raises(KeyboardInterrupt):
+        run(dataset, METHOD | {"options": {"fail_at": 3}})
+    assert calls() == ["1", "1", "2", "3"] and not Path("out").exists()
+    # the option is part of what the pairs are made of, so nothing of it is taken over
+    with pytest.raises(KeyboardInterrupt):
+        run(dataset, METHOD | {"options": {"fail_at": 2}})
+    assert calls() == ["1", "1", "2"]
+    write(Path("data/test/left/KM_left_2.tiff"), np.full(SHAPE, 5, np.uint16))
+    run(dataset, METHOD | {"options": {"fail_at": 2}})
+    assert calls() == ["5", "5", "3"]
+    assert read_disparity("out/KM_2.tiff")[1, 1] == 5 / 8
+
+
+def test_only_what_a_pair_is_made_of_has_it_matched_again(dataset):
+    files = {"files": ["mine.py"]}
+    run(dataset, **files)
+    assert len(calls()) == 4
+    first = read_record("out")
+    write(Path("data/test/disp/KM_disparity_2.tiff"), np.zeros(SHAPE, np.float32))  # a label
+    assert run(dataset, **files) == first and calls() == []
+    run(dataset, **files, code="other")
+    assert len(calls()) == 4
+    Path("mine.py").write_text(CODE + "\n# another")
+    run(dataset, **files, code="other")
+    assert len(calls()) == 4
+    for kind in ("left", "right", "disp"):
+        next(Path(f"data/test/{kind}").glob("*_3.tiff")).unlink()
+    Path("out/KM_2.tiff").write_bytes(b"spoilt")
+    run(dataset, **files, code="other")
+    assert calls() == ["2", "2"]
+    assert {file.name for file in Path(".work").glob("*.tiff")} == {"KM_1.tiff", "KM_2.tiff"}
+    assert read_prediction("out", dataset.pairs()[1])[1, 1] == 2 / 8
+
+
+def test_a_folder_of_results_is_taken_over(dataset):
+    folder = Path("theirs")
+    folder.mkdir()
+    truth = np.arange(96, dtype=np.float32).reshape(SHAPE)
+    truth[0, 0], truth[0, 1] = -999, np.nan
+    write(folder / "KM_1.tif", truth)
+    np.save(folder / "KM_2.npy", truth.astype(np.float64))
+    cv2.imwrite(str(folder / "KM_3.pfm"), np.nan_to_num(truth, nan=np.inf))
+    record = run(dataset, {"kind": "folder", "folder": "theirs"})
+    expected = np.where(truth >= 0, truth, np.nan)
+    for pair in dataset.pairs():
+        assert np.array_equal(read_prediction("out", pair), expected, equal_nan=True), pair.name
+    assert record["median_seconds"] is None and record["peak_memory_mb"] is None
+
+
+def test_what_a_folder_lacks_is_told(dataset):
+    settings = {"kind": "folder", "folder": "theirs"}
+    with pytest.raises(InputError, match="no such folder"):
+        run(dataset, settings)
+    write(Path("theirs/KM_1.tif"), np.zeros(SHAPE, np.float32))
+    with pytest.raises(InputError, match="no result for pair KM_2"):
+        run(dataset, settings)
+    write(Path("theirs/KM_2.tif"), np.zeros((3, 3), np.float32))
+    with pytest.raises(InputError, match=r"KM_2 is \(3, 3\), its image \(8, 12\)"):
+        run(dataset, settings)
+
+
+def test_images_that_do_not_fit_each_other_are_refused(dataset):
+    write(Path("data/test/right/KM_right_2.tiff"), np.zeros((8, 13), np.uint16))
+    with pytest.raises(InputError, match=r"left image is \(8, 12\) uint16, right one \(8, 13\)"):
+        run(dataset)
+
+
+def test_no_record_is_told(tmp_path):
+    with pytest.raises(InputError, match="no predictions"):
+        read_record(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system counts as it does")
+def test_peak_memory_is_that_of_the_process_alone():
+    """Not that of the process which started it, as Linux's ru_maxrss would have it."""
+    ballast = np.ones(80 << 20)  # 640 MB
+    code = (
+        "from stereotruth.matching.benchmark.predictions import peak_memory_mb as peak;"
+        "import numpy as np;"
+        "before = peak(); held = np.ones(25 << 20); print(before, peak())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, after = map(float, run.stdout.split())
+    assert ballast.nbytes / 2**20 > before > 10
+    assert after - before == pytest.approx(200, abs=30)

@@ -1,0 +1,62 @@
+"""The folder of scores of a method."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from stereotruth.dataset.stereo_dataset import Pair, StereoDataset
+from stereotruth.matching.benchmark.score_method import choose, describe, score
+
+from ....synthetic.toy_benchmark import CITIES, rows, settings
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_a_folder_of_scores_holds_tiles_cities_strata_and_pictures(compared):
+    folder = compared / "benchmark/half"
+    tiles = rows(folder / "scores.csv")
+    assert [row["tile"] for row in tiles] == [f"{c}_{n}" for c in CITIES for n in (1, 2, 3)]
+    for row in tiles:
+        assert int(row["labelled"]) == 24 * 28 and float(row["valid_share"]) == 0.75
+        assert float(row["epe_px"]) == pytest.approx(0.5, abs=1e-5)
+        assert float(row["filled_epe_px"]) > 0.5
+    kunming, wuhan, total = rows(folder / "cities.csv")
+    assert (kunming["city"], wuhan["city"], total["city"]) == ("Kunming", "Wuhan", "all")
+    assert int(total["labelled"]) == 6 * 24 * 28 and total["tiles"] == "6"
+    assert kunming["epe_px_low"] == ""  # three tiles are too few
+    low, mean, high = (float(total[f"filled_epe_px{end}"]) for end in ("_low", "", "_high"))
+    assert low < mean < high
+    names = [row["stratum"] for row in rows(folder / "strata.csv")]
+    assert names == ["all", "near_step", "match_inside", "match_outside"]
+    assert sorted(p.name for p in (folder / "panels").iterdir()) == ["KM_2.png", "WH_2.png"]
+    summary = json.loads((folder / "scores.json").read_text())
+    assert summary["label"] == "Half" and summary["tiles"] == 6
+    assert "of the 75.0 % of pixels that are valid; holes filled: EPE" in describe(summary)
+
+
+def test_scoring_again_gives_the_same_bytes(compared, tmp_path):
+    dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
+    again = settings(fine_tuned_of="two")
+    score(dataset, "test", "Half", compared / "match/half", tmp_path / "again", **again)
+    files = [p for p in (compared / "benchmark/half").rglob("*") if p.is_file()]
+    assert len(files) == 6
+    for file in files:
+        other = tmp_path / "again" / file.relative_to(compared / "benchmark/half")
+        assert file.read_bytes() == other.read_bytes(), file.name
+
+
+def test_pictures_are_chosen_of_all_cities():
+    def pairs(**counts):
+        return [
+            Pair(f"{city}_{n}", city, "test", Path(), Path(), None)
+            for city, count in counts.items()
+            for n in range(count)
+        ]
+
+    names = [pair.name for pair in choose(pairs(A=9, B=1, C=4), 5)]
+    assert names == ["A_3", "A_5", "B_0", "C_1", "C_2"]
+    assert len(choose(pairs(A=2, B=3), 9)) == 5
+    assert choose(pairs(A=2), 0) == []

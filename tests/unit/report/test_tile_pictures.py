@@ -1,0 +1,45 @@
+"""Pictures of a tile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.products.rasters import write_tiff
+from stereotruth.report import tile_pictures
+
+from ...synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
+    rows = write_city(tmp_path, 1)
+    made = tile_pictures.tile_pictures(
+        tmp_path, rows[0], thumbnail=(SIZE, 10**6), slider=(SIZE, 10**6)
+    )
+    assert made.histogram == {SHIFT: SIZE**2 - 600}
+    assert made.disparity_px == (SHIFT, SHIFT)
+    assert made.correlation == pytest.approx(1.0)
+    left, warped = picture(made.uris["slider_left"]), picture(made.uris["slider_warped"])
+    inner = np.s_[40:, 2 * SHIFT : -SHIFT]
+    assert np.abs(left - warped)[inner].mean() < 3  # grey values: compression
+    assert left[inner].std() > 20
+    difference = picture(made.uris["slider_difference"])
+    assert difference[inner].min() > 235
+    assert np.abs(warped[15:25, 26:44] - tile_pictures.NO_MATCH).max() < 25
+    assert np.abs(difference[15:25, 26:44] - tile_pictures.NO_DIFFERENCE).max() < 25
+    status = picture(made.uris["status"])
+    colours = tile_pictures.status_colours(list(FLAGS.values()))
+    for place, name in ((status[60:, 60:], "labelled"), (status[15:25, 26:44], "a_new_reason")):
+        assert np.abs(place - tuple(bytes.fromhex(colours[name][1:]))).max() < 25
+
+
+def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
+    rows = write_city(tmp_path, 1)
+    write_tiff(tmp_path / rows[0]["disp"], np.full((SIZE, SIZE), 4, np.float32), nodata=-999)
+    made = tile_pictures.tile_pictures(
+        tmp_path, rows[0], thumbnail=(9, 10**6), slider=(SIZE, 10**6)
+    )
+    assert made.correlation < 0.9
+    assert picture(made.uris["slider_difference"])[40:, 20:80].min(axis=2).mean() < 150

@@ -1,0 +1,49 @@
+"""A simulated scene as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import rasterio
+
+from stereotruth.products.provenance import source_modules
+from stereotruth.simulate import world
+from stereotruth.simulate.cities import (
+    lidar_files,
+)
+from stereotruth.simulate.lidar import simulate_lidar_tile
+from stereotruth.simulate.render import prepare, simulate_image
+
+from ...synthetic.small_cities import TOWN
+
+
+def test_same_spec_gives_the_same_files(town: Path, tmp_path: Path) -> None:
+    world._build.cache_clear()
+    prepare.__globals__["_prepare"].cache_clear()
+    scene = TOWN.scenes[0]
+    name = lidar_files(TOWN, scene)[1]
+    simulate_image(TOWN, scene, "right", tmp_path / "right.tif", seed=1)
+    simulate_lidar_tile(TOWN, scene, name, tmp_path / name, seed=1)
+    assert (tmp_path / "right.tif").read_bytes() == (town / "right.tif").read_bytes()
+    assert (tmp_path / name).read_bytes() == (town / "lidar" / name).read_bytes()
+    simulate_image(TOWN, scene, "right", tmp_path / "other.tif", seed=2)
+    with rasterio.open(tmp_path / "other.tif") as a, rasterio.open(town / "right.tif") as b:
+        difference = a.read(1).astype(float) - b.read(1)
+    assert 2 < difference.std() < 12  # only the sensor's noise is drawn again
+
+
+def test_shares_no_code_with_the_pipeline() -> None:
+    modules = source_modules(
+        "simulate.render", "simulate.lidar", "simulate.truth", "simulate.control_points"
+    )
+    others = {m for m in modules if not m.startswith("simulate")}
+    assert others <= {
+        "",
+        "errors",
+        "job",
+        "products",
+        "products.files",
+        "products.grids",
+        "products.locks",
+        "products.provenance",
+    }

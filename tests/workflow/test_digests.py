@@ -1,0 +1,114 @@
+"""The code digests of the rules: an edit of what a digest holds makes the rule's products again."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+
+from stereotruth.matching import kinds
+from stereotruth.products.provenance import source_modules
+
+from ..synthetic.rules import FOLDER, read_rules
+
+RULES = read_rules()
+WITH_SCRIPT = {name: rule for name, rule in RULES.items() if rule.script}
+# The packages that the digests of each rule reach, all of them: a rule must not grow unseen.
+REACH = {
+    "simulate_image": {"simulate", "products"},
+    "simulate_lidar": {"simulate", "products"},
+    "simulate_truth": {"simulate", "products"},
+    "ingest": {"lidar", "products"},
+    "align": {"alignment", "epipolar", "products"},
+    "refine": {"alignment", "epipolar", "lidar", "products"},
+    "rectify": {"epipolar", "alignment", "products"},
+    "rectify_strip": {"epipolar", "alignment", "products"},
+    "project": {"disparity", "alignment", "epipolar", "lidar", "products"},
+    "project_right": {"disparity", "alignment", "epipolar", "lidar", "products"},
+    "project_strip": {"disparity", "alignment", "epipolar", "lidar", "products"},
+    "export": {"dataset", "epipolar", "products"},
+    "dataset": {"dataset", "products"},
+    "grid_truth": {"evaluation", "epipolar", "simulate", "products"},
+    "evaluate_truth": {"evaluation", "dataset", "epipolar", "products"},
+    "evaluate_truth_city": {"evaluation", "dataset", "epipolar", "products"},
+    "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
+    "report_city": {"report", "dataset", "epipolar", "products"},
+    "audit": {"evaluation", "dataset", "disparity", "epipolar", "products"},
+    "train": {"matching", "dataset", "products"},
+    "match": {"matching", "dataset", "products"},
+    "score": {"matching", "dataset", "disparity", "products"},
+    "benchmark_tables": {"matching", "dataset", "disparity", "products"},
+    "predict_scene": {"matching", "products"},
+    "dsm": {"matching", "epipolar", "products"},
+}
+# Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
+# there are, and a scene more is no other scene.
+ANYWHERE = {"errors", "error_statistics", "job", "settings"}
+# Who reports and records does not change what is computed.
+NOT_COVERED = {"job", "products.provenance"}
+
+
+def covered(rule) -> set[str]:
+    """All modules that a rule's digests hold, those of every kind of method too."""
+    named = {module for modules in rule.digests().values() for module in modules}
+    if rule.digest_of_method():
+        named |= {module for module in kinds.MODULES.values() if module}
+    return set(source_modules(*named))
+
+
+def makes_something(rule) -> bool:
+    return "output" in rule.directives
+
+
+def test_the_rules_are_read():
+    assert len(WITH_SCRIPT) >= 25
+    assert RULES["project_right"].script == "project"
+    assert RULES["project_right"].directives["log"] != RULES["project"].directives["log"]
+    assert set(RULES["audit"].digests()) == {"measuring", "code"}
+
+
+def test_every_rule_that_makes_something_has_a_digest_of_its_code():
+    without = {
+        name
+        for name, rule in WITH_SCRIPT.items()
+        if makes_something(rule) and not rule.digests().get("code")
+    }
+    assert without == set()
+
+
+@pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
+def test_a_digest_reaches_the_packages_that_stand_here(name):
+    assert name in REACH, "a new rule: say here what its digest may reach"
+    reached = {module.partition(".")[0] for module in covered(WITH_SCRIPT[name])}
+    assert reached - ANYWHERE == REACH[name]
+
+
+def test_no_other_rules_stand_here():
+    assert set(REACH) <= set(WITH_SCRIPT)
+
+
+@pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
+def test_code_digests_hold_the_modules_that_the_scripts_import(name):
+    """Otherwise an edit of a module would leave stale results standing."""
+    rule = WITH_SCRIPT[name]
+    tree = ast.parse((FOLDER / f"scripts/{rule.script}.py").read_text(encoding="utf-8"))
+    imported = {
+        node.module.removeprefix("stereotruth.")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth.")
+    }
+    assert imported - covered(rule) <= NOT_COVERED
+
+
+@pytest.mark.parametrize("script", (FOLDER / "scripts").glob("*.py"), ids=lambda f: f.stem)
+def test_every_script_has_its_rule_and_log(script):
+    """The rule has the script's name and a log below its own; all that is done is done in a job."""
+    rule = RULES[script.stem]
+    assert rule.script == script.stem
+    for name, other in WITH_SCRIPT.items():
+        if other.script == script.stem:
+            assert f'"logs/{name}/' in other.directives["log"]
+    (main,) = (node for node in ast.parse(script.read_text()).body if isinstance(node, ast.If))
+    (work,) = (node for node in main.body if isinstance(node, ast.With))
+    assert ast.unparse(work.items[0].context_expr).startswith("job(snakemake.log[0], ")
+    assert not any(isinstance(node, ast.Expr) for node in main.body)
