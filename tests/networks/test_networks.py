@@ -11,6 +11,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
 from stereotruth.errors import InputError
+from stereotruth.matching.kinds import NETWORKS
 from stereotruth.matching.networks import image_scaling, inference, keras_weights, layers, weights
 from stereotruth.matching.networks.inference import NetworkMethod
 from stereotruth.matching.networks.psmnet import PSMNet
@@ -33,7 +34,7 @@ def test_parameters_are_as_many_as_the_authors(kind: str, trained: int, statisti
     assert sum(b.numel() for k, b in held.items() if "running" in k) == statistics
 
 
-@pytest.mark.parametrize("kind", sorted(weights.KINDS))
+@pytest.mark.parametrize("kind", sorted(NETWORKS))
 def test_outputs_have_the_sizes_that_the_loss_expects(kind: str) -> None:
     network = SavedNetwork(kind, (-64, 64)).build()
     side = 256
@@ -112,7 +113,7 @@ def test_any_range_can_be_looked_for() -> None:
     assert np.array_equal(found, again(*image, (-64, 128)))
 
 
-@pytest.mark.parametrize("kind", weights.KINDS)
+@pytest.mark.parametrize("kind", NETWORKS)
 def test_ranges_are_widened_to_the_networks_planes(kind: str) -> None:
     assert weights.covering(kind, (-96, 96)) == (-96, 96)  # US3D's
     assert weights.covering(kind, (-128, 64)) == (-128, 64)  # WHU-Stereo's
@@ -130,11 +131,11 @@ def test_weight_files_hold_all_that_is_needed(tmp_path: Path) -> None:
     file = tmp_path / "weights.pt"
     weights.save_weights(file, made.model, made.network, {"from": "here"})
     settings = {"weights": str(file), "device": "cpu"}
-    again = inference.network_method("stereonet", settings)
+    again = inference.make("mine", "stereonet", settings, 0)
     image = np.random.default_rng(1).integers(1, 900, (2, 64, 64)).astype(np.uint16)
     assert np.array_equal(made(*image, (-64, 64)), again(*image, (-64, 64)))
     with pytest.raises(InputError, match="weights of stereonet, not of psmnet"):
-        inference.network_method("psmnet", settings)
+        inference.make("mine", "psmnet", settings, 0)
     file.write_bytes(b"no weights")
     with pytest.raises(InputError, match="not a weight file"):
         weights.load_weights(file)
@@ -207,7 +208,7 @@ def test_published_stereonet_gives_the_reference_outputs(
 def test_published_stereonet_matches_a_real_tile_from_its_raw_pixels() -> None:
     settings = {"weights": SHARED / "weights/StereoNet_WHU.h5", "device": "cpu"}
     reference = np.load(SHARED / "reference/real_WHU_KM_253_crop512.npz")
-    found = inference.network_method("stereonet", settings)(
+    found = inference.make("mine", "stereonet", settings, 0)(
         reference["raw_left"], reference["raw_right"], (-128, 64)
     )
     assert np.abs(found - reference["d3"]).max() < 1e-3

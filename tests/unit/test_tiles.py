@@ -6,7 +6,6 @@ import csv
 import json
 import struct
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,6 +19,7 @@ from stereotruth.dataset.export import export_city
 from stereotruth.dataset.orientation import evaluate
 from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.dataset.settings import Limits, Settings
 from stereotruth.dataset.splits import shared_ground
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.dataset.tile_files import round_disparity
@@ -30,6 +30,7 @@ from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.errors import InputError
 from stereotruth.products.grids import Layer, building, create_grid
 from stereotruth.products.rasters import write_tiff
+from stereotruth.settings import fields_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -146,9 +147,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     return make_scene(tmp_path_factory.mktemp("scenes") / "s1", bare_from=240)
 
 
-run = partial(
-    export_city, "Town", "TN", size=SIZE, training=600, validation=80, testing=200, seed=1
-)
+NO_LIMITS = Limits(*[None] * 6)
+COUNTS = {"training": 600, "validation": 80, "testing": 200}
+
+
+def run(scenes, out: Path, **options) -> dict:
+    """Export with other settings than the configuration's; ``options``: settings and the rest."""
+    given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
+    settings = {name: given.pop(name) for name in list(given) if name in fields_of(Settings)}
+    return export_city("Town", "TN", scenes, out, settings=Settings(**settings), **COUNTS | given)
 
 
 @pytest.fixture(scope="module")
