@@ -13,7 +13,17 @@ import re
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+)
 
 from pydantic import (
     AfterValidator,
@@ -26,7 +36,6 @@ from pydantic import (
     ValidationError,
 )
 from pydantic.dataclasses import dataclass as validated
-from typing_extensions import dataclass_transform
 
 from .errors import InputError
 
