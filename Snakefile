@@ -9,6 +9,9 @@ configfile: "config/config.yaml"
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/inputs.smk"
+include: "workflow/rules/methods.smk"
+include: "workflow/rules/run.smk"
 include: "workflow/rules/simulate.smk"
 include: "workflow/rules/ingest.smk"
 include: "workflow/rules/align.smk"
@@ -29,14 +32,6 @@ rule all:
     default_target: True
     input:
         expand("tiles/{city}", city=CITIES),
-
-
-onsuccess:
-    print(made())
-
-
-onerror:
-    print(complaints(log))
 
 
 report: "workflow/report/workflow.rst"

@@ -37,7 +37,6 @@ from stereotruth.products.provenance import source_digest
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]
-SCHEMAS = PROJECT / "workflow" / "schemas"
 GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to its unit
     ("visible labelled %", "visible", 98.5, None, 100),
     ("hidden labelled %", "hidden", None, 1.0, 100),
@@ -348,8 +347,8 @@ def read_config(files: Sequence[Path]) -> dict[str, Any]:
 
 def scenes_made(config: Mapping[str, Any], only: Sequence[str] | None) -> list[Made]:
     """The scenes of the sheet, of these cities or of all, that the workflow has made."""
-    cities = sheets.read_cities(config["cities"], SCHEMAS)
-    scenes = sheets.read_scenes(config["scenes"], cities, SCHEMAS)
+    cities = sheets.read_cities(config["cities"])
+    scenes = sheets.read_scenes(config["scenes"], cities)
     present = []
     for made in (Made(s) for s in scenes.values() if not only or s.city in only):
         if made.disparity.is_dir():

@@ -27,7 +27,8 @@ from stereotruth.evaluation.audit import sharing
 from stereotruth.evaluation.audit.conventions import label_values
 from stereotruth.evaluation.audit.matches import Matches, match_pair
 from stereotruth.evaluation.audit.pair import EXTRA_PX, measure_arrays
-from stereotruth.evaluation.audit.verdicts import FAULT, UNDECIDED, Limits, judge
+from stereotruth.evaluation.audit.settings import Settings
+from stereotruth.evaluation.audit.verdicts import FAULT, UNDECIDED, judge
 from stereotruth.products.files import replacing
 from stereotruth.products.grids import require_complete
 from stereotruth.products.rasters import read_image
@@ -197,7 +198,7 @@ def main() -> None:
     config = yaml.safe_load((PROJECT / "config/config.yaml").read_text())
     settings = config["benchmark"]["datasets"]["synthetic"] | {"root": str(arguments.dataset)}
     dataset = StereoDataset.of("synthetic", settings)
-    limits = Limits(**{k: v for k, v in config["audit"].items() if k != "worst"})
+    limits = Settings(**config["audit"])
     pairs = dataset.pairs(labelled=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
@@ -225,7 +226,7 @@ def main() -> None:
         print(shared.read_text())
 
 
-def report(done: list[dict[str, Any]], limits: Limits, pairs: int) -> None:
+def report(done: list[dict[str, Any]], limits: Settings, pairs: int) -> None:
     """A row per fault: pairs, found by its check, found by any, undecided."""
     names = {name: of["check"] for found in done for name, of in found.items()}
     print("\n| fault | pairs | found by its check | by any | undecided |\n|---|---|---|---|---|")

@@ -30,6 +30,7 @@ from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.matching.benchmark.predictions import peak_memory_mb
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes.predict_scene import predict_scene
+from stereotruth.matching.scenes.settings import Settings
 from stereotruth.matching.scenes.surface_model import Raster, write_dsm
 from stereotruth.matching.scenes.whole_images import match
 from stereotruth.products.grids import Layer, blocks, building, create_grid, require_complete
@@ -420,8 +421,8 @@ def main() -> None:
     for method, settings in methods.items():
         store, tiff = folder / f"{method}.zarr", folder / f"{method}_dsm.tif"
         margin = None if settings["kind"] == "sgm" else given.margin
-        options = {"method": method, "settings": settings, "disparity_range": RANGE}
-        options |= {"block_px": BLOCK, "overlap_px": OVERLAP, "margin_px": margin, "workers": 2}
+        of = Settings(RANGE, block_px=BLOCK, overlap_px=OVERLAP, margin_px=margin)
+        options = {"method": method, "entry": settings, "settings": of, "workers": 2}
         summary, seconds, peak = measured(predict_scene, *stores, store, **options)
         _, dsm_seconds, dsm_peak = measured(write_dsm, store, tiff, workers=2)
         dsm, raster = read_dsm(tiff)

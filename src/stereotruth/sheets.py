@@ -1,4 +1,4 @@
-"""The user's sheets and configuration: read, checked, and turned into plain values.
+"""The user's sheets: read, checked, and turned into plain values.
 
 Everything that can be known to be wrong before any work is refused here, in one line that names
 the sheet, the row and the remedy.
@@ -12,75 +12,75 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import jsonschema
-import yaml
+from pydantic import Field, StringConstraints
 
 from .errors import InputError
+from .settings import Text, Whole, check, settings
 
 LIDAR_SUFFIXES = (".las", ".laz")
 
 
-@dataclass(frozen=True)
+Count = Annotated[Whole, Field(ge=0)]
+Given = Annotated[Text, StringConstraints(min_length=1)]
+
+
+@settings
 class City:
     """One row of the cities sheet; the counts are those of the paper's table 3."""
 
-    city: str
-    prefix: str
-    training: int
-    validation: int
-    testing: int
+    city: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    """name of letters, digits, `-` and `_`; its tiles go to `tiles/<city>/`"""
+
+    prefix: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9]+$")]
+    """what its tile names begin with (SG, KM, YD, QC, WH, HY …), of letters and digits"""
+
+    training: Count
+    """tiles of this split in the paper's table 3: the weights by which the labelled tiles are
+    split"""
+
+    validation: Count
+    """likewise"""
+
+    testing: Count
+    """likewise"""
 
 
-@dataclass(frozen=True)
+@settings
 class Scene:
     """One row of the scenes sheet: a stereo pair, its LiDAR and its ground control points."""
 
-    scene: str
-    city: str
-    left_image: str
-    right_image: str
-    lidar: str
-    lidar_crs: str
-    geoid: str
-    gcps: str
+    scene: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9-]+$")]
+    """unique id of letters, digits and `-`"""
 
+    city: Given
+    """a row of the cities sheet"""
 
-def _schema(name: str, schemas: Path) -> dict[str, Any]:
-    return yaml.safe_load((schemas / f"{name}.schema.yaml").read_text(encoding="utf-8"))
+    left_image: Given
+    """backward view (reference): GeoTIFF, or a format that GDAL reads, with RPC metadata in the
+    TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside it"""
 
+    right_image: Given
+    """forward view (target), likewise"""
 
-def _complaint(error: jsonschema.ValidationError) -> tuple[str, str]:
-    """What is wrong, and the remedy, of a schema violation in the user's words."""
-    key = ".".join(str(part) for part in error.absolute_path)
-    if error.validator == "additionalProperties":
-        known = sorted(error.schema.get("properties", {}))
-        unknown = sorted(set(error.instance) - set(known))
-        close = difflib.get_close_matches(unknown[0], known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
-        place = f" under {key!r}" if key else ""
-        return f"unknown key {', '.join(map(repr, unknown))}{place}", hint
-    if error.validator == "required":
-        return error.message, "add it"
-    meaning = error.schema.get("description", "")
-    return f"{key or 'value'}: {error.message}", f"{key or 'it'} is: {meaning}" if meaning else (
-        "see config/README.md"
-    )
+    lidar: Given
+    """a folder or a glob of `.las`, `.laz`, `.copc.laz` files"""
 
+    lidar_crs: Text
+    """EPSG code or WKT (compound allowed) for files that carry none; else empty"""
 
-def check(instance: Mapping[str, Any], schema: str, schemas: Path, file: str | Path) -> None:
-    """Hold values against one of the JSON schemas.
+    geoid: Text
+    """geoid grid (GTX or GeoTIFF), m, where the LiDAR's heights are orthometric; else empty:
+    heights are ellipsoidal"""
 
-    Raises InputError with the first violation, naming ``file``, the key and what it should be.
-    """
-    validator = jsonschema.Draft202012Validator(_schema(schema, schemas))
-    error = jsonschema.exceptions.best_match(validator.iter_errors(instance))
-    if error is not None:
-        problem, remedy = _complaint(error)
-        raise InputError(problem, file=file, remedy=remedy)
+    gcps: Text
+    """CSV of ground control points, see below; empty without any, if `alignment.refine` is true:
+    the refinement then starts from the RPCs alone (10 px standard deviation is assumed, 3e-4 of
+    scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
+    images lie on the LiDAR: the attribute `alignment_sigma` of `left.zarr` says how well"""
 
 
 def _read_table(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
@@ -131,7 +131,7 @@ def _unique(values: Iterable[str], column: str, file: Path) -> None:
         )
 
 
-def read_cities(path: str | Path, schemas: Path) -> dict[str, City]:
+def read_cities(path: str | Path) -> dict[str, City]:
     """The cities sheet by name of the city. Raises InputError as described in the module."""
     path = Path(path)
     cities = {}
@@ -146,20 +146,19 @@ def read_cities(path: str | Path, schemas: Path) -> dict[str, City]:
                     remedy=f"{count} is a number of tiles: a whole number, 0 or more",
                 )
             values[count] = int(cells[count])
-        check(values, "cities", schemas, f"{path}, line {number}")
-        cities[cells["city"]] = City(**values)
+        cities[cells["city"]] = check(values, City, f"{path}, line {number}")
     _unique([cells["city"] for _, cells in rows], "city", path)
     _unique([cells["prefix"] for _, cells in rows], "prefix", path)
     return cities
 
 
-def read_scenes(path: str | Path, cities: Mapping[str, City], schemas: Path) -> dict[str, Scene]:
+def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene]:
     """The scenes sheet by id of the scene. Raises InputError as described in the module."""
     path = Path(path)
     scenes = {}
     rows = _read_table(path, [f.name for f in fields(Scene)])
     for number, cells in rows:
-        check(cells, "scenes", schemas, f"{path}, line {number}")
+        scene = check(cells, Scene, f"{path}, line {number}")
         if cells["city"] not in cities:
             close = difflib.get_close_matches(cells["city"], cities, n=1)
             raise InputError(
@@ -174,7 +173,7 @@ def read_scenes(path: str | Path, cities: Mapping[str, City], schemas: Path) -> 
                 file=path,
                 remedy="left_image is the backward view, right_image the forward view",
             )
-        scenes[cells["scene"]] = Scene(**cells)
+        scenes[scene.scene] = scene
     _unique([cells["scene"] for _, cells in rows], "scene", path)
     return scenes
 

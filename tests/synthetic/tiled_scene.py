@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,11 @@ import rasterio
 
 from stereotruth.dataset.export import export_city
 from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.dataset.settings import Limits, Settings
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.products.grids import Layer, building, create_grid
+from stereotruth.settings import fields_of
 
 SIZE = 64
 PIXELS = 360  # side of the original images
@@ -124,9 +125,15 @@ def make_scene(
     return SceneFiles(folder.name, *stores)
 
 
-run = partial(
-    export_city, "Town", "TN", size=SIZE, training=600, validation=80, testing=200, seed=1
-)
+NO_LIMITS = Limits(*[None] * 6)
+COUNTS = {"training": 600, "validation": 80, "testing": 200}
+
+
+def run(scenes, out: Path, **options) -> dict:
+    """Export with other settings than the configuration's; ``options``: settings and the rest."""
+    given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
+    settings = {name: given.pop(name) for name in list(given) if name in fields_of(Settings)}
+    return export_city("Town", "TN", scenes, out, settings=Settings(**settings), **COUNTS | given)
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from stereotruth import sheets
+from stereotruth.configuration import Configuration, with_tables
 from stereotruth.errors import InputError
+from stereotruth.settings import fields_of, nested
 
 ROOT = Path(__file__).parents[2]
-SCHEMAS = ROOT / "workflow" / "schemas"
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"
 COLUMNS = ("scene", "city", "left_image", "right_image", "lidar", "lidar_crs", "geoid", "gcps")
 ROW = ("Qichun-1", "Qichun", "l.tif", "r.tif", "lidar", "", "", "g.csv")
@@ -29,12 +30,12 @@ def with_cell(column: str, value: str) -> tuple[str, ...]:
 
 @pytest.fixture
 def cities(tmp_path):
-    return sheets.read_cities(write(tmp_path / "cities.tsv", CITIES), SCHEMAS)
+    return sheets.read_cities(write(tmp_path / "cities.tsv", CITIES))
 
 
 def test_the_sheets_of_the_project_are_valid():
-    cities = sheets.read_cities(ROOT / "config" / "cities.tsv", SCHEMAS)
-    scenes = sheets.read_scenes(ROOT / "config" / "scenes.tsv", cities, SCHEMAS)
+    cities = sheets.read_cities(ROOT / "config" / "cities.tsv")
+    scenes = sheets.read_scenes(ROOT / "config" / "scenes.tsv", cities)
     assert {scene.city for scene in scenes.values()} == set(cities)
     # table 3 of the paper
     assert sum(c.training + c.validation + c.testing for c in cities.values()) == 1757
@@ -43,7 +44,7 @@ def test_the_sheets_of_the_project_are_valid():
 def test_a_sheet_is_read_with_crlf_bom_comments_and_short_rows(tmp_path, cities):
     text = "\ufeff" + scenes_text(ROW) + "# a remark\n\n"
     file = write(tmp_path / "s.tsv", text.replace("\n", "\r\n"))
-    scene = sheets.read_scenes(file, cities, SCHEMAS)["Qichun-1"]
+    scene = sheets.read_scenes(file, cities)["Qichun-1"]
     assert (scene.left_image, scene.lidar_crs, scene.gcps) == ("l.tif", "", "g.csv")
 
 
@@ -63,7 +64,7 @@ def test_a_sheet_is_read_with_crlf_bom_comments_and_short_rows(tmp_path, cities)
 def test_a_wrong_scenes_sheet_is_refused_by_name(tmp_path, cities, text, words):
     file = write(tmp_path / "scenes.tsv", text)
     with pytest.raises(InputError) as refusal:
-        sheets.read_scenes(file, cities, SCHEMAS)
+        sheets.read_scenes(file, cities)
     for word in ["scenes.tsv", "Remedy", *words]:
         assert word in str(refusal.value)
 
@@ -71,13 +72,13 @@ def test_a_wrong_scenes_sheet_is_refused_by_name(tmp_path, cities, text, words):
 def test_a_count_that_is_no_number_is_refused(tmp_path):
     file = write(tmp_path / "cities.tsv", CITIES.replace("600", "many"))
     with pytest.raises(InputError, match="training is 'many'"):
-        sheets.read_cities(file, SCHEMAS)
+        sheets.read_cities(file)
 
 
 def test_an_unknown_key_is_refused_with_a_guess():
     config = {"tiles": {"sise": 512}}
     with pytest.raises(InputError) as refusal:
-        sheets.check({**default_config(), **config}, "config", SCHEMAS, "config")
+        Configuration.of({**default_config(), **config})
     assert "unknown key 'sise' under 'tiles'" in str(refusal.value)
     assert "did you mean 'size'?" in str(refusal.value)
 
@@ -86,7 +87,7 @@ def test_a_value_out_of_range_is_refused_with_its_meaning():
     config = default_config()
     config["occlusion"]["window"] = 8
     with pytest.raises(InputError, match=r"occlusion.window.*odd"):
-        sheets.check(config, "config", SCHEMAS, "config")
+        Configuration.of(config)
 
 
 def default_config() -> dict:
@@ -97,11 +98,104 @@ def default_config() -> dict:
 
 def test_the_default_configuration_is_valid_and_documented():
     config = default_config()
-    sheets.check(config, "config", SCHEMAS, "config")
+    Configuration.of(config)
     guide = (ROOT / "config" / "README.md").read_text()
     for key, value in config.items():
         for name in [f"{key}.{sub}" for sub in value] if isinstance(value, dict) else [key]:
             assert f"`{name}`" in guide, name
+
+
+def test_the_file_of_defaults_holds_every_key_with_the_default_of_its_class():
+    def keys(values: dict, before: str = "") -> set[str]:
+        found = set()
+        for key, value in values.items():
+            found.add(f"{before}{key}")
+            if isinstance(value, dict) and key not in ("datasets", "methods", "fixed"):
+                found |= keys(value, f"{before}{key}.")
+        return found
+
+    def written(of: object, before: str = "") -> set[str]:
+        found = set()
+        for name, key in fields_of(type(of)).items():
+            found.add(f"{before}{name}")
+            inner, by_name = nested(key.type)
+            if inner is not None and not by_name:
+                found |= written(getattr(of, name), f"{before}{name}.")
+        return found
+
+    assert Configuration.of(default_config()) == Configuration()
+    assert keys(default_config()) == written(Configuration())
+
+
+def test_the_reference_follows_from_the_classes():
+    guide = (ROOT / "config" / "README.md").read_text()
+    assert with_tables(guide) == guide, "run: python -m stereotruth.configuration"
+    assert guide.count("<!-- keys: ") == guide.count("<!-- end -->") == 4
+
+
+def with_key(path: str, value: object) -> dict:
+    config = inside = default_config()
+    *sections, key = path.split(".")
+    for section in sections:
+        inside = inside.setdefault(section, {})
+    inside[key] = value
+    return config
+
+
+MINE = {"root": "mine", "layout": "whu", "disparity_range": [-64, 64]}
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("tile", 3, ["unknown key 'tile'.", "did you mean 'tiles'?"]),
+        ("tiles", None, ["tiles: None has no keys", "size, stride"]),
+        ("seed", "x", ["seed: 'x' should be a valid integer", "whole number"]),
+        ("seed", True, ["seed: True"]),
+        ("strict", "yes", ["strict: 'yes'", "true, false"]),
+        ("tiles.stride", "z", ["tiles.stride: 'z'", "px, null"]),
+        ("tiles.min_labelled", 1.5, ["tiles.min_labelled: 1.5", "share, 0 … 1"]),
+        ("occlusion.window", 33, ["33 should be less than or equal to 31", "odd, 3 … 31"]),
+        ("occlusion.method", "bth", ["'bth'", "correlation, geometric, both, none"]),
+        ("ingest.drop_classes", [300], ["ingest.drop_classes.0: 300"]),
+        ("ingest.drop_classes", [7, 7], ["ingest.drop_classes", "a value twice"]),
+        ("alignment.fixed", {"S-1": 3}, ["alignment.fixed.S-1: 3", "scene: path"]),
+        ("strips", 0, ["strips: 0", "1 … 1000"]),
+        ("strips", {"S-1": 0}, ["strips.S-1: 0", "1 … 1000"]),
+        ("predict.offset", "best", ["predict.offset: 'best'", "px, auto"]),
+        ("predict.block_px", 1000, ["1000 should be a multiple of 256"]),
+        ("predict.overlap_px", 600, ["predict: blocks of 1024 px with an overlap of 600 px"]),
+        ("predict.dsm.resolution", 1, ["'resolution' under 'predict.dsm'", "'resolution_m'?"]),
+        ("benchmark.thresholds_px", [], ["benchmark.thresholds_px: [] should have"]),
+        ("benchmark.datasets.x", {"root": "r"}, ["benchmark.datasets.x.", "is required"]),
+        ("benchmark.datasets.x", MINE | {"nodatta": 0}, ["'nodatta' under 'benchmark.datasets.x'"]),
+        ("benchmark.datasets.x y", MINE, ["benchmark.datasets.x y: 'x y' should match"]),
+        ("benchmark.methods.x", {"kind": "raft"}, ["'raft'", "hmsmnet"]),
+        ("benchmark.methods.x", {"kind": "sgm", "training": {"epoch": 1}}, ["'epochs'?"]),
+        ("training.crop_px", [64], ["training.crop_px.1: is required"]),
+        ("training.augmentation.noise", -1, ["training.augmentation.noise: -1"]),
+    ],
+)
+def test_a_wrong_value_is_refused_by_its_key_with_what_it_may_be(path, value, words):
+    with pytest.raises(InputError) as refusal:
+        Configuration.of(with_key(path, value))
+    for word in ["config: ", "Remedy", *words]:
+        assert word in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("benchmark.datasets.x", MINE | {"methods": None}),
+        ("benchmark.datasets.synthetic", None),
+        ("benchmark.methods.sgm", {"kind": "sgm", "block_size": 5, "label": "mine"}),
+        ("strips", {"Wuhan-1": 8}),
+        ("predict.offset", -40),
+        ("tiles.nodata", -9999.5),
+    ],
+)
+def test_what_a_key_may_be_is_taken(path, value):
+    assert Configuration.of(with_key(path, value))
 
 
 def scene_with_lidar(lidar: Path | str) -> sheets.Scene:

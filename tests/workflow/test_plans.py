@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -90,6 +92,36 @@ def test_refinement_can_be_switched_off(project):
     (project.folder / "off.yaml").write_text("alignment:\n  refine: false\n")
     jobs = project.plan("tiles/Kunming", "--configfile", "off.yaml")
     assert "refine" not in jobs and jobs["align"] == 1
+
+
+PACK = """
+benchmark:
+  datasets: {mine: {root: mine, layout: whu, disparity_range: [-8, 8]}}
+  methods:
+    ours: {kind: function, function: "pack.stereo:match"}
+    gone: {kind: function, function: "no_such_module:match"}
+"""
+
+
+def test_an_edit_behind_a_module_is_seen_and_a_missing_one_refused(project):
+    (project.folder / "mine").mkdir()
+    (project.folder / "pack").mkdir()
+    for name in ("__init__.py", "stereo.py", "helper.py"):
+        (project.folder / "pack" / name).write_text("raise SystemExit('imported')\n")
+    (project.folder / "pack.yaml").write_text(PACK)
+    made = "results/match/mine/ours"
+    (project.folder / made).mkdir(parents=True)
+    touched = project.snakemake("--touch", made, "--configfile", "pack.yaml")
+    assert touched.status == 0, touched.text
+    assert project.plan(made, "--configfile", "pack.yaml") == {}
+    later = time.time() + 5
+    (project.folder / "pack/helper.py").write_text("# edited\n")
+    os.utime(project.folder / "pack/helper.py", (later, later))
+    assert project.plan(made, "--configfile", "pack.yaml") == {"match": 1}
+    run = project.snakemake("--dry-run", "results/match/mine/gone", "--configfile", "pack.yaml")
+    assert run.status != 0
+    for word in ("benchmark.methods.gone", "cannot import no_such_module", "Remedy"):
+        assert word in run.text
 
 
 def test_lint_passes():

@@ -28,8 +28,8 @@ rule align:
         mem_mb=1000,
         runtime=10,
     params:
-        model=config["alignment"]["model"],
-        strict=config["strict"],
+        model=SETTINGS.alignment.model,
+        strict=SETTINGS.strict,
         code=source_digest("alignment.align", "alignment.align_report"),
     message:
         "Aligning scene {wildcards.scene} to its ground control points"

@@ -16,9 +16,8 @@ rule audit:
         mem_mb=4000,
         runtime=240,
     params:
-        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
-        limits={k: v for k, v in config["audit"].items() if k != "worst"},
-        worst=config["audit"]["worst"],
+        dataset=lambda w: dataset_entry(w.dataset),
+        settings=asdict(SETTINGS.audit),
         measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),
         code=source_digest("evaluation.audit.audit"),
         template=file_sha256(PACKAGE / "evaluation" / "audit" / "page.html.jinja"),

@@ -1,7 +1,7 @@
 rule match:
     input:
         dataset=lambda w: dataset_folder(w.dataset),
-        files=method_files,
+        files=lambda w: method_files(w.method, w.dataset),
     output:
         directory("results/match/{dataset}/{method}"),
     log:
@@ -18,9 +18,9 @@ rule match:
         mem_mb=6000,
         runtime=480,
     params:
-        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
-        method=lambda w: scene_method(w.method),
-        split=config["benchmark"]["split"],
+        dataset=lambda w: dataset_entry(w.dataset),
+        method=lambda w: method_entry(w.method, w.dataset),
+        split=SETTINGS.benchmark.split,
         code=lambda w: source_digest("matching.benchmark.predictions", *method_modules(w.method)),
     message:
         "Matching dataset {wildcards.dataset} by {wildcards.method}"
@@ -49,14 +49,14 @@ rule score:
         mem_mb=2000,
         runtime=120,
     params:
-        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
-        split=config["benchmark"]["split"],
+        dataset=lambda w: dataset_entry(w.dataset),
+        split=SETTINGS.benchmark.split,
         label=lambda w: method_label(w.method),
         fine_tuned_of=lambda w: method_settings(w.method).get("fine_tuned_of"),
-        thresholds_px=config["benchmark"]["thresholds_px"],
-        bootstrap=config["benchmark"]["bootstrap"],
-        panels=config["benchmark"]["panels"],
-        seed=config["seed"],
+        thresholds_px=list(SETTINGS.benchmark.thresholds_px),
+        bootstrap=SETTINGS.benchmark.bootstrap,
+        panels=SETTINGS.benchmark.panels,
+        seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.score_method"),
     message:
         "Scoring {wildcards.method} on dataset {wildcards.dataset}"
@@ -100,9 +100,9 @@ rule benchmark_tables:
         mem_mb=2000,
         runtime=30,
     params:
-        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
-        split=config["benchmark"]["split"],
-        seed=config["seed"],
+        dataset=lambda w: dataset_entry(w.dataset),
+        split=SETTINGS.benchmark.split,
+        seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.compare_methods"),
         template=file_sha256(PACKAGE / "matching" / "benchmark" / "page.html.jinja"),
     message:
@@ -115,7 +115,7 @@ rule benchmark:
     input:
         lambda w: expand(
             "results/benchmark/{dataset}/index.html",
-            dataset=[name for name, of in config["benchmark"]["datasets"].items() if of],
+            dataset=[name for name, of in SETTINGS.benchmark.datasets.items() if of],
         ),
     message:
         "All stereo methods on all datasets"

@@ -9,7 +9,7 @@ rule export:
         disparity_of_right=lambda w: [
             f"results/project/{w.city}/{s.scene}_right.zarr"
             for s in scenes_of(w.city)
-            if config["project"]["right_view"]
+            if SETTINGS.project.right_view
         ],
     output:
         tiles=directory("tiles/{city}"),
@@ -41,12 +41,14 @@ rule export:
         runtime=60,
     params:
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
-        city=lambda w: CITIES[w.city].__dict__,
-        tiles=config["tiles"],
-        quality=config["quality"],
-        evaluation=config["evaluation"],
-        seed=config["seed"],
-        strict=config["strict"],
+        city=lambda w: asdict(CITIES[w.city]),
+        settings={
+            **asdict(SETTINGS.tiles),
+            **asdict(SETTINGS.evaluation),
+            "quality": asdict(SETTINGS.quality),
+            "seed": SETTINGS.seed,
+            "strict": SETTINGS.strict,
+        },
         code=source_digest("dataset.export"),
     message:
         "Cutting the tiles of {wildcards.city}"

@@ -16,7 +16,7 @@ rule ingest:
         runtime=60,
     params:
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
-        drop_classes=config["ingest"]["drop_classes"],
+        drop_classes=list(SETTINGS.ingest.drop_classes),
         code=source_digest("lidar.ingest"),
     message:
         "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"

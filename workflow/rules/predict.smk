@@ -2,7 +2,7 @@ rule predict_scene:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
-        files=scene_method_files,
+        files=lambda w: method_files(w.method, SETTINGS.predict.dataset),
     output:
         disparity=directory("results/predict/{city}/{scene}/{method}.zarr"),
     log:
@@ -18,7 +18,7 @@ rule predict_scene:
         mem_mb=6000,
         runtime=720,
     params:
-        method=lambda w: scene_method(w.method),
+        method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
     message:
@@ -45,7 +45,7 @@ rule dsm:
         mem_mb=2000,
         runtime=240,
     params:
-        settings=config["predict"]["dsm"],
+        settings=asdict(SETTINGS.predict.dsm),
         code=source_digest("matching.scenes.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"
@@ -58,7 +58,7 @@ rule predict:
         [
             f"results/predict/{s.city}/{s.scene}/{method}_dsm.tif"
             for s in SCENES.values()
-            for method in config["predict"]["methods"]
+            for method in SETTINGS.predict.methods
         ],
     message:
         "Disparities and surface models of all scenes"

@@ -1,11 +1,6 @@
-PROJECTION = {
-    "method": config["occlusion"]["method"],
-    "window": config["occlusion"]["window"],
-    "correlation_threshold": config["occlusion"]["correlation_threshold"],
-    "representative": config["project"]["representative"],
-    "edge_margin_px": config["project"]["edge_margin_px"],
-    "min_points": config["project"]["min_points_per_px"],
-}
+from stereotruth.disparity.settings import Settings as Projection
+
+PROJECTION = asdict(Projection.of(config))
 
 
 rule project:

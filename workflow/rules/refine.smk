@@ -29,7 +29,7 @@ rule refine:
         mem_mb=2000,
         runtime=30,
     params:
-        strict=config["strict"],
+        strict=SETTINGS.strict,
         code=source_digest("alignment.refine", "alignment.refine_report"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"

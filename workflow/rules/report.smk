@@ -32,7 +32,7 @@ rule report_city:
         mem_mb=2000,
         runtime=60,
     params:
-        sliders=config["report"]["sliders"],
+        sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),
         template=file_sha256(PACKAGE / "report" / "page.html.jinja"),
     message:

@@ -12,7 +12,7 @@ rule simulate_image:
         mem_mb=3000,
         runtime=30,
     params:
-        seed=config["seed"],
+        seed=SETTINGS.seed,
         code=source_digest("simulate.render"),
     message:
         "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
@@ -36,8 +36,8 @@ rule simulate_lidar:
         mem_mb=3000,
         runtime=30,
     params:
-        spacing_m=config["simulate"]["lidar_spacing_m"],
-        seed=config["seed"],
+        spacing_m=SETTINGS.simulate.lidar_spacing_m,
+        seed=SETTINGS.seed,
         code=source_digest("simulate.lidar"),
     message:
         "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
@@ -61,7 +61,7 @@ rule simulate_truth:
         mem_mb=3000,
         runtime=30,
     params:
-        seed=config["seed"],
+        seed=SETTINGS.seed,
         code=source_digest("simulate.truth", "simulate.control_points"),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"

@@ -26,10 +26,12 @@ rule train:
         mem_mb=12000,
         runtime=2880,
     params:
-        dataset=lambda w: {k: v for k, v in dataset_settings(w.dataset).items() if k != "methods"},
+        dataset=lambda w: dataset_entry(w.dataset),
         kind=lambda w: method_settings(w.method)["kind"],
         training=lambda w: training_of(w.method),
-        code=source_digest("matching.networks.training", "matching.kinds"),
+        code=lambda w: source_digest(
+            "matching.networks.training", "matching.kinds", *method_modules(w.method)
+        ),
     message:
         "Training {wildcards.method} on dataset {wildcards.dataset}"
     script:

@@ -2,7 +2,7 @@
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
-from stereotruth.evaluation.audit.verdicts import Limits
+from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
 
 if __name__ == "__main__":
@@ -11,9 +11,8 @@ if __name__ == "__main__":
         audit(
             StereoDataset.of(name, params.dataset),
             snakemake.output[0],
-            Limits(**params.limits),
+            Settings(**params.settings),
             work=f"results/audit/{name}",
-            worst=params.worst,
             workers=snakemake.threads,
             code=params.measuring,
         )

@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 
 from stereotruth.dataset.export import export_city
-from stereotruth.dataset.quality_limits import Limits
 from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.dataset.settings import Settings
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.job import job
 
 if __name__ == "__main__":
-    given, city, tiles = snakemake.input, snakemake.params.city, snakemake.params.tiles
+    given, city = snakemake.input, snakemake.params.city
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
     with job(snakemake.log[0], f"export {city['city']}") as log:
         summary = export_city(
@@ -27,11 +27,7 @@ if __name__ == "__main__":
             ),
             out_dir=snakemake.output.tiles,
             **city,
-            **tiles,
-            seed=snakemake.params.seed,
-            strict=snakemake.params.strict,
-            quality=Limits(**snakemake.params.quality),
-            **snakemake.params.evaluation,
+            settings=Settings(**snakemake.params.settings),
             code=snakemake.params.code,
             workers=snakemake.threads,
             coverage=snakemake.output.coverage,

@@ -1,17 +1,12 @@
 """A stereo method over a whole scene."""
 
 from stereotruth.job import dask_scheduler, job
-from stereotruth.matching.kinds import NETWORKS
 from stereotruth.matching.scenes.predict_scene import predict_scene
+from stereotruth.matching.scenes.settings import Settings
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    settings, address = (
-        dict(snakemake.params.method),
-        snakemake.config["dask"]["scheduler_address"],
-    )
-    if settings["kind"] in NETWORKS:
-        (settings["weights"],) = snakemake.input.files
+    address = snakemake.config["dask"]["scheduler_address"]
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
         dask_scheduler(address) as scheduler,
@@ -21,8 +16,8 @@ if __name__ == "__main__":
             snakemake.input.right,
             snakemake.output.disparity,
             method=method,
-            settings=settings,
-            **snakemake.params.settings,
+            entry=snakemake.params.method,
+            settings=Settings(**snakemake.params.settings),
             workers=snakemake.threads,
             scheduler=scheduler,
             code=snakemake.params.code,

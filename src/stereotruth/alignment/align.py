@@ -46,6 +46,7 @@ from .robust_fit import (
     opencv_inliers,
     studentised,
 )
+from .settings import Settings
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
@@ -136,7 +137,7 @@ def align(
     right_image: str | Path,
     gcps_csv: str | Path,
     *,
-    model: str = "affine",
+    model: str = Settings.model,
     scene: str = "",
     blunder_floor: float = BLUNDER_FLOOR,
     estimator: str = "robust",
@@ -267,7 +268,7 @@ def from_rpcs(
     left_image: str | Path,
     right_image: str | Path,
     *,
-    model: str = "affine",
+    model: str = Settings.model,
     scene: str = "",
     provenance: Mapping[str, Any] | None = None,
 ) -> Alignment:

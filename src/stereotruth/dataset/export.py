@@ -36,9 +36,10 @@ from ..job import progress
 from ..products.files import growing_table, replacing, whole_folder, write_table
 from ..products.provenance import describe, file_sha256, source_digest
 from .orientation import save
-from .quality_limits import NO_LIMITS, Limits, flag, missed
+from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
 from .scene_stores import SceneFiles, open_stores
+from .settings import Limits, Settings
 from .sift_matches import MATCH_COLUMNS, match_rows
 from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
@@ -70,19 +71,10 @@ def export_city(
     scenes: Iterable[SceneFiles | tuple],
     out_dir: str | Path,
     *,
-    size: int = 1024,
-    stride: int | None = None,
-    min_labelled: float = 0.6,
-    right_offset: str = "tile",
-    disparity_dtype: str = "float16",
-    nodata: float = -999.0,
-    training: int = 0,
-    validation: int = 0,
-    testing: int = 0,
-    seed: int = 0,
-    strict: bool = False,
-    quality: Limits = NO_LIMITS,
-    building_share: float = 0.02,
+    settings: Settings,
+    training: int,
+    validation: int,
+    testing: int,
     code: str = "",
     workers: int = 1,
     coverage: str | Path | None = None,
@@ -93,10 +85,8 @@ def export_city(
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
-    alignment.json (for the record) and the store of the right view's labels. ``stride`` defaults to
-    ``size``, px. ``training``, ``validation``, ``testing`` are the counts of table 3, which are
-    scaled to the tiles there are. ``quality``: the limits beyond which tiles and scenes are
-    flagged. ``building_share``: share of building pixels from which on a tile is of that class.
+    alignment.json (for the record) and the store of the right view's labels. ``training``,
+    ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there are.
     ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
     matches. ``work``: folder in which finished tiles wait for a later call that would make the
     same, by default a hidden one beside ``out_dir``. Returns a summary, see
@@ -105,8 +95,8 @@ def export_city(
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
     """
-    out, stride = Path(out_dir), stride or size
-    half = disparity_dtype == "float16"
+    out, size, stride = Path(out_dir), settings.size, settings.stride or settings.size
+    disparity_dtype, nodata = settings.disparity_dtype, settings.nodata
     if float(np.dtype(disparity_dtype).type(nodata)) != float(nodata):
         raise InputError(
             f"nodata {nodata:g} cannot be stored in {disparity_dtype}",
@@ -117,25 +107,27 @@ def export_city(
     for item in scenes:
         source = open_stores(SceneFiles(*item))
         cells = scan_scene(source, step, workers)
-        windows, phase, outcome = choose_windows(cells, size, stride, min_labelled, right_offset)
+        windows, phase, outcome = choose_windows(
+            cells, size, stride, settings.min_labelled, settings.right_offset
+        )
         sources.append(source)
         chosen += [(source, window) for window in windows]
         phases[source.scene], outcomes[source.scene] = phase, outcome
         scans[source.scene] = (cells.picture, cells.mask, cells.scale)
     if not any(window.labelled for _, window in chosen):
-        _refuse_empty(city, outcomes, size, min_labelled)
+        _refuse_empty(city, outcomes, size, settings.min_labelled)
     chosen.sort(key=lambda pair: not pair[1].labelled)  # stable: unlabelled pairs get last numbers
     parameters = {
         "size": size,
         "stride": stride,
-        "min_labelled": min_labelled,
-        "right_offset": right_offset,
+        "min_labelled": settings.min_labelled,
+        "right_offset": settings.right_offset,
         "disparity_dtype": disparity_dtype,
         "nodata": nodata,
         "split_counts": {"train": training, "val": validation, "test": testing},
-        "seed": seed,
-        "quality": asdict(quality),
-        "building_share": building_share,
+        "seed": settings.seed,
+        "quality": asdict(settings.quality),
+        "building_share": settings.building_share,
     }
     inputs = {name: value for source in sources for name, value in source.inputs.items()}
     provenance = describe(inputs, parameters, code)
@@ -146,8 +138,8 @@ def export_city(
         size=size,
         dtype=disparity_dtype,
         nodata=nodata,
-        building_share=building_share,
-        limits=quality,
+        building_share=settings.building_share,
+        limits=settings.quality,
         code=code or source_digest("dataset.export"),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=provenance,
@@ -186,8 +178,9 @@ def export_city(
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
                     table.writerows(match_rows(head, checks.matches))
         rows = [row for row, _ in written]
-        splits = _split(written, parameters["split_counts"], seed, strict, city)
-        gates = _gates(city, rows, scene_checks, quality, strict)
+        splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
+        gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+        half = disparity_dtype == "float16"
         summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
         summary["quality"] = gates
         write_table(scratch / "manifest.csv", rows)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
+
+from .settings import Limits
 
 FIGURES = {  # the figure that a limit is for; of signed figures, the size counts
     "max_gcp_rms_px": "gcp_rms_px",
@@ -20,21 +21,6 @@ FIGURES = {  # the figure that a limit is for; of signed figures, the size count
     "min_warp_correlation": "warp_correlation",
 }
 OF_ERRORS = ("max_sift_error_px", "max_sift_mean_absolute_error_px")
-
-
-@dataclass(frozen=True)
-class Limits:
-    """The keys of ``quality`` in the configuration; None switches a gate off."""
-
-    max_gcp_rms_px: float | None = None
-    max_y_parallax_px: float | None = None
-    max_sift_error_px: float | None = None
-    max_sift_mean_absolute_error_px: float | None = None
-    min_sift_matches: int | None = None
-    min_warp_correlation: float | None = None
-
-
-NO_LIMITS = Limits()
 
 
 class Miss(NamedTuple):

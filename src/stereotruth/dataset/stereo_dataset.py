@@ -31,6 +31,7 @@ from ..errors import InputError
 from ..products.files import read_table
 from ..products.rasters import read_disparity
 from .split_names import NO_TRUTH, NONE, SPLITS
+from .stereo_dataset_settings import Settings
 
 LAYOUTS = ("stereotruth", "whu", "us3d")
 CITY_OF_PREFIX = {
@@ -80,27 +81,21 @@ class StereoDataset:
     root: Path
     layout: str
     disparity_range: tuple[int, int]
-    nodata: float = -999.0
-    grows_with_height: bool = True
+    nodata: float = float(Settings.nodata)
+    grows_with_height: bool = Settings.grows_with_height
 
     @classmethod
     def of(cls, name: str, settings: Mapping[str, Any]) -> StereoDataset:
         """From an entry of ``benchmark.datasets``."""
-        low, high = settings["disparity_range"]
+        given = Settings(**settings)
+        low, high = given.disparity_range
         if low >= high:
             raise InputError(
                 f"benchmark.datasets.{name}.disparity_range: [{low}, {high}] is empty",
                 remedy="give the smallest disparity first",
             )
-        nodata = float(settings.get("nodata", -999))
-        return cls(
-            name,
-            Path(settings["root"]),
-            settings["layout"],
-            (low, high),
-            nodata,
-            settings.get("grows_with_height", True),
-        )
+        root, nodata = Path(given.root), float(given.nodata)
+        return cls(name, root, given.layout, (low, high), nodata, given.grows_with_height)
 
     def pairs(self, split: str | None = None, *, labelled: bool = False) -> list[Pair]:
         """The pairs of a split (None: all), only those with labels if ``labelled``.

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..epipolar.warping import CorrelationSum
 from ..error_statistics import ErrorSum
-from .quality_limits import Limits, flag, missed
+from .quality_limits import flag, missed
+from .settings import Limits
 from .sift_matches import FIGURES, TileMatches
 
 

@@ -18,8 +18,8 @@ from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
 from ..products.rasters import write_tiff
 from .orientation import orientation, save
-from .quality_limits import Limits
 from .scene_stores import SceneStores
+from .settings import Limits
 from .sift_matches import match_tile
 from .split_names import NONE
 from .tile_checks import TileChecks, check_cells

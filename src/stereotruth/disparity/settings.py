@@ -1,35 +1,68 @@
-"""How points are judged and condensed."""
+"""Settings of the stage project: how points are judged and condensed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from ..errors import InputError
-from .image_agreement import VOTE_PX
-from .seen_surface import EDGE
+from pydantic import Field
+
+from ..settings import Flag, Number, Odd, Unit, Whole, settings
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How points are judged and condensed; see the module and config/README.md."""
+@settings
+class Occlusion:
+    """The configuration's section occlusion."""
 
-    method: str = "correlation"
-    window: int = 9
-    correlation_threshold: float = 0.5
-    representative: str = "top"
-    edge_margin_px: float = 0.0
-    min_points: int = 1
+    method: Literal["correlation", "geometric", "both", "none"] = "both"
+    """how hidden and changed points are found: by the paper's filter, which compares the images
+    around each point; by the rays to both cameras, which run into other points; by the rays, and
+    where the images contradict the LiDAR over most of a surface (25 px around a pixel) it counts as
+    changed; not at all"""
 
-    def __post_init__(self) -> None:
-        for name, allowed in (("method", METHODS), ("representative", REPRESENTATIVES)):
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"{name} is {getattr(self, name)!r}", remedy=f"take one of {', '.join(allowed)}"
-                )
-        if self.window < 3 or self.window % 2 == 0:
-            raise InputError(
-                f"correlation window of {self.window} px", remedy="take an odd number from 3 on"
-            )
+    window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
+    """side of the correlation window; with `both`, of the pixels in it only those of the same
+    surface count"""
+
+    correlation_threshold: Annotated[Number, Field(ge=-1, le=1)] = 0.5
+    """with `correlation` a point below is dropped; with `both` a pixel below votes for change"""
+
+
+@settings
+class Representative:
+    """Of the configuration's section project, what disparities follow from."""
+
+    representative: Literal["top", "paper"] = "top"
+    """the point that stands for a pixel: the mean of its points on the surface that its centre
+    meets, or mean X, mean Y and max Z of all its points, as in the paper"""
+
+    edge_margin_px: Annotated[Number, Field(ge=0, le=1), Unit("px")] = 0
+    """with `top`: a pixel whose centre lies nearer to the edge between its surface (roof, crown)
+    and another stays unlabelled, since noise of the alignment decides which one it meets; pixels on
+    an edge itself always do"""
+
+    min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
+    """a pixel with fewer stays unlabelled"""
+
+
+@settings
+class Project(Representative):
+    """The configuration's section project."""
+
+    right_view: Flag = False
+    """also the labels of the right images: `results/project/<City>/<scene>_right.zarr`, and
+    `disp_right`, `status_right` of the tiles"""
+
+
+@settings
+class Settings(Representative, Occlusion):
+    """How points are judged and condensed; see config/README.md."""
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Settings:
+        """From the configuration."""
+        project = {k: v for k, v in config.get("project", {}).items() if k != "right_view"}
+        return cls(**config.get("occlusion", {}), **project)
 
     @property
     def uses_seen_surface(self) -> bool:
@@ -49,11 +82,10 @@ class Settings:
     @property
     def margin(self) -> int:
         """Pixels around a window whose points have a say in it."""
+        # here, since these load compiled code and a workflow plans with the settings
+        from .image_agreement import VOTE_PX
+        from .seen_surface import EDGE
+
         # one for each ring of neighbours: planes, their pooled noise, support
         reach = EDGE + 3
         return reach + VOTE_PX + self.window // 2 if self.method == "both" else reach
-
-
-METHODS = ("correlation", "geometric", "both", "none")
-
-REPRESENTATIVES = ("top", "paper")

@@ -43,6 +43,7 @@ from ..products.grids import building
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
+from .settings import Settings
 from .to_wgs84 import ToWGS84, check_area, to_wgs84
 
 log = logging.getLogger("stereotruth")
@@ -121,7 +122,7 @@ def ingest(
     *,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
-    drop_classes: Sequence[int] = (7, 18),
+    drop_classes: Sequence[int] = Settings.drop_classes,
     scene: str = "",
     provenance: Mapping[str, Any] | None = None,
     chunk_points: int = 100_000,

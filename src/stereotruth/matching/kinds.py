@@ -1,16 +1,150 @@
-"""The kinds of stereo methods as plain values, so that a workflow can plan with them."""
+"""The kinds of stereo methods as plain values, so that a workflow can plan with them.
+
+A new kind is an entry of :data:`KINDS` and the module that the entry names. That module has a
+function ``make(name, kind, settings, workers)`` that returns a :class:`matcher.Matcher`:
+``settings`` are those of the method's entry in the configuration, ``workers`` the threads that it
+may use.
+"""
 
 from __future__ import annotations
 
+import os.path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.machinery import PathFinder
+from importlib.metadata import entry_points
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 
-NETWORKS = ("stereonet", "psmnet", "hmsmnet")
 FOLDER = "folder"
-KINDS = ("sgm", *NETWORKS, "function", FOLDER)
-MODULES = {"sgm": "matching.sgm", **dict.fromkeys(NETWORKS, "matching.networks.inference")}
-LABELS = {"sgm": "SGM", "stereonet": "StereoNet", "psmnet": "PSM-Net", "hmsmnet": "HMSM-Net"}
+ENTRY_POINTS = "stereotruth.methods"
+Files = Callable[[Mapping[str, Any]], list[Path]]
+
+
+def _none(settings: Mapping[str, Any]) -> list[Path]:
+    return []
+
+
+def _weights(settings: Mapping[str, Any]) -> list[Path]:
+    return [Path(settings["weights"])] if settings.get("weights") else []
+
+
+def _results(settings: Mapping[str, Any]) -> list[Path]:
+    return sorted(file for file in Path(settings.get("folder", "")).glob("*") if file.is_file())
+
+
+def _code(settings: Mapping[str, Any]) -> list[Path]:
+    """The user's file, or those of the module; of a module in a package, all of the package."""
+    place = place_of(settings.get("function", ""))[0]
+    if place.endswith(".py"):
+        return [Path(place)]
+    top = place.partition(".")[0]
+    try:
+        spec = find_spec(top) if top else None  # imports nothing, since it has no parent
+    except ValueError:
+        spec = None
+    spec = spec or PathFinder.find_spec(top, [str(Path.cwd())])
+    if spec is None:
+        raise InputError(
+            f"cannot import {place}: No module named {top!r}",
+            remedy="install it, or call the workflow from the folder that it lies in",
+        )
+    if folders := spec.submodule_search_locations:
+        found = [file for folder in folders for file in Path(folder).rglob("*.py")]
+    else:
+        found = [Path(spec.origin)] if spec.has_location else []
+    if not found:
+        raise InputError(
+            f"no file holds the code of {place}, so that its edits cannot be seen",
+            remedy="name a function of a module or package that has .py files",
+        )
+    here = Path.cwd()
+    return sorted(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
+
+
+def place_of(function: str) -> tuple[str, str]:
+    """Module (``package.module`` or ``path.py``) and name of a user's function.
+
+    ``function``: ``module:name``, or an entry point of the group :data:`ENTRY_POINTS`. Raises
+    InputError if there is no such entry point.
+    """
+    place, colon, name = function.rpartition(":")
+    if colon:
+        return place, name
+    (*found,) = entry_points(group=ENTRY_POINTS, name=function)
+    if not found:
+        raise InputError(
+            f"no entry point {function!r} of group {ENTRY_POINTS}",
+            remedy="install the package that has it, or write package.module:function",
+        )
+    return found[0].module, found[0].attr
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of stereo methods.
+
+    ``label``: how tables call its methods ("": by their names). ``module``: of this package, makes
+    its methods (None: they cannot run). ``files``: those that a method is made of, from the
+    settings of its entry. ``network``: ``module:class`` of this package; such methods are trained.
+    ``tiles_at_once``: whether several tiles of a scene are worked on at once, a thread each;
+    else the method itself has all threads.
+    """
+
+    label: str = ""
+    module: str | None = None
+    files: Files = _none
+    network: str | None = None
+    tiles_at_once: bool = False
+
+    @property
+    def is_network(self) -> bool:
+        """Whether its methods are trained."""
+        return self.network is not None
+
+    @property
+    def modules(self) -> list[str]:
+        """Modules of this package that hold its own code."""
+        network = (self.network or "").partition(":")[0]
+        return [module for module in (self.module, network) if module]
+
+
+def _network(label: str, of: str) -> Kind:
+    module = "matching.networks.inference"
+    return Kind(label, module, _weights, network=f"matching.networks.{of}")
+
+
+KINDS = {
+    "sgm": Kind("SGM", "matching.sgm", tiles_at_once=True),
+    "stereonet": _network("StereoNet", "stereonet:StereoNet"),
+    "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
+    "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
+    "function": Kind(module="matching.user_function", files=_code),
+    FOLDER: Kind(files=_results),
+}
+NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)
+
+
+def kind_of(name: str, settings: Mapping[str, Any]) -> Kind:
+    """The kind of a method's entry. Raises InputError for an unknown one."""
+    kind = settings.get("kind")
+    if kind not in KINDS:
+        raise InputError(
+            f"method {name!r} is of unknown kind {kind!r}",
+            remedy=f"take one of {', '.join(KINDS)}",
+        )
+    return KINDS[kind]
+
+
+def names_of(files: Sequence[Path]) -> dict[str, Path]:
+    """The files by their paths below the folder that they share."""
+    if not files:
+        return {}
+    shared = Path(os.path.commonpath([file.absolute().parent for file in files]))
+    return {file.absolute().relative_to(shared).as_posix(): file for file in files}
 
 
 def need_pytorch(name: str, kind: str) -> None:

@@ -20,7 +20,7 @@ and by the upper 8 of their 16 bits 44 %. On two pairs of US3D all settings trie
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .matcher import called
 
 MODES = {
     "sgbm": cv2.STEREO_SGBM_MODE_SGBM,  # five paths
@@ -212,3 +213,8 @@ def _threads(count: int) -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> SemiGlobalMatcher:
+    """The method of a configuration entry, with so many threads."""
+    return called(name, SemiGlobalMatcher, {**settings, "workers": workers})

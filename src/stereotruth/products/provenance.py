@@ -34,11 +34,17 @@ def _module_file(module: str) -> Path | None:
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
+    """The tree without its docstrings, those of attributes included."""
+
+    def is_text(statement: ast.stmt) -> bool:
+        match statement:
+            case ast.Expr(value=ast.Constant(value=str())):
+                return True
+        return False
+
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            match node.body:
-                case [ast.Expr(value=ast.Constant(value=str())), *rest]:
-                    node.body = rest or [ast.Pass()]
+            node.body = [part for part in node.body if not is_text(part)] or [ast.Pass()]
     return tree
 
 

@@ -23,6 +23,7 @@ from ..products import pictures
 from ..products.files import read_table, replacing
 from ..products.html_tables import gate, minus, missed, table, words
 from . import drawings, sections, tile_pictures
+from .settings import Settings
 
 PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
 BASE64 = 3 / 4  # bytes of a picture per byte in the page
@@ -75,7 +76,7 @@ def write_report(
     table4: str | Path | None = None,
     sift: str | Path | None = None,
     sift_figure: str | Path | None = None,
-    sliders: int = 30,
+    sliders: int = Settings.sliders,
     workers: int = 1,
     code: str = "",
 ) -> None:

@@ -17,6 +17,7 @@ from .cities import CITIES, CitySpec, SceneSpec, lidar_files
 from .control_points import simulate_points, write_gcps
 from .lidar import simulate_lidar_tile
 from .render import simulate_image
+from .settings import Settings
 from .truth import simulate_truth
 
 log = logging.getLogger("stereotruth")
@@ -53,7 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stereotruth.simulate", description=__doc__)
     parser.add_argument("what", choices=[*CITIES, "gcps"], help="a city, or gcps for all GCP files")
     parser.add_argument("folder", type=Path, help="where to write <scene>/… (or <scene>.csv)")
-    parser.add_argument("--spacing-m", type=float, default=0.4, help="LiDAR pulse spacing")
+    parser.add_argument(
+        "--spacing-m", type=float, default=Settings.lidar_spacing_m, help="LiDAR pulse spacing"
+    )
     parser.add_argument("--seed", type=int, default=SEED, help="draws all measurement noise")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -18,6 +18,7 @@ from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .kernels import inlined, kernel
 from .layout import frame_of, half_size, image_axes
+from .settings import Settings
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
 from .world import build_surfaces
 
@@ -242,7 +243,7 @@ def simulate_lidar_tile(
     tile_name: str,
     out_laz: str | Path,
     *,
-    spacing_m: float = 0.4,
+    spacing_m: float = Settings.lidar_spacing_m,
     seed: int,
 ) -> dict[str, int]:
     """Fly one LiDAR tile and write it as the city's LAS format says.

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.dataset.quality_limits import FIGURES, NO_LIMITS, Limits, flag, missed
+from stereotruth.dataset.quality_limits import FIGURES, flag, missed
+from stereotruth.dataset.settings import Limits
 
 GOOD = {
     "gcp_rms_px": 0.4,
@@ -13,6 +14,7 @@ GOOD = {
     "warp_correlation": 0.97,
 }
 LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.5)
+NO_LIMITS = Limits(*[None] * 6)
 
 
 def test_good_figures_miss_nothing():

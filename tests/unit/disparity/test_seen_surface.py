@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity.one_surface import SURFACE_PX
 from stereotruth.disparity.pixel_points import POINT, PX, PixelPoints
 from stereotruth.disparity.seen_surface import COVER_PX, MANY, MAX_COVER_PX, seen_surface
+from stereotruth.epipolar.one_surface import SURFACE_PX
 
 
 def window_of(x: np.ndarray, y: np.ndarray, disparity: np.ndarray, side: int) -> PixelPoints:

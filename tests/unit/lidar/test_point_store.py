@@ -7,8 +7,9 @@ import pytest
 import zarr
 
 from stereotruth.errors import InputError
+from stereotruth.lidar import lattice
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import PointStore, coverage, query_points, summary
+from stereotruth.lidar.point_store import PointStore, query_points
 
 from ...synthetic.las import everything, write_las
 
@@ -60,6 +61,14 @@ def test_empty_queries(store) -> None:
     assert len(query_points([], 0, 0, 1, 1)) == 0
 
 
+def boxes_of(*stores: PointStore) -> np.ndarray:
+    """(lon_min, lat_min, lon_max, lat_max) of the cells that hold points, each once."""
+    cells = [np.stack([store.cell_row, store.cell_col], axis=1) for store in stores]
+    size = (1 << lattice.CELL_BITS) / lattice.PER_DEG
+    corner = np.unique(np.concatenate(cells), axis=0)[:, ::-1] * size
+    return np.hstack([corner, corner + size])
+
+
 def test_two_stores_hold_what_one_does(tmp_path) -> None:
     """Split a file in two: the same points, and the same exact sums in either order."""
     xyz = write_las(tmp_path / "all.laz", 4000)
@@ -77,11 +86,15 @@ def test_two_stores_hold_what_one_does(tmp_path) -> None:
         for name in ("lon_q", "lat_q", "h_q"):
             assert np.array_equal(np.sort(getattr(got, name)), np.sort(getattr(expected, name)))
     parts = [PointStore(tmp_path / f"{name}.zarr") for name in "ab"]
-    assert summary(parts)["points"]["kept"] == 4000
-    assert summary(parts)["bounds"] == list(whole.bounds)
-    assert np.array_equal(coverage(parts), coverage([whole]))
-    assert summary(parts)["covered_km2"] == pytest.approx(0.49, abs=0.2)  # whole cells
-    boxes = coverage([whole])
+    assert sum(part.attrs["points"]["kept"] for part in parts) == 4000
+    bounds = np.array([part.bounds for part in parts])
+    outermost = (f(bounds[:, k]) for k, f in enumerate([np.min] * 2 + [np.max] * 2))
+    assert (*outermost, bounds[:, 4].min(), bounds[:, 5].max()) == whole.bounds
+    boxes = boxes_of(whole)
+    assert np.array_equal(boxes_of(*parts), boxes)
+    width = (boxes[:, 2] - boxes[:, 0]) * np.cos(np.radians(boxes[:, 1]))
+    covered_m2 = (width * (boxes[:, 3] - boxes[:, 1])).sum() * lattice.DEGREE_M**2
+    assert covered_m2 == pytest.approx(0.49e6, abs=0.2e6)  # whole cells
     inside = (expected.lon[:, None] >= boxes[:, 0]) & (expected.lon[:, None] < boxes[:, 2])
     inside &= (expected.lat[:, None] >= boxes[:, 1]) & (expected.lat[:, None] < boxes[:, 3])
     assert (inside.sum(axis=1) == 1).all()

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.matching import methods
-from stereotruth.matching.methods import FunctionMethod, Matcher, make_method
+from stereotruth.matching import kinds
+from stereotruth.matching.kinds import KINDS, names_of
+from stereotruth.matching.matcher import Matcher
+from stereotruth.matching.methods import make_method
 from stereotruth.matching.sgm import SemiGlobalMatcher
+from stereotruth.matching.user_function import FunctionMethod
 
 MODULE = """
 import numpy as np
@@ -73,10 +76,10 @@ def test_a_class_is_a_method_as_it_is(here):
 
 
 def test_entry_points_are_found(here, monkeypatch):
-    point = EntryPoint("theirs", "my_stereo:constant", methods.ENTRY_POINTS)
+    point = EntryPoint("theirs", "my_stereo:constant", kinds.ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(here))
     monkeypatch.setattr(
-        methods, "entry_points", lambda group, name: [point] if name == "theirs" else []
+        kinds, "entry_points", lambda group, name: [point] if name == "theirs" else []
     )
     assert np.all(function("theirs")(IMAGE, IMAGE, (0, 8)) == 3)
     with pytest.raises(InputError, match="no entry point 'others'"):
@@ -126,3 +129,39 @@ def test_what_a_function_raises_is_not_hidden():
 
     with pytest.raises(ZeroDivisionError):
         FunctionMethod(broken)(IMAGE, IMAGE, (0, 8))
+
+
+def files(function):
+    return [str(path) for path in KINDS["function"].files({"function": function})]
+
+
+def test_the_files_of_a_function_are_found_without_its_import(here, monkeypatch):
+    (here / "pack/sub").mkdir(parents=True)
+    for name in ("pack/__init__.py", "pack/stereo.py", "pack/sub/more.py", "pack/notes.txt"):
+        (here / name).write_text("raise SystemExit('imported')")
+    assert files("my_stereo:constant") == ["my_stereo.py"]
+    assert files("sub/mine.py:constant") == ["sub/mine.py"]
+    whole = ["pack/__init__.py", "pack/stereo.py", "pack/sub/more.py"]
+    assert files("pack.stereo:match") == files("pack:match") == whole
+    point = EntryPoint("theirs", "pack.stereo:match", kinds.ENTRY_POINTS)
+    monkeypatch.setattr(kinds, "entry_points", lambda group, name: [point])
+    assert files("theirs") == whole
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [
+        ("no_such_module:f", "cannot import no_such_module"),
+        ("sys:exit", "no file holds the code of sys"),
+        ("others", "no entry point 'others'"),
+    ],
+)
+def test_a_function_whose_edits_cannot_be_seen_is_refused(here, function, words):
+    with pytest.raises(InputError, match=words):
+        files(function)
+
+
+def test_files_are_named_below_the_folder_that_they_share(here):
+    paths = [here / "pack/__init__.py", here / "pack/sub/__init__.py"]
+    assert names_of(paths) == {"__init__.py": paths[0], "sub/__init__.py": paths[1]}
+    assert list(names_of([here / "pack/stereo.py"])) == ["stereo.py"]

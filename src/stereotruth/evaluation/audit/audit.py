@@ -33,9 +33,10 @@ from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
 from .page import write_page
 from .pair import measure
+from .settings import Limits, Settings
 from .sharing import Features, Shared, features, find_shared
 from .summary import Audited, in_words, summarise, table_rows
-from .verdicts import FAULT, NOTE, Finding, Limits, judge
+from .verdicts import FAULT, NOTE, Finding, judge
 
 log = logging.getLogger("stereotruth")
 
@@ -43,20 +44,18 @@ log = logging.getLogger("stereotruth")
 def audit(
     dataset: StereoDataset,
     out: str | Path,
-    limits: Limits,
+    settings: Settings,
     *,
     work: str | Path,
-    worst: int = 12,
     workers: int = 1,
     code: str = "",
 ) -> dict[str, Any]:
     """Audit all pairs of a dataset into the folder ``out``; returns the summary.
 
     ``work``: where what was measured of each pair stays, for runs after a kill, with other limits
-    or with more pairs. ``worst``: pairs that are shown in pictures. Raises InputError if the
-    dataset has no pairs or a file cannot be read.
+    or with more pairs. Raises InputError if the dataset has no pairs or a file cannot be read.
     """
-    out, work = Path(out), Path(work)
+    out, work, limits = Path(out), Path(work), settings.limits
     pairs = dataset.pairs()
     measured = _measure_all(dataset, pairs, work, workers, code)
     log.info("looking for shared ground")
@@ -69,7 +68,7 @@ def audit(
         write_table(scratch / "pairs.csv", table_rows(audited))
         (scratch / "summary.json").write_text(text, encoding="utf-8")
         (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
-        write_page(scratch / "index.html", dataset, audited, summary, limits, worst)
+        write_page(scratch / "index.html", dataset, audited, summary, limits, settings.worst)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary

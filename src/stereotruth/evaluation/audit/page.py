@@ -18,8 +18,9 @@ from ...products.pictures import encode, gradient
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX
+from .settings import Limits
 from .summary import Audited, table_rows
-from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Limits
+from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED
 
 Picture = pictures.Picture
 

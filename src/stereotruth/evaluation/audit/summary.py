@@ -12,8 +12,9 @@ import numpy as np
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from .conventions import AS_STATED
 from .pair import estimate
+from .settings import Limits
 from .sharing import Shared
-from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Limits, Verdict
+from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Verdict
 
 NONE = "none"
 CONFIDENCE = 0.05  # of all limits that are stated

@@ -16,6 +16,7 @@ from typing import Any
 from . import conventions
 from .pair import estimate
 from .registration import SHIFTS
+from .settings import Limits
 
 FAULT, UNDECIDED, NOTE = "fault", "undecided", "note"
 GOOD = "good"
@@ -35,17 +36,6 @@ CHECKS = {  # what a pair must have, in the order of the page
     "hidden": "labels on visible pixels only",
     "shared": "ground in one split only",
 }
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Tolerances (px, shares) and the rate of false alarms per check and dataset."""
-
-    parallax_px: float
-    label_bias_px: float
-    contradicted_share: float
-    hidden_share: float
-    false_alarms: float
 
 
 @dataclass(frozen=True)

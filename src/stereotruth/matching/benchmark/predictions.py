@@ -35,7 +35,8 @@ from ...products.finished_pieces import Ledger
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
 from ..kinds import FOLDER
-from ..methods import Matcher, make_method
+from ..matcher import Matcher
+from ..methods import make_method
 from .prediction_files import RECORD
 
 SUFFIXES = (".tif", ".tiff", ".npy", ".pfm")  # of a folder of results

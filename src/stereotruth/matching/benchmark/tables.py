@@ -16,7 +16,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...products.files import replacing, write_table
-from ..kinds import LABELS
+from ..kinds import KINDS
 from . import published_scores
 
 Row = dict[str, Any]
@@ -146,7 +146,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             ["Method", "EPE (px)", "D1 (%)", "Time (ms)"],
             [
                 [
-                    LABELS[kind],
+                    KINDS[kind].label,
                     *_paper(published_scores.TABLE5[kind][:2]),
                     f"{published_scores.TABLE5[kind][2]}",
                 ]

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from ...errors import InputError
 from .image_scaling import Scaling, image_statistics, scaled
 from .layers import channels_last
-from .weights import SavedNetwork, covering, is_keras, load_weights
+from .load_network import load_network
+from .weights import SavedNetwork, covering
 
 log = logging.getLogger("stereotruth")
 
@@ -113,7 +114,7 @@ class NetworkMethod:
         return np.where(seen, disparity, np.float32(np.nan))
 
 
-def network_method(kind: str, settings: Mapping[str, Any], workers: int = 0) -> NetworkMethod:
+def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> NetworkMethod:
     """The method of a configuration entry: ``weights`` (a .pt, or Keras' .h5), ``device``,
     ``precision``, and for .h5 ``scaling``; ``workers`` threads on a CPU (0: all cores).
 
@@ -124,16 +125,11 @@ def network_method(kind: str, settings: Mapping[str, Any], workers: int = 0) -> 
         raise InputError(
             f"{kind}: no weights", remedy="train it, or name a file in benchmark.methods"
         )
-    if is_keras(path):
-        from .keras_weights import read_keras
-
-        model, network = read_keras(path, kind, settings.get("scaling"))
-    else:
-        model, network, _ = load_weights(path)
-        if model.kind != kind:
-            raise InputError(
-                f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
-            )
+    model, network = load_network(path, kind, settings.get("scaling"))
+    if model.kind != kind:
+        raise InputError(
+            f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
+        )
     device = choose_device(settings.get("device"))
     if device.type == "cpu" and workers:
         torch.set_num_threads(workers)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ...errors import InputError
+from ..kinds import NETWORKS
 from .image_scaling import SCALINGS
-from .weights import KINDS, SavedNetwork, save_weights
+from .weights import SavedNetwork, save_weights
 
 Arrays = list[NDArray[np.float32]]
 
@@ -147,7 +148,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Keras weights (.h5) to a weight file (.pt)")
     parser.add_argument("weights", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=sorted(KINDS), default="stereonet")
+    parser.add_argument("--kind", choices=sorted(NETWORKS), default="stereonet")
     parser.add_argument("--disparity-range", type=int, nargs=2, default=(-128, 64), metavar="PX")
     parser.add_argument("--scaling", choices=SCALINGS, default=None)
     given = parser.parse_args(arguments)

@@ -27,41 +27,29 @@ from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...errors import InputError
 from ...products.rasters import read_image
 from .image_scaling import scaled
+from .training_settings import Augmentation
 from .weights import SavedNetwork
 
 TRIES = 10  # random windows looked at for one with enough labels
 LABELLED_SHARE = 0.1  # that is enough
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """Random changes of training pairs; as it stands, none (the paper uses none).
-
-    ``flip_rows``: upside down, every other time. ``contrast``, ``brightness``: standard deviations
-    of a factor on, and of an offset to, each image by itself, in its own standard deviations;
-    ``noise``: of each pixel.
-    """
-
-    flip_rows: bool = False
-    contrast: float = 0.0
-    brightness: float = 0.0
-    noise: float = 0.0
-
-    def apply(
-        self, images: NDArray[np.float32], disparity: NDArray[np.float32], rng: np.random.Generator
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Changed copies of the images [2, C, h, w] and the disparity [h, w]."""
-        if self.flip_rows and rng.random() < 0.5:
-            images, disparity = images[..., ::-1, :], disparity[::-1]
-        if self.contrast or self.brightness:
-            factor = np.exp(rng.normal(0, self.contrast, (2, 1, 1, 1))).astype(np.float32)
-            offset = rng.normal(0, self.brightness, (2, 1, 1, 1)).astype(np.float32)
-            images = images * factor + offset
-        if self.noise:
-            images = images + np.float32(self.noise) * rng.standard_normal(
-                images.shape, dtype=np.float32
-            )
-        return images, disparity
+def augmented(
+    images: NDArray[np.float32],
+    disparity: NDArray[np.float32],
+    by: Augmentation,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Changed copies of the images [2, C, h, w] and the disparity [h, w]."""
+    if by.flip_rows and rng.random() < 0.5:
+        images, disparity = images[..., ::-1, :], disparity[::-1]
+    if by.contrast or by.brightness:
+        factor = np.exp(rng.normal(0, by.contrast, (2, 1, 1, 1))).astype(np.float32)
+        offset = rng.normal(0, by.brightness, (2, 1, 1, 1)).astype(np.float32)
+        images = images * factor + offset
+    if by.noise:
+        images = images + np.float32(by.noise) * rng.standard_normal(images.shape, dtype=np.float32)
+    return images, disparity
 
 
 @dataclass
@@ -117,7 +105,7 @@ class LabelledPairs(Dataset):
             seen = match_inside(disparity)[window]
             images, disparity = images[..., *window], disparity[window].copy()
             disparity[seen & ~match_inside(disparity)] = np.nan
-        images, disparity = self.augmentation.apply(images, disparity, rng)
+        images, disparity = augmented(images, disparity, self.augmentation, rng)
         images = np.ascontiguousarray(images)
         return (
             torch.from_numpy(images[0]),

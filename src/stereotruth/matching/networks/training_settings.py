@@ -3,43 +3,100 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import asdict, field, fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from torch import nn
+from pydantic import Field
 
 from ...errors import InputError
-from .training_pairs import Augmentation
+from ...settings import Flag, Number, Text, Unit, Whole, settings
+
+if TYPE_CHECKING:
+    from torch import nn
+
+Count = Annotated[Whole, Field(ge=1)]
+NotNegative = Annotated[Number, Field(ge=0)]
 
 
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a network is trained; the defaults are the paper's.
+@settings
+class Augmentation:
+    """Random changes of training pairs; as it stands, none (the paper uses none)."""
 
-    ``crop_px``: rows and columns of the windows trained on, null: whole pairs; ``crops_per_pair``
-    in each epoch. ``initial_weights``: a .pt or Keras' .h5 to start from; ``frozen``: parts of the
-    network that keep them (such as ``features``), with their batch statistics. ``hours``: of
-    training at most, all runs together; it ends after the epoch in which they are over.
-    ``processes``: null: one for each GPU. ``loader_workers``: processes that read pairs.
-    """
+    flip_rows: Flag = False
+    """upside down, every other time"""
 
-    epochs: int = 120
-    batch_size: int = 1
-    learning_rate: float = 1e-3
-    halve_every_epochs: int = 10
-    crop_px: tuple[int, int] | None = None
-    crops_per_pair: int = 1
+    contrast: Annotated[NotNegative, Unit("standard deviation")] = 0
+    """of the logarithm of a random factor on the contrast of each image by itself"""
+
+    brightness: Annotated[NotNegative, Unit("standard deviations of the image")] = 0
+    """of a random offset to each image by itself"""
+
+    noise: Annotated[NotNegative, Unit("standard deviations of the image")] = 0
+    """of each pixel"""
+
+
+@settings
+class Training:
+    """The configuration's section training; the defaults are the paper's."""
+
+    epochs: Count = 120
+    """passes over all pairs"""
+
+    batch_size: Annotated[Count, Unit("pairs")] = 1
+    """of each process"""
+
+    learning_rate: Annotated[Number, Field(gt=0)] = 0.001
+    """of Adam"""
+
+    halve_every_epochs: Annotated[Count, Unit("epochs")] = 10
+    """after so many the learning rate is halved"""
+
+    crop_px: Annotated[
+        tuple[Annotated[Whole, Field(ge=8)], Annotated[Whole, Field(ge=8)]] | None, Unit("px, px")
+    ] = None
+    """rows and columns of random windows that are trained on, multiples of 8 (StereoNet), 64
+    (HMSM-Net), 256 (PSM-Net); null: whole tiles"""
+
+    crops_per_pair: Annotated[Count, Unit("windows")] = 1
+    """of each pair in an epoch"""
+
     augmentation: Augmentation = field(default_factory=Augmentation)
-    initial_weights: str | None = None
-    frozen: tuple[str, ...] = ()
-    device: str | None = None
-    precision: str | None = None
-    threads: int = 0
-    processes: int | None = None
-    loader_workers: int = 0
-    checkpoint_minutes: float = 5.0
-    hours: float | None = None
-    seed: int = 0
+    """random changes of the training pairs; none as it stands:"""
+
+    initial_weights: Annotated[Text | None, Unit("file")] = None
+    """weights to start from (fine-tuning): a `.pt` that rule `train` made, also of another dataset
+    (`results/train/us3d/stereonet/best.pt` is made if need be), or Keras' `.h5`"""
+
+    frozen: Annotated[tuple[Text, ...], Unit("names")] = ()
+    """parts of the network that keep the initial weights, such as `features`, with their batch
+    statistics"""
+
+    hours: Annotated[Annotated[Number, Field(gt=0)] | None, Unit("h")] = None
+    """of training at most, all runs together; it ends after the epoch in which they are over"""
+
+    device: Annotated[Text | None, Unit("cpu, cuda or another of PyTorch")] = None
+    """null: the GPUs that there are"""
+
+    precision: Literal["float32", "bfloat16", "float16"] | None = None
+    """null: mixed with bfloat16 on a GPU, float32 on a CPU; processors with matrix units (AMX) are
+    three times as fast with `bfloat16`"""
+
+    processes: Count | None = None
+    """that share each step; null: one for each GPU"""
+
+    loader_workers: Annotated[Whole, Field(ge=0), Unit("processes")] = 0
+    """that read tiles beside the training"""
+
+    checkpoint_minutes: Annotated[NotNegative, Unit("min")] = 5
+    """a killed training goes on from its last checkpoint, at the latest from the last epoch"""
+
+
+@settings
+class TrainingSettings(Training):
+    """How a network is trained, with what does not stand in the section training."""
+
+    threads: Whole = 0
+    seed: Whole = 0
 
     @classmethod
     def of(cls, *settings: Mapping[str, Any]) -> TrainingSettings:
@@ -56,11 +113,6 @@ class TrainingSettings:
                 f"training: unknown keys {', '.join(sorted(unknown))}",
                 remedy=f"take of {', '.join(sorted(known))}",
             )
-        crop = merged.get("crop_px")
-        merged["crop_px"] = tuple(crop) if crop else None
-        merged["frozen"] = tuple(merged.get("frozen") or ())
-        if not isinstance(merged.get("augmentation"), Augmentation):
-            merged["augmentation"] = Augmentation(**(merged.get("augmentation") or {}))
         return cls(**merged)
 
     def on(self, threads: int) -> TrainingSettings:

@@ -18,10 +18,10 @@ from ...errors import InputError
 from ...products.files import replacing
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
-from .keras_weights import load_keras, read_keras
+from .load_network import load_network
 from .training_pairs import LabelledPairs
 from .training_settings import TrainingSettings
-from .weights import SavedNetwork, covering, is_keras, load_weights
+from .weights import SavedNetwork, covering
 
 log = logging.getLogger("stereotruth")
 
@@ -93,10 +93,7 @@ def model_of(kind: str, dataset: StereoDataset, training: TrainingSettings) -> S
         image = read_image(dataset.pairs("train")[0].left)
         colour = image.ndim == 3
         return SavedNetwork(kind, span, 3 if colour else 1, "us3d" if colour else "standardise")
-    if is_keras(training.initial_weights):
-        there, _ = read_keras(training.initial_weights, kind)
-    else:
-        there, _, _ = load_weights(training.initial_weights)
+    there, _ = load_network(training.initial_weights, kind)
     return replace(there, kind=kind, disparity_range=span)
 
 
@@ -107,10 +104,7 @@ def start(model: SavedNetwork, training: TrainingSettings) -> nn.Module:
     path = training.initial_weights
     if path is None:
         return network
-    if is_keras(path):
-        load_keras(network, path)
-        return network
-    there, other, _ = load_weights(path)
+    there, other = load_network(path, model.kind)
     if (there.kind, there.channels) != (model.kind, model.channels):
         raise InputError(
             f"weights of {there.kind} with {there.channels} channels, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,20 +14,22 @@ from torch import nn
 
 from ...errors import InputError
 from ...products.files import replacing
-from .hmsmnet import HMSMNet
-from .psmnet import PSMNet
-from .stereonet import StereoNet
+from ..kinds import KINDS
 
-KINDS: dict[str, type[nn.Module]] = {"stereonet": StereoNet, "psmnet": PSMNet, "hmsmnet": HMSMNet}
+
+def network_class(kind: str) -> type[nn.Module]:
+    """The network of a kind; by its name, so that digests of one do not hold the others' code."""
+    module, _, name = KINDS[kind].network.partition(":")
+    return getattr(importlib.import_module(f"stereotruth.{module}"), name)
 
 
 @dataclass(frozen=True)
 class SavedNetwork:
     """What a network is made of besides its weights.
 
-    ``kind`` of :data:`KINDS`; ``disparity_range`` in px, max exclusive; ``channels`` of its images
-    (1 or 3); ``scaling``: ``standardise`` (each image by its mean and standard deviation, as for
-    WHU-Stereo) or ``us3d`` (8-bit values to -1 ... 1, blue first, as for US3D).
+    ``kind`` of :data:`kinds.NETWORKS`; ``disparity_range`` in px, max exclusive; ``channels`` of
+    its images (1 or 3); ``scaling``: ``standardise`` (each image by its mean and standard
+    deviation, as for WHU-Stereo) or ``us3d`` (8-bit values to -1 ... 1, blue first, as for US3D).
     """
 
     kind: str
@@ -40,7 +43,7 @@ class SavedNetwork:
         Raises InputError if its planes cannot cover the range.
         """
         try:
-            return KINDS[self.kind](self.disparity_range, self.channels)
+            return network_class(self.kind)(self.disparity_range, self.channels)
         except ValueError as error:
             raise InputError(
                 f"{self.kind}: {error}", remedy=f"take {covering(self.kind, self.disparity_range)}"
@@ -88,12 +91,7 @@ def load_weights(path: str | Path) -> tuple[SavedNetwork, nn.Module, dict[str, A
 
 def covering(kind: str, wanted: tuple[int, int]) -> tuple[int, int]:
     """The least disparity range of a network's planes that holds the ``wanted`` one, px."""
-    of = KINDS[kind]
+    of = network_class(kind)
     first = wanted[0] // of.plane_px * of.plane_px
     step = of.plane_px * of.planes_divisor
     return first, first + -(-(wanted[1] - first) // step) * step
-
-
-def is_keras(path: str | Path) -> bool:
-    """Whether a weight file is one of Keras, by its name."""
-    return Path(path).suffix in (".h5", ".hdf5")

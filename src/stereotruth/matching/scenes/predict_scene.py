@@ -27,9 +27,12 @@ from ...job import BlockProgress
 from ...products.grids import Layer, require_complete
 from ...products.provenance import describe, digest, file_sha256
 from ...products.resumable_grids import BlockStore, making
-from ..methods import Matcher, make_method
+from ..kinds import kind_of, names_of
+from ..matcher import Matcher
+from ..methods import make_method
 from .offsets import Offsets, find_offsets
 from .scene_tiles import blend, predict_tile
+from .settings import CHUNK, Settings
 from .tiling import Tiling, inside, view_of
 
 log = logging.getLogger("stereotruth")
@@ -38,7 +41,6 @@ Place = tuple[int, int]
 Window = tuple[slice, slice]
 
 
-CHUNK = 256  # px of the result
 LAYERS = {
     "disparity": Layer(
         "float32",
@@ -52,16 +54,9 @@ LAYERS = {
 }
 
 
-def method_files(settings: Mapping[str, Any]) -> list[Path]:
-    """The files that a method of a configuration entry is made of: weights, the user's module."""
-    named = [settings.get("weights"), str(settings.get("function", "")).rpartition(":")[0]]
-    return [Path(name) for name in named if name and Path(name).is_file()]
-
-
-def identity(settings: Mapping[str, Any]) -> str:
+def identity(entry: Mapping[str, Any], files: Sequence[Path]) -> str:
     """Digest of a method's configuration entry and of its files' content."""
-    files = [file_sha256(path) for path in method_files(settings)]
-    return digest({"settings": dict(settings), "files": files})
+    return digest({"settings": dict(entry), "files": [file_sha256(path) for path in files]})
 
 
 def _image_content(attrs: Mapping[str, Any]) -> str:
@@ -75,7 +70,7 @@ class _ImagePair:
     left_store: Path
     right_store: Path
     method: str
-    settings: Mapping[str, Any]
+    entry: Mapping[str, Any]
     threads: int  # of the method
     disparity_range: DisparityRange
     tiling: Tiling
@@ -99,7 +94,7 @@ class _ImagePair:
 
     @cached_property
     def matcher(self) -> Matcher:
-        return make_method(self.method, self.settings, self.threads)
+        return make_method(self.method, self.entry, self.threads)
 
     def tile(self, out: BlockStore, key: str, place: Place, offset: int) -> None:
         """Predict one tile and write it to its place in the grid of tiles."""
@@ -176,12 +171,8 @@ def predict_scene(
     out: str | Path,
     *,
     method: str,
-    settings: Mapping[str, Any],
-    disparity_range: DisparityRange,
-    block_px: int = 1024,
-    overlap_px: int = 64,
-    offset: int | str = "auto",
-    margin_px: int | None = None,
+    entry: Mapping[str, Any],
+    settings: Settings,
     workers: int = 1,
     scheduler: Any = "threads",
     code: str = "",
@@ -190,9 +181,8 @@ def predict_scene(
     """Write the disparity of a scene by a method as a Zarr grid; returns its summary.
 
     ``left_store``, ``right_store``: rectified images as `rectify` makes them. ``method``: a name
-    for messages; ``settings``: its configuration entry (:func:`..methods.make_method`).
-    ``disparity_range``: px, of one tile; ``offset``: of the right image, px, or "auto"
-    (:mod:`.offsets`). ``block_px``: a multiple of 256. ``margin_px``: None is the method's own.
+    for messages; ``entry``: its configuration entry (:func:`..methods.make_method`).
+    ``settings``: how the method goes over the scene, with a disparity range.
     ``workers`` tiles are worked on at once by SGM, while networks and functions get that many
     threads. ``scheduler`` is what Dask's compute takes. ``code``: digest of the source, for the
     provenance.
@@ -204,13 +194,11 @@ def predict_scene(
     Raises InputError for images that nowhere match, and settings that the method does not take.
     """
     left_store, right_store, out = (Path(p).absolute() for p in (left_store, right_store, out))
-    if block_px % CHUNK or not 0 <= 2 * overlap_px <= block_px:
-        raise InputError(
-            f"blocks of {block_px} px with an overlap of {overlap_px} px",
-            remedy=f"take a multiple of {CHUNK}, and an overlap of half of it at most",
-        )
-    by_tiles = settings.get("kind") == "sgm"
-    low, high = (int(d) for d in disparity_range)
+    kind = kind_of(method, entry)
+    files = [file for file in kind.files(entry) if file.is_file()]
+    low, high = settings.disparity_range
+    block_px, overlap_px = settings.block_px, settings.overlap_px
+    offset, margin_px = settings.offset, settings.margin_px
     left_attrs, right_attrs = (
         dict(require_complete(path).attrs) for path in (left_store, right_store)
     )
@@ -220,8 +208,8 @@ def predict_scene(
         "left_store": left_store,
         "right_store": right_store,
         "method": method,
-        "settings": dict(settings),
-        "threads": 1 if by_tiles else workers,
+        "entry": dict(entry),
+        "threads": 1 if kind.tiles_at_once else workers,
         "disparity_range": (low, high),
         "tiling": tiling,
         "margin": margin_px,
@@ -236,7 +224,7 @@ def predict_scene(
 
     parameters = {
         "method": method,
-        "method_settings": dict(settings),
+        "method_settings": dict(entry),
         "disparity_range": [low, high],
         "block_px": block_px,
         "overlap_px": overlap_px,
@@ -246,7 +234,7 @@ def predict_scene(
     content = digest(
         {
             "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
-            "method": identity(settings),
+            "method": identity(entry, files),
             "range": [low, high],
             "margin": parameters["margin_px"],
             "tiling": [block_px, overlap_px],
@@ -257,7 +245,7 @@ def predict_scene(
     tile_keys = {p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places}
     keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
     every = [tiling.block_window(place) for place in places]
-    width = workers if by_tiles else 1
+    width = workers if kind.tiles_at_once else 1
     tile_shape = tuple(n * tiling.side for n in tiling.count)
     tile_store = out.with_name(f"{out.name}.tiles")
     sizes = {"chunk": tiling.side, "shard": tiling.side}
@@ -287,7 +275,7 @@ def predict_scene(
             name: digest(dict(attrs.get("provenance", {})))
             for name, attrs in (("left", left_attrs), ("right", right_attrs))
         }
-        inputs |= {path.name: file_sha256(path) for path in method_files(settings)}
+        inputs |= {name: file_sha256(path) for name, path in names_of(files).items()}
         attrs = {
             "kind": "prediction",
             "scene": scene,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..methods import Matcher
+from ..matcher import Matcher
 from .tiling import Tiling, View, extent_of
 
 Window = tuple[slice, slice]

@@ -45,6 +45,7 @@ from ...products.files import replacing
 from ...products.grids import Layer, blocks, require_complete
 from ...products.provenance import digest
 from ...products.resumable_grids import BlockStore, making
+from .settings import SurfaceModel as Settings
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -309,7 +310,7 @@ def write_dsm(
     disparity_store: str | Path,
     out: str | Path,
     *,
-    resolution_m: float | None = None,
+    resolution_m: float | None = Settings.resolution_m,
     workers: int = 1,
     scheduler: Any = "threads",
     code: str = "",

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..methods import Matcher
+from ..matcher import Matcher
 from .scene_tiles import blend_lists, predict_tile
 from .tiling import BLOCK_PX, OVERLAP_PX, Tiling, inside, view_of
 

@@ -16,11 +16,13 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
 from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
-from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits
+from stereotruth.evaluation.audit.settings import Settings
+from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
 
 from ....synthetic.pair_with_block import make
 
-LIMITS = Limits(0.3, 0.3, 0.05, 0.01, 0.01)
+LIMITS = Settings(0.3, 0.3, 0.05, 0.01, 0.01)
+ONE_SHOWN = replace(LIMITS, worst=1)
 
 
 def write(path, values, nodata=None):
@@ -83,7 +85,8 @@ def audited(tmp_path_factory):
     same.right = same.left
     add(root, 12, same)
     out = root / "audit" / "mine"
-    summary = audit.audit(dataset(root), out, LIMITS, work=root / "work", worst=3, workers=2)
+    shown = replace(LIMITS, worst=3)
+    summary = audit.audit(dataset(root), out, shown, work=root / "work", workers=2)
     return root, out, summary
 
 
@@ -157,21 +160,21 @@ def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run, "measure", killed)
     with pytest.raises(KeyboardInterrupt):
-        audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+        audit.audit(dataset(root), out, ONE_SHOWN, work=tmp_path / "work")
     assert not out.exists()
     seen.clear()
     monkeypatch.setattr(run, "measure", lambda of, p: (seen.append(p.name), whole(of, p))[1])
-    summary = audit.audit(dataset(root), out, LIMITS, work=tmp_path / "work", worst=1)
+    summary = audit.audit(dataset(root), out, ONE_SHOWN, work=tmp_path / "work")
     assert len(seen) == 1
     assert summary["verdicts"][GOOD] == 3 and not summary["shared"]
     seen.clear()
     strict = replace(LIMITS, parallax_px=0.001)
     work = tmp_path / "work"
     assert audit.audit(dataset(root), out, strict, work=work)["verdicts"][GOOD] < 3
-    audit.audit(dataset(root), out, LIMITS, work=work, worst=1)
+    audit.audit(dataset(root), out, ONE_SHOWN, work=work)
     assert not seen
-    fresh = {"work": tmp_path / "fresh", "worst": 1, "workers": 2}
-    again = audit.audit(dataset(root), tmp_path / "again", LIMITS, **fresh)
+    fresh = {"work": tmp_path / "fresh", "workers": 2}
+    again = audit.audit(dataset(root), tmp_path / "again", ONE_SHOWN, **fresh)
     assert again == summary
     for file in out.iterdir():
         assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes(), file.name

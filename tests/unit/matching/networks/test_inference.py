@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereotruth.errors import InputError
+from stereotruth.matching.kinds import NETWORKS
 from stereotruth.matching.networks import image_scaling, inference, keras_weights, weights
 from stereotruth.matching.networks.inference import NetworkMethod
 from stereotruth.matching.networks.weights import SavedNetwork
@@ -21,7 +22,7 @@ with_published = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("kind", sorted(weights.KINDS))
+@pytest.mark.parametrize("kind", sorted(NETWORKS))
 def test_outputs_have_the_sizes_that_the_loss_expects(kind: str) -> None:
     network = SavedNetwork(kind, (-64, 64)).build()
     side = 256
@@ -67,7 +68,7 @@ def test_any_range_can_be_looked_for() -> None:
     assert np.array_equal(found, again(*image, (-64, 128)))
 
 
-@pytest.mark.parametrize("kind", weights.KINDS)
+@pytest.mark.parametrize("kind", NETWORKS)
 def test_ranges_are_widened_to_the_networks_planes(kind: str) -> None:
     assert weights.covering(kind, (-96, 96)) == (-96, 96)  # US3D's
     assert weights.covering(kind, (-128, 64)) == (-128, 64)  # WHU-Stereo's
@@ -104,7 +105,7 @@ def test_published_stereonet_gives_the_reference_outputs(
 def test_published_stereonet_matches_a_real_tile_from_its_raw_pixels() -> None:
     settings = {"weights": PUBLISHED / "weights/StereoNet_WHU.h5", "device": "cpu"}
     reference = np.load(PUBLISHED / "reference/real_WHU_KM_253_crop512.npz")
-    found = inference.network_method("stereonet", settings)(
+    found = inference.make("mine", "stereonet", settings, 0)(
         reference["raw_left"], reference["raw_right"], (-128, 64)
     )
     assert np.abs(found - reference["d3"]).max() < 1e-3

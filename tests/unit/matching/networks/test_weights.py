@@ -31,11 +31,11 @@ def test_weight_files_hold_all_that_is_needed(tmp_path: Path) -> None:
     file = tmp_path / "weights.pt"
     weights.save_weights(file, made.model, made.network, {"from": "here"})
     settings = {"weights": str(file), "device": "cpu"}
-    again = inference.network_method("stereonet", settings)
+    again = inference.make("mine", "stereonet", settings, 0)
     image = np.random.default_rng(1).integers(1, 900, (2, 64, 64)).astype(np.uint16)
     assert np.array_equal(made(*image, (-64, 64)), again(*image, (-64, 64)))
     with pytest.raises(InputError, match="weights of stereonet, not of psmnet"):
-        inference.network_method("psmnet", settings)
+        inference.make("mine", "psmnet", settings, 0)
     file.write_bytes(b"no weights")
     with pytest.raises(InputError, match="not a weight file"):
         weights.load_weights(file)

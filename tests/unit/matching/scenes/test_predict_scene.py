@@ -13,6 +13,7 @@ from stereotruth.job import dask_scheduler
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes import predict_scene as whole
 from stereotruth.matching.scenes.predict_scene import predict_scene
+from stereotruth.matching.scenes.settings import Settings
 from stereotruth.matching.scenes.whole_images import match
 from stereotruth.products.grids import Layer, building, create_grid, open_grid
 
@@ -23,12 +24,17 @@ SHAPE = (600, 900)
 SETTINGS = {"kind": "sgm", "mode": "sgbm"}
 GIVEN = {
     "method": "sgm",
-    "settings": SETTINGS,
+    "entry": SETTINGS,
     "disparity_range": (-16, 32),
     "block_px": 256,
     "overlap_px": 32,
     "code": "test",
 }
+
+
+def predict(left, right, out, *, method, entry, code, workers=1, scheduler="threads", **settings):
+    how = {"method": method, "entry": entry, "code": code, "settings": Settings(**settings)}
+    return predict_scene(left, right, out, **how, workers=workers, scheduler=scheduler)
 
 
 def truth() -> np.ndarray:
@@ -58,7 +64,7 @@ def images(tmp_path_factory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def fresh(images, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("fresh") / "sgm.zarr"
-    predict_scene(*images, out, **GIVEN, workers=1)
+    predict(*images, out, **GIVEN, workers=1)
     return out
 
 
@@ -100,7 +106,7 @@ def test_nothing_but_the_scene_is_left(fresh):
 
 
 def test_two_workers_give_the_same_bytes(images, fresh, tmp_path):
-    predict_scene(*images, tmp_path / "sgm.zarr", **GIVEN, workers=2)
+    predict(*images, tmp_path / "sgm.zarr", **GIVEN, workers=2)
     assert tree(tmp_path / "sgm.zarr") == tree(fresh)
 
 
@@ -111,7 +117,7 @@ def test_workers_of_a_dask_cluster_write_the_same_bytes(images, fresh, tmp_path)
         distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
         dask_scheduler(cluster.scheduler_address) as client,
     ):
-        predict_scene(*images, tmp_path / "sgm.zarr", **GIVEN, scheduler=client)
+        predict(*images, tmp_path / "sgm.zarr", **GIVEN, scheduler=client)
     assert tree(tmp_path / "sgm.zarr") == tree(fresh)
 
 
@@ -121,24 +127,24 @@ def test_a_killed_job_goes_on_where_it_was(images, fresh, tmp_path, monkeypatch,
     with monkeypatch.context() as patch:
         before = tiles_made(patch, stop_after)
         with pytest.raises(Killed):
-            predict_scene(*images, out, **GIVEN, scheduler="synchronous")
+            predict(*images, out, **GIVEN, scheduler="synchronous")
         assert not out.exists()
     after = tiles_made(monkeypatch)
-    predict_scene(*images, out, **GIVEN, scheduler="synchronous")
+    predict(*images, out, **GIVEN, scheduler="synchronous")
     assert sorted(before + after) == [(i, j) for i in range(3) for j in range(4)]
     assert tree(out) == tree(fresh)
     del after[:]
-    predict_scene(*images, out, **GIVEN, scheduler="synchronous")
+    predict(*images, out, **GIVEN, scheduler="synchronous")
     assert after == []
     assert tree(out) == tree(fresh)
 
 
 def test_a_lost_block_needs_the_tiles_around_it(images, fresh, tmp_path, monkeypatch):
     out = tmp_path / "sgm.zarr"
-    predict_scene(*images, out, **GIVEN)
+    predict(*images, out, **GIVEN)
     (tmp_path / ".sgm.zarr.work" / "store" / "disparity" / "c" / "2" / "3").write_bytes(b"spoilt")
     made = tiles_made(monkeypatch)
-    predict_scene(*images, out, **GIVEN)
+    predict(*images, out, **GIVEN)
     assert sorted(made) == [(1, 2), (1, 3), (2, 2), (2, 3)]
     assert tree(out) == tree(fresh)
 
@@ -147,15 +153,15 @@ def test_a_lost_block_needs_the_tiles_around_it(images, fresh, tmp_path, monkeyp
     "other",
     [
         {"code": "another"},
-        {"settings": {**SETTINGS, "uniqueness_percent": 10}},
+        {"entry": {**SETTINGS, "uniqueness_percent": 10}},
         {"disparity_range": (-16, 48)},
     ],
 )
 def test_other_code_settings_or_range_make_all_anew(images, fresh, tmp_path, monkeypatch, other):
     out = tmp_path / "sgm.zarr"
-    predict_scene(*images, out, **GIVEN)
+    predict(*images, out, **GIVEN)
     made = tiles_made(monkeypatch)
-    predict_scene(*images, out, **{**GIVEN, **other})
+    predict(*images, out, **{**GIVEN, **other})
     assert len(made) == 12
 
 
@@ -164,14 +170,14 @@ def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeyp
     text = "import numpy as np\n\ndef flat(left, right, r):\n    return np.full(left.shape, {})\n"
     module.write_text(text.format(3.0))
     settings = {"kind": "function", "function": f"{module}:flat", "margin_px": 8}
-    given = {**GIVEN, "method": "mine", "settings": settings, "offset": 5}
+    given = {**GIVEN, "method": "mine", "entry": settings, "offset": 5}
     out = tmp_path / "mine.zarr"
     made = tiles_made(monkeypatch)
-    predict_scene(*images, out, **given)
+    predict(*images, out, **given)
     assert np.nanmax(open_grid(out)["disparity"].values) == 8.0
     module.write_text(text.format(2.0) + "\n")  # another size: Python looks at whole seconds
     del made[:]
-    summary = predict_scene(*images, out, **given)
+    summary = predict(*images, out, **given)
     assert len(made) == 12
     assert (summary["disparity_min_px"], summary["disparity_max_px"]) == (7.0, 7.0)
 
@@ -181,10 +187,10 @@ def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeyp
     [
         ({"block_px": 200}, "multiple of 256"),
         ({"overlap_px": 200}, "overlap"),
-        ({"settings": {"kind": "sgm", "mode": "none"}}, "no mode"),
+        ({"entry": {"kind": "sgm", "mode": "none"}}, "no mode"),
         ({"offset": 5000}, "no disparity at all"),
     ],
 )
 def test_mistakes_are_named(images, tmp_path, other, words):
     with pytest.raises(InputError, match=words):
-        predict_scene(*images, tmp_path / "x.zarr", **{**GIVEN, **other})
+        predict(*images, tmp_path / "x.zarr", **{**GIVEN, **other})

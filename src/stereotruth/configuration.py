@@ -1,0 +1,138 @@
+"""The whole configuration: every key with its type, limits, default and meaning, from the stages.
+
+``config/config.yaml`` holds the same defaults, with remarks for who edits it. The reference tables
+of ``config/README.md`` are written from the classes by
+
+    python -m stereotruth.configuration
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from .alignment.settings import Settings as Alignment
+from .dataset.settings import Evaluation, Limits, Tiles
+from .disparity.settings import Occlusion, Project
+from .evaluation.audit.settings import Settings as Audit
+from .lidar.settings import Settings as Ingest
+from .matching.benchmark.settings import Settings as Benchmark
+from .matching.networks.training_settings import Training
+from .matching.scenes.settings import Predict
+from .report.settings import Settings as Report
+from .settings import Flag, Key, Text, Unit, Whole, check, fields_of, nested, settings, values_of
+from .sheets import City, Scene
+from .simulate.settings import Settings as Simulate
+
+Strips = Annotated[Whole, Field(ge=1, le=1000)]
+
+
+@settings
+class Dask:
+    """The configuration's section dask."""
+
+    scheduler_address: Annotated[Text | None, Unit("address")] = None
+    """Dask scheduler (`tcp://host:8786`) whose workers make the blocks of the rules `project`,
+    `predict_scene` and `dsm`, for who has a Dask cluster that works on one scene with scheduling of
+    its own; null: threads of the job. The workers need this package and the same paths"""
+
+
+@settings
+class Configuration:
+    """All keys of ``config/config.yaml``."""
+
+    scenes: Annotated[Text, Unit("path")] = "config/scenes.tsv"
+    """the scenes sheet, see below"""
+
+    cities: Annotated[Text, Unit("path")] = "config/cities.tsv"
+    """the cities sheet, see below"""
+
+    strict: Flag = False
+    """true: warnings about the alignment (any ground control point left out), the splits or a limit
+    of `quality` end the run"""
+
+    seed: Annotated[Whole, Field(ge=0), Unit("whole number")] = 20230213
+    """of everything random: measurement noise of the synthetic cities, splits"""
+
+    simulate: Simulate = field(default_factory=Simulate)
+    ingest: Ingest = field(default_factory=Ingest)
+    alignment: Alignment = field(default_factory=Alignment)
+    occlusion: Occlusion = field(default_factory=Occlusion)
+    project: Project = field(default_factory=Project)
+    tiles: Tiles = field(default_factory=Tiles)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    quality: Limits = field(default_factory=Limits)
+
+    strips: Annotated[Strips | dict[str, Strips], Unit("number, or scene: number")] = 1
+    """jobs among which the grid of a scene is shared, each for some rows of blocks of 1024 px; for
+    any cluster that Snakemake submits jobs to, without a Dask that runs there. The bytes are those
+    of one job"""
+
+    dask: Dask = field(default_factory=Dask)
+    report: Report = field(default_factory=Report)
+    benchmark: Benchmark = field(default_factory=Benchmark)
+
+    training: Training = field(default_factory=Training)
+    """how the networks are trained (`results/train/<dataset>/<method>/`), see [below](#training);
+    an entry of `benchmark.methods` may have a `training` of its own, whose keys precede"""
+
+    predict: Predict = field(default_factory=Predict)
+    audit: Audit = field(default_factory=Audit)
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], file: str | Path = "config") -> Configuration:
+        """What the user wrote. Raises InputError that names ``file`` and the first wrong key."""
+        return check(config, cls, file)
+
+
+BELOW = ("training", "benchmark.methods")  # have tables of their own
+TABLE = re.compile(r"(<!-- keys: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def rows(of: Any, before: str = "") -> Iterator[str]:
+    """The rows of the reference table: key; unit, values; effect."""
+    for name, key in fields_of(of).items():
+        full = f"{before}{name}"
+        inner, by_name = nested(key.type)
+        if inner is None or key.meaning:
+            yield row(full, key)
+        if inner is not None and full not in BELOW:
+            yield from rows(inner, f"{full}.<name>." if by_name else f"{full}.")
+
+
+def row(name: str, key: Key) -> str:
+    """One row."""
+    return f"| `{name}` | {values_of(key)} | {key.meaning} |".replace("|  |", "| |")
+
+
+def columns(of: Any) -> Iterator[str]:
+    """The table of a sheet's columns."""
+    yield from ("| column | meaning |", "|---|---|")
+    yield from (f"| `{name}` | {key.meaning} |" for name, key in fields_of(of).items())
+
+
+def with_tables(guide: str) -> str:
+    """The text of ``config/README.md`` with its tables as they follow from the classes."""
+    head = ("| key | unit, values | effect |", "|---|---|---|")
+    tables = {
+        "configuration": [*head, *rows(Configuration)],
+        "training": [*head, *rows(Training, "training.")],
+        "scenes": columns(Scene),
+        "cities": columns(City),
+    }
+
+    def table(found: re.Match[str]) -> str:
+        return found[1] + "".join(f"{line}\n" for line in tables[found[2]]) + found[3]
+
+    return TABLE.sub(table, guide)
+
+
+if __name__ == "__main__":
+    file = Path(*sys.argv[1:] or ["config/README.md"])
+    file.write_text(with_tables(file.read_text(encoding="utf-8")), encoding="utf-8")

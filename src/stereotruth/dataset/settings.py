@@ -1,0 +1,78 @@
+"""Settings of the stage export."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ..settings import Flag, Number, Share, Unit, Whole, settings
+
+NotNegative = Annotated[Number, Field(ge=0)]
+
+
+@settings
+class Tiles:
+    """The configuration's section tiles."""
+
+    size: Annotated[Whole, Field(ge=16), Unit("px")] = 1024
+    """side of a tile"""
+
+    stride: Annotated[Annotated[Whole, Field(ge=1)] | None, Unit("px")] = None
+    """distance between neighbouring tiles; null: the size"""
+
+    min_labelled: Share = 0.5
+    """a pair with fewer labelled pixels counts as incomplete and goes to `unlabelled/`"""
+
+    right_offset: Literal["tile", "scene"] = "tile"
+    """the right image is shifted by the mean disparity of the tile or of the scene"""
+
+    disparity_dtype: Literal["float16", "float32"] = "float16"
+    """type of the disparity files; OpenCV and Pillow cannot read 16-bit float TIFF"""
+
+    nodata: Annotated[Number, Unit("px")] = -999
+    """value of unlabelled pixels in the disparity files"""
+
+
+@settings
+class Evaluation:
+    """The configuration's section evaluation."""
+
+    building_share: Share = 0.02
+    """a tile of which as many of the classified pixels are building is of the class building, any
+    other of the class vegetation; where the LiDAR has no classes, flat things that stand above the
+    ground count as buildings"""
+
+
+@settings
+class Limits:
+    """The configuration's section quality; None switches a gate off."""
+
+    max_gcp_rms_px: Annotated[NotNegative | None, Unit("px of the images")] = 1
+    """a scene whose ground control points leave a larger residual (rms of either view) is flagged,
+    as is what exceeds the limits below; null: no limit"""
+
+    max_y_parallax_px: Annotated[NotNegative | None, Unit("px")] = 0.5
+    """size of the median y-parallax of the SIFT matches of a tile or scene"""
+
+    max_sift_error_px: Annotated[NotNegative | None, Unit("px")] = 0.5
+    """size of the median of SIFT disparity less label"""
+
+    max_sift_mean_absolute_error_px: Annotated[NotNegative | None, Unit("px")] = 1
+    """mean of its size"""
+
+    min_sift_matches: Annotated[Annotated[Whole, Field(ge=0)] | None, Unit("matches")] = 10
+    """fewer are flagged themselves, and the two limits above not applied"""
+
+    min_warp_correlation: Annotated[Number, Field(ge=-1, le=1)] | None = 0.5
+    """correlation of the left and the right image warped by the labels"""
+
+
+@settings
+class Settings(Evaluation, Tiles):
+    """How tiles are cut, checked and split."""
+
+    seed: Whole = field(kw_only=True)
+    strict: Flag = False
+    quality: Limits = field(default_factory=Limits)

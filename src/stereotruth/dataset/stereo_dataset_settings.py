@@ -1,0 +1,31 @@
+"""How the configuration names a stereo dataset."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from ..settings import Flag, Number, Range, Text, Unit, settings
+
+
+@settings
+class Settings:
+    """An entry of the configuration's benchmark.datasets."""
+
+    root: Annotated[Text, Unit("path")]
+    """its folder"""
+
+    layout: Literal["stereotruth", "whu", "us3d"]
+    """where its files lie and what they are called"""
+
+    disparity_range: Range
+    """disparities that methods look for and labels that count, the second excluded"""
+
+    nodata: Annotated[Number, Unit("px")] = -999
+    """value of unlabelled pixels, −999 if it is not given"""
+
+    grows_with_height: Flag = True
+    """whether the larger of two disparities is the higher place (true if it is not given): holes of
+    a disparity map are filled with the lower one"""
+
+    methods: Annotated[tuple[Text, ...] | None, Unit("names")] = None
+    """methods that the target `benchmark` compares; null or not given: all"""

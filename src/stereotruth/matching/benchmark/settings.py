@@ -1,0 +1,78 @@
+"""Settings of the benchmark of stereo methods."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints
+
+from ...dataset.stereo_dataset_settings import Settings as Dataset
+from ...settings import Number, Text, Unit, Whole, each_once, settings
+from ..kinds import KINDS
+from ..networks.training_settings import Training
+
+Name = Annotated[Text, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
+
+
+@settings(more=True)
+class Method:
+    """An entry of benchmark.methods; each kind knows its own further settings."""
+
+    kind: Literal[*KINDS]
+    label: Text = ""
+    """how tables call the method"""
+
+    fine_tuned_of: Text = ""
+    """name of the method whose training was carried on"""
+
+    weights: Annotated[Text | None, Unit("path")] = None
+    """of a network; null: those that rule train makes"""
+
+    training: Training = field(default_factory=Training)
+    """what its training has other than the section training"""
+
+
+@settings
+class Scoring:
+    """How disparities are scored."""
+
+    thresholds_px: Annotated[
+        tuple[Annotated[Number, Field(gt=0)], ...],
+        Field(min_length=1),
+        AfterValidator(each_once),
+        Unit("px"),
+    ] = (3, 1)
+    """errors above these count for D1; tables show the first"""
+
+    bootstrap: Annotated[Whole, Field(ge=0), Unit("samples")] = 1000
+    """of the tiles, for the 95 % confidence intervals; 0: none"""
+
+    panels: Annotated[Whole, Field(ge=0), Unit("tiles")] = 24
+    """that are drawn for each method, of all cities; figure 10 shows up to six"""
+
+
+def _own_dataset() -> dict[str, Dataset | None]:
+    own = Dataset("dataset", "stereotruth", (-64, 128), methods=("sgm",))
+    return {"synthetic": own}
+
+
+def _methods() -> dict[str, Method | None]:
+    return {kind: Method(kind) for kind in ("sgm", "stereonet", "psmnet", "hmsmnet")}
+
+
+@settings
+class Settings(Scoring):
+    """The configuration's section benchmark."""
+
+    datasets: Annotated[dict[Name, Dataset | None], Unit("by name")] = field(
+        default_factory=_own_dataset
+    )
+    """datasets on which stereo methods are compared (`benchmark/<dataset>/<method>`), see
+    [below](#stereo-methods); `synthetic` is what rule `dataset` makes; null takes a dataset away"""
+
+    methods: Annotated[dict[Name, Method | None], Unit("by name")] = field(default_factory=_methods)
+    """methods, see [below](#stereo-methods); null takes a method away"""
+
+    split: Literal["train", "val", "test"] | None = "test"
+    """pairs that are matched and scored; null: all"""

@@ -1,0 +1,108 @@
+"""Datasets and stereo methods of the configuration."""
+
+from stereotruth.matching.kinds import KINDS
+from stereotruth.matching.scenes.settings import Settings as PredictionSettings
+
+
+def dataset_settings(name):
+    """The entry of a dataset in the configuration's section benchmark."""
+    known = {n: of for n, of in config["benchmark"]["datasets"].items() if of}
+    if name not in known:
+        raise WorkflowError(
+            f"benchmark.datasets: no dataset {name!r}. "
+            f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
+        )
+    return known[name]
+
+
+def dataset_entry(name):
+    """What a dataset is: its entry without the methods that are compared on it."""
+    return {key: value for key, value in dataset_settings(name).items() if key != "methods"}
+
+
+def dataset_folder(name):
+    """The root of a dataset; the workflow makes its own."""
+    root = str(Path(dataset_settings(name)["root"]))
+    if root != "dataset" and not Path(root).is_dir():
+        raise WorkflowError(
+            f"benchmark.datasets.{name}.root: {root}: no such folder. "
+            "Remedy: name the dataset's folder"
+        )
+    return root
+
+
+def is_own_dataset(name):
+    """Whether the workflow makes the dataset."""
+    return dataset_folder(name) == "dataset"
+
+
+def method_settings(name):
+    """The entry of a method in the configuration's section benchmark."""
+    known = {n: of for n, of in config["benchmark"]["methods"].items() if of}
+    if name not in known:
+        raise WorkflowError(
+            f"benchmark.methods: no method {name!r}. "
+            f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
+        )
+    return known[name]
+
+
+def methods_of(dataset):
+    """Names of the methods that are compared on a dataset."""
+    known = [n for n, of in config["benchmark"]["methods"].items() if of]
+    return dataset_settings(dataset).get("methods") or known
+
+
+def method_entry(name, dataset):
+    """What the disparities by a method follow from: no names, nor its training.
+
+    A network without weights takes those that it is trained to on the dataset.
+    """
+    names = ("label", "fine_tuned_of", "training")
+    entry = {key: value for key, value in method_settings(name).items() if key not in names}
+    if KINDS[entry["kind"]].is_network:
+        entry["weights"] = entry.get("weights") or f"results/train/{dataset}/{name}/best.pt"
+    return entry
+
+
+def method_files(name, dataset):
+    """Files that a method is made of: weights, the user's code, results to be scored."""
+    entry = method_entry(name, dataset)
+    try:
+        return [str(file) for file in KINDS[entry["kind"]].files(entry)]
+    except InputError as error:
+        raise WorkflowError(f"benchmark.methods.{name}: {error}")
+
+
+def training_of(name):
+    """How a network is trained: section training, and what the method's entry has other."""
+    own = method_settings(name).get("training") or {}
+    return {"seed": SETTINGS.seed, **asdict(SETTINGS.training), **own}
+
+
+def method_modules(name):
+    """Modules of the package that hold a method's own code."""
+    return KINDS[method_settings(name)["kind"]].modules
+
+
+def method_label(name):
+    """How tables call a method."""
+    return method_settings(name).get("label") or KINDS.get(name, KINDS["function"]).label or name
+
+
+def products_of_own_dataset():
+    """What tells the strata of the workflow's own dataset: status, classes, exact truth."""
+    scenes = SCENES.values()
+    return [
+        *(f"tiles/{city}" for city in CITIES),
+        *(f"results/project/{s.city}/{s.scene}.zarr" for s in scenes),
+        *(f"results/truth/{s.city}/{s.scene}.zarr" for s in scenes if is_synthetic(s)),
+    ]
+
+
+def scene_prediction():
+    """How methods go over whole scenes; the disparity range is that of their dataset."""
+    settings = asdict(SETTINGS.predict)
+    known = dataset_settings(settings["dataset"])["disparity_range"]
+    own = {key: settings[key] for key in PredictionSettings.__dataclass_fields__}
+    return own | {"disparity_range": own["disparity_range"] or known}

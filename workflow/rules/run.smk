@@ -1,0 +1,57 @@
+"""One run at a time, and its last lines."""
+
+import json
+import re
+
+from stereotruth.products.locks import FileLock
+
+LOCKS = []  # held until this process ends
+
+
+def refuse_second_run():
+    """End this run if another one works in this directory.
+
+    Snakemake's own lock stays when it is killed; this one does not (profiles/default turns the
+    other off).
+    """
+    lock = FileLock(".snakemake/run.lock")
+    if not lock.take(Path.cwd(), wait=False):
+        raise WorkflowError(
+            f"{Path.cwd()}: another run is at work here ({lock.holder}). "
+            "Remedy: wait until it ends, or stop it"
+        )
+    LOCKS.append(lock)
+
+
+onstart:
+    refuse_second_run()
+
+
+def complaints(snakemake_logs):
+    """The errors that the failed jobs of a run have logged, one line each."""
+    text = "".join(Path(file).read_text() for file in snakemake_logs)
+    logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
+    found = []
+    for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
+        found += re.findall(r"ERROR (.*?: error: .*)", file.read_text())
+    return "\n".join(found)
+
+
+def made():
+    """What the last lines of a run say: the tiles that there are, and where to look."""
+    summaries = [Path("results", "export", city, "summary.json") for city in CITIES]
+    lines = [
+        line
+        for file in summaries
+        if file.is_file()
+        for line in json.loads(file.read_text())["lines"]
+    ]
+    return "\n".join(["", *lines]) if lines else "done"
+
+
+onsuccess:
+    print(made())
+
+
+onerror:
+    print(complaints(log))
