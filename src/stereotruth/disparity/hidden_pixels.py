@@ -321,7 +321,8 @@ def _is_hidden(
     """Does the ray from place (a, b) in [0, 1)² of cell (i, j) at height ``start`` hit a cell?
 
     (du, dv): cells per metre of rise; ``top``: no cell is higher (m). The cell of the start does
-    not count: what lies above the start there is the business of :mod:`.seen_surface`.
+    not count: what lies above the start there is the business of
+    :func:`.seen_surface.seen_surface`.
     """
     speed = np.sqrt(du * du + dv * dv)
     if speed < 1e-6:  # the camera stands in the zenith
