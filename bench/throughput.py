@@ -83,17 +83,18 @@ with job(log, "project"):
 """
 BOUNDS = {  # part of a profile: what its time goes into
     "laspy": "arithmetic decoding, bit by bit: the floor",
-    "crs": "two passes over 6 arrays: memory",
-    "crs_patches": "27 multiplications and additions a point in vectors: memory",
-    "points": "ingest: scattered writes of the sort; query: one pass over memory",
+    "to_wgs84": "two passes over 6 arrays: memory",
+    "projection_polynomials": "27 multiplications and additions a point in vectors: memory",
+    "cell_sort": "scattered writes of the sort: cache misses",
+    "point_store": "one pass over memory",
     "zarr, store": "LZ4 and three copies in Zarr",
     "zarr, query": "LZ4 and two copies in Zarr",
     "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
-    "occlusion": "scattered updates of the surface; rays: steps along them",
-    "representative": "exact sums by pixel: one pass over the points",
-    "agreement": "windows of pixels, not of points",
-    "correlation": "200 samples a point in vectors: arithmetic",
+    "hidden_pixels": "scattered updates of the surface; rays: steps along them",
+    "pixel_labels": "exact sums by pixel: one pass over the points",
+    "image_agreement": "windows of pixels, not of points",
+    "paper_correlation": "200 samples a point in vectors: arithmetic",
 }
 
 

@@ -14,8 +14,7 @@ of its point that got furthest:
    (:func:`.image_agreement.supported`; ``geometric``, ``both``); are there ``min_points``.
 
 So the method ``correlation`` is the paper's filter, ``geometric`` is visibility in both views from
-the points, ``both`` is geometric, and what the images contradict is changed; ``none`` tests no
-view.
+the points, ``both`` is geometric, and what the images contradict is changed; ``none`` is neither.
 """
 
 from __future__ import annotations

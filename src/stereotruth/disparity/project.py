@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +149,7 @@ def project_scene(
             *((f"points/{store.path.name}", store.path) for store in stores),
         )
     }
-    parameters = {"view": view, **vars(settings)}
+    parameters = {"view": view} | asdict(settings)
     left_attrs = require_complete(left_store).attrs
     attrs = {
         "kind": "disparity",
