@@ -60,34 +60,36 @@ POINTS_AT_25_CM = 82.6  # million, of this scene
 BLOCK = 1 << 16
 INGEST_JOB = """
 import sys
-from stereotruth.points import ingest
-from stereotruth.provenance import describe
-from stereotruth.runlog import job
+from stereotruth.job import job
+from stereotruth.lidar.ingest import ingest
+from stereotruth.products.provenance import describe
 lidar, store, log = sys.argv[1:]
 with job(log, "ingest"):
     ingest(lidar, store, provenance=describe([lidar], {}, ""))
 """
 PROJECT_JOB = """
 import json, sys
-from stereotruth.disparity import project_scene
-from stereotruth.runlog import job
+from stereotruth.disparity.project import project_scene
+from stereotruth.job import job
 left, right, points, out, log, settings = sys.argv[1:]
 with job(log, "project"):
     project_scene(left, right, json.loads(points), out, **json.loads(settings))
 """
 BOUNDS = {  # part of a profile: what its time goes into
     "laspy": "arithmetic decoding, bit by bit: the floor",
-    "crs": "two passes over 6 arrays: memory",
-    "crs_patches": "27 multiplications and additions a point in vectors: memory",
-    "points": "ingest: scattered writes of the sort; query: one pass over memory",
+    "to_wgs84": "two passes over 6 arrays: memory",
+    "projection_polynomials": "27 multiplications and additions a point in vectors: memory",
+    "cell_sort": "scattered writes of the sort: cache misses",
+    "point_store": "one pass over memory",
     "zarr, store": "LZ4 and three copies in Zarr",
     "zarr, query": "LZ4 and two copies in Zarr",
     "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
-    "occlusion": "scattered updates of the surface; rays: steps along them",
-    "representative": "exact sums by pixel: one pass over the points",
-    "agreement": "windows of pixels, not of points",
-    "correlation": "200 samples a point in vectors: arithmetic",
+    "seen_surface": "scattered updates of the surface",
+    "hidden_pixels": "rays: steps along them",
+    "pixel_labels": "exact sums by pixel: one pass over the points",
+    "image_agreement": "windows of pixels, not of points",
+    "paper_correlation": "200 samples a point in vectors: arithmetic",
 }
 
 
@@ -697,7 +699,7 @@ def main() -> int:
     config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
     project = config["project"]
     settings = dict(config["occlusion"]) | {
-        "representative": project["representative"],
+        "pixel_labels": project["representative"],
         "edge_margin_px": project["edge_margin_px"],
         "min_points": project["min_points_per_px"],
     }
