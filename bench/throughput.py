@@ -91,7 +91,8 @@ BOUNDS = {  # part of a profile: what its time goes into
     "zarr, query": "LZ4 and two copies in Zarr",
     "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
-    "hidden_pixels": "scattered updates of the surface; rays: steps along them",
+    "seen_surface": "scattered updates of the surface",
+    "hidden_pixels": "rays: steps along them",
     "pixel_labels": "exact sums by pixel: one pass over the points",
     "image_agreement": "windows of pixels, not of points",
     "paper_correlation": "200 samples a point in vectors: arithmetic",
@@ -707,7 +708,7 @@ def main() -> int:
     config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
     project = config["project"]
     settings = dict(config["occlusion"]) | {
-        "representative": project["representative"],
+        "pixel_labels": project["representative"],
         "edge_margin_px": project["edge_margin_px"],
         "min_points": project["min_points_per_px"],
     }

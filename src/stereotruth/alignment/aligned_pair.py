@@ -88,14 +88,6 @@ class ViewFit:
             return math.nan
         return float(np.sqrt(np.mean(np.sum(pairs**2, axis=1))))
 
-    def covariance_at(self, col: ArrayLike, row: ArrayLike) -> Floats:
-        """Covariance [..., 2, 2] in px² of the corrected (col, row) at image points.
-
-        That is the part of a projected point's error that stems from the GCPs' measurement.
-        """
-        design = self.design(col, row)
-        return design @ self.covariance @ np.swapaxes(design, -1, -2)
-
     def design(self, col: ArrayLike, row: ArrayLike) -> Floats:
         """[..., 2, 6]: change of the corrected (col, row) with the parameters of ``covariance``."""
         col, row = np.broadcast_arrays(np.asarray(col, float), np.asarray(row, float))

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.resampling import RADIUS, sample, tap_weights
-from .window_fit import gain_and_correlation, normal_equations, solve_two, weighted_mean
+from .window_fit import gain_and_correlation, shift, weighted_mean
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -71,9 +71,6 @@ def least_squares_match(
     count = (template.shape[0] - 2) ** 2
     warped = np.empty(template.shape, np.float32)
     left, right, weight = np.empty((count, 3)), np.empty((count, 3)), np.ones(count)
-    moves = np.zeros((count, 2, 2))
-    moves[:, 0, 0], moves[:, 1, 1] = 1.0, 1.0
-    normal, rhs, middle = np.empty((2, 2)), np.empty(2), np.empty(2)
     result[:] = np.nan
     _inner(template, left)
     mean_left = weighted_mean(left, weight)
@@ -87,11 +84,8 @@ def least_squares_match(
         gain, correlation = gain_and_correlation(left, right, weight, mean_left, mean_right)
         if np.isnan(gain):
             return
-        misfit = normal_equations(
-            left, right, weight, mean_left, mean_right, gain, moves, normal, rhs, middle
-        )
-        dx, dy, det = solve_two(normal, rhs)
-        if np.isnan(det):
+        dx, dy, sigma = shift(left, right, weight, mean_left, mean_right, gain, False)
+        if np.isnan(dx):
             return
         x += dx
         y += dy
@@ -99,6 +93,6 @@ def least_squares_match(
             return
         if max(abs(dx), abs(dy)) < CONVERGED:
             result[0], result[1] = x, y
-            result[2] = np.sqrt(misfit / (count - 4) * max(normal[0, 0], normal[1, 1]) / det)
+            result[2] = sigma
             result[3] = correlation
             return

@@ -20,7 +20,6 @@ of the upper-left pixel.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,345 +27,24 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .model import EpipolarModel, ImageModel
+from .pair_geometry import convergence_angle, find_overlap, find_rotation, view_order
 from .rpc import SensorModel
-from .spline_kernels import cubic_weights, forward_with_slopes
+from .spline_fit import grow, y_parallax
+from .spline_kernels import forward_with_slopes
+from .virtual_points import Points, box_defect, common_box, frame, of_box, of_frames, steps
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
 
 
-# Weights of the penalties, per coefficient and relative to the mean squared residual (px²).
-# A residual floor of r px can push a free direction by about r / (2 sqrt(RIDGE)); a real
-# coefficient of c px is biased by at most sqrt(RIDGE) c / 2.
-RIDGE = 1e-9
-SMOOTHNESS = 1e-10
-SIZES = (6, 8, 10, 12)  # coefficients per axis, tried in turn
-GOOD_RMS = 0.003  # px; no larger spline is tried below this
 ACCEPTED_RMS = 0.01  # px; above this over the RPCs' ground box the domain is narrowed
-MIN_CONVERGENCE = 1.0  # degrees
-MAX_DOMAIN = 300_000.0  # px; the largest scenes have some 50 000
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Virtual points in both images: ground (lon, lat, height) [3, n] and (col, row) [2, n]."""
-
-    ground: Floats
-    left: Floats
-    right: Floats
-
-    @classmethod
-    def at(
-        cls, left: SensorModel, right: SensorModel, lon: Floats, lat: Floats, h: Floats
-    ) -> _Points:
-        ground = np.stack([np.ravel(c) for c in np.broadcast_arrays(lon, lat, h)])
-        in_left, in_right = np.array(left.project(*ground)), np.array(right.project(*ground))
-        good = (
-            np.isfinite(ground).all(0) & np.isfinite(in_left).all(0) & np.isfinite(in_right).all(0)
-        )
-        return cls(ground[:, good], in_left[:, good], in_right[:, good])
-
-    def __add__(self, other: _Points) -> _Points:
-        return _Points(
-            np.hstack([self.ground, other.ground]),
-            np.hstack([self.left, other.left]),
-            np.hstack([self.right, other.right]),
-        )
-
-
-def _steps(low: float, high: float, n: int, inset: float) -> Floats:
-    """n equal steps from low to high, drawn in by a share of the range at both ends."""
-    return low + (high - low) * np.linspace(inset, 1 - inset, n)
-
-
-def _design(domain: tuple[float, float, float, float], n: int, image: Floats) -> Floats:
-    """[points, n²] values of the B-splines at image (col, row) [2, points] inside the domain."""
-    weights = []
-    for axis, coordinate in enumerate(image):
-        s = (coordinate - domain[axis]) / (domain[axis + 2] - domain[axis]) * (n - 3)
-        i = np.clip(np.floor(s).astype(int), 0, n - 4)
-        dense = np.zeros((s.size, n))
-        for a, w in enumerate(cubic_weights.py_func(s - i)):
-            dense[np.arange(s.size), i + a] = w
-        weights.append(dense)
-    return (weights[1][:, :, None] * weights[0][:, None, :]).reshape(-1, n * n)
-
-
-def _second_differences(n: int) -> Floats:
-    """[2 n (n - 2), n²]: second differences of n × n coefficients along both axes."""
-    one = np.diff(np.eye(n), 2, axis=0)
-    return np.vstack([np.kron(np.eye(n), one), np.kron(one, np.eye(n))])
-
-
-def _domain(image: Floats) -> tuple[float, float, float, float]:
-    """Bounds of image points, padded by 2 %, in whole px."""
-    low, high = image.min(axis=1), image.max(axis=1)
-    pad = 0.02 * (high - low) + 2.0
-    low, high = np.floor(low - pad), np.ceil(high + pad)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _solve(design: Floats, target: Floats, *penalties: Floats) -> Floats:
-    """Least squares with penalty rows; rounded, so that the count of threads leaves no trace."""
-    rows = np.vstack([design / np.sqrt(len(target)), *penalties])
-    right = np.zeros(len(rows))
-    right[: len(target)] = target / np.sqrt(len(target))
-    return np.round(np.linalg.lstsq(rows, right, rcond=None)[0], 6)
-
-
-def _fit_images(
-    points: _Points, surface: _Points, rotation: Floats, n: int
-) -> tuple[ImageModel, ImageModel]:
-    """Both image models with n × n coefficients per spline.
-
-    ``points`` make the rows, ``surface`` (at the reference height) the right image's x.
-    """
-    homogeneous = np.vstack([surface.right, np.ones(surface.right.shape[1])])
-    wanted = rotation @ np.vstack([surface.left, np.ones(surface.left.shape[1])])
-    affine = np.linalg.lstsq(homogeneous.T, wanted.T, rcond=None)[0].T
-    affine = np.round(affine, 12)
-    left_domain = _domain(np.hstack([points.left, surface.left]))
-    right_domain = _domain(np.hstack([points.right, surface.right]))
-
-    def rows(matrix: Floats, image: Floats) -> Floats:
-        return matrix[:, :2] @ image + matrix[:, 2:]
-
-    left_design = _design(left_domain, n, points.left)
-    right_design = _design(right_domain, n, points.right)
-    smooth = np.sqrt(SMOOTHNESS / n**2) * _second_differences(n)
-    nothing = np.zeros_like(smooth)
-    near = np.sqrt(RIDGE / n**2) * np.eye(n * n)
-    y = _solve(
-        np.hstack([left_design, -right_design]),
-        rows(affine, points.right)[1] - rows(rotation, points.left)[1],
-        np.hstack([near, np.zeros_like(near)]),
-        np.hstack([smooth, nothing]),
-        np.hstack([nothing, smooth]),
-    ).reshape(2, n, n)
-    x = _solve(
-        _design(right_domain, n, surface.right),
-        wanted[0] - rows(affine, surface.right)[0],
-        smooth * 1e2,
-    ).reshape(n, n)
-    return (
-        ImageModel(rotation, left_domain, y[0]),
-        ImageModel(affine, right_domain, y[1], x),
-    )
-
-
-def _parallax(left: ImageModel, right: ImageModel, points: _Points) -> Floats:
-    """y_left - y_right in px of virtual points."""
-    return left.forward(*points.left)[1] - right.forward(*points.right)[1]
-
-
-def _direction(sensor: SensorModel, col: float, row: float, height: float) -> Floats:
-    """Unit vector (east, north, up) of a pixel's ray, upwards, near an ellipsoidal height in m."""
-    lon, lat = sensor.localize([col, col], [row, row], [height, height + 200.0])
-    phi = np.radians(lat[0])
-    squared = 6.69437999014e-3  # first eccentricity squared of WGS 84
-    w = 1.0 - squared * np.sin(phi) ** 2
-    prime_vertical = 6378137.0 / np.sqrt(w) + height
-    meridian = 6378137.0 * (1.0 - squared) / w**1.5 + height
-    ray = np.array(
-        [
-            np.radians(lon[1] - lon[0]) * np.cos(phi) * prime_vertical,
-            np.radians(lat[1] - lat[0]) * meridian,
-            200.0,
-        ]
-    )
-    return ray / np.linalg.norm(ray)
-
-
-def _frame(size: tuple[int, int], n: int) -> tuple[Floats, Floats]:
-    """(col, row) of an n × n grid over an image of (cols, rows) px, edges included."""
-    col, row = np.meshgrid(np.linspace(0, size[0] - 1, n), np.linspace(0, size[1] - 1, n))
-    return col.ravel(), row.ravel()
-
-
-def _inside(image: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which image points [2, n] lie in the frame of an image of (cols, rows) px."""
-    limit = np.array(size)[:, None] - 0.5
-    return ((image >= -0.5) & (image <= limit)).all(axis=0)
-
-
-def _of_frames(
-    left: SensorModel,
-    right: SensorModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
-    heights: Floats,
-    n: int,
-) -> _Points:
-    """Ground points over both images' frames at the given heights."""
-    found = []
-    for sensor, size in zip((left, right), sizes):
-        col, row = _frame(size, n)
-        lon, lat = sensor.localize(col[:, None], row[:, None], heights[None, :])
-        found.append(_Points.at(left, right, lon, lat, heights[None, :]))
-    return found[0] + found[1]
-
-
-def _of_box(
-    left: SensorModel,
-    right: SensorModel,
-    box: tuple[float, float, float, float],
-    heights: Floats,
-    n: int,
-    inset: float,
-) -> _Points:
-    """Ground points on a regular grid over a ground box at the given heights."""
-    lon, lat, h = np.meshgrid(
-        _steps(box[0], box[2], n, inset), _steps(box[1], box[3], n, inset), heights
-    )
-    return _Points.at(left, right, lon, lat, h)
-
-
-def _common_box(
-    left: SensorModel, right: SensorModel
-) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
-    """Intersection of both RPCs' ground boxes: (lon, lat bounds) and height range."""
-    a, b = np.array(left.rpc.ground_box), np.array(right.rpc.ground_box)
-    b[[0, 2]] += 360.0 * np.round((a[0] + a[2] - b[0] - b[2]) / 720.0)
-    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:4], b[2:4])
-    heights = (max(a[4], b[4]), min(a[5], b[5]))
-    if heights[0] >= heights[1]:
-        heights = (min(a[4], b[4]), max(a[5], b[5]))
-    return (
-        (float(low[0]), float(low[1]), float(high[0]), float(high[1])),
-        (float(heights[0]), float(heights[1])),
-    )
-
-
-def _box_defect(
-    left: SensorModel,
-    right: SensorModel,
-    box: tuple[float, float, float, float],
-    points: _Points,
-    n: int,
-) -> str:
-    """Why a ground box cannot carry the fit, or an empty string."""
-    if box[0] >= box[2] or box[1] >= box[3]:
-        return "the RPCs' ground boxes do not overlap"
-    if points.ground.shape[1] < n:
-        return "the RPCs give no finite image coordinates in parts of their ground box"
-    for sensor in (left, right):
-        for values in sensor.rpc.denominators(*points.ground):
-            if values.min() <= 0.0 <= values.max():
-                return "an RPC's denominator vanishes in its ground box"
-    for image in (points.left, points.right):
-        if np.ptp(image, axis=1).max() > MAX_DOMAIN:
-            return f"the RPCs' ground box spans more than {MAX_DOMAIN:.0f} px"
-    return ""
-
-
-def _overlap(
-    left: SensorModel,
-    right: SensorModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
-    reference: float,
-    height_range: tuple[float, float],
-    names: tuple[str, str],
-) -> Floats:
-    """(col, row) [2, n] of left pixels whose ground at the reference height the right image sees.
-
-    If there are none at that height, those of the nearest height in the range that has some.
-    """
-    col, row = _frame(sizes[0], 41)
-    heights = sorted({reference, *_steps(*height_range, 21, 0.0)}, key=lambda h: abs(h - reference))
-    for height in heights:
-        lon, lat = left.localize(col, row, height)
-        if height == reference and not np.isfinite(lon).any():
-            raise InputError(
-                "no pixel can be located on the ground by the RPC",
-                file=names[0],
-                remedy="check that the RPC belongs to this image",
-            )
-        seen = _inside(np.array(right.project(lon, lat, height)), sizes[1])
-        if seen.any():
-            return np.stack([col[seen], row[seen]])
-    raise InputError(
-        f"left and right image do not overlap between {height_range[0]:.0f} and "
-        f"{height_range[1]:.0f} m (other image: {names[1]})",
-        file=names[0],
-        remedy="check that both images are of one pair and that each RPC belongs to its image",
-    )
-
-
-def _convergence(
-    left: SensorModel, right: SensorModel, overlap: Floats, height: float, names: tuple[str, str]
-) -> float:
-    """Angle in degrees between both rays in the middle of the overlap."""
-    col, row = overlap.mean(axis=1)
-    there = right.project(*left.localize(col, row, height), height)
-    rays = _direction(left, col, row, height), _direction(right, *map(float, there), height)
-    angle = float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0))))
-    if not angle >= MIN_CONVERGENCE:
-        raise InputError(
-            f"left and right image see the ground from one direction (convergence {angle:.2f} "
-            f"degrees; other image: {names[1]})",
-            file=names[0],
-            remedy="check that the two images are not the same view, and that each RPC belongs "
-            "to its image",
-        )
-    return angle
-
-
-def _rotation(
-    left: SensorModel, right: SensorModel, overlap: Floats, height: float
-) -> tuple[Floats, float]:
-    """Rotation float64[2, 3] of the left image to (x, y), and its angle in degrees.
-
-    +x is the way that a point on a right ray goes in the left image when it rises: x_right stays,
-    x_left and with it the disparity grow.
-    """
-    ground = left.localize(*overlap, height)
-    there = right.project(*ground, height)
-    ends = [left.project(*right.localize(*there, h), h) for h in (height - 50.0, height + 50.0)]
-    way = np.array(ends[1]) - np.array(ends[0])
-    east, south = np.nanmean(way / np.hypot(*way), axis=1)
-    angle = round(float(np.degrees(np.arctan2(south, east))), 6)
-    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    return np.array([[c, s, 0.0], [-s, c, 0.0]]), angle
-
-
-def _view_order(left: SensorModel, right: SensorModel, overlap: Floats, height: float) -> str:
-    """Which image looks backward, if image rows run in flight direction."""
-    col, row = overlap.mean(axis=1)
-    there = right.project(*left.localize(col, row, height), height)
-    base = (_direction(left, col, row, height) - _direction(right, *map(float, there), height))[:2]
-    lon, lat = left.localize([col, col], [row - 50.0, row + 50.0], height)
-    flight = np.array([(lon[1] - lon[0]) * np.cos(np.radians(lat[0])), lat[1] - lat[0]])
-    along = float(base @ flight / np.linalg.norm(base) / np.linalg.norm(flight))
-    if abs(along) < 0.7:
-        return "across track"
-    return "left looks backward" if along > 0 else "left looks forward"
-
-
-def _grow(
-    points: _Points, checks: list[_Points], surface: _Points, rotation: Floats
-) -> tuple[tuple[ImageModel, ImageModel], float]:
-    """The smallest spline that is good enough, else the best; with its rms y-parallax in px.
-
-    That is the worst rms of several sets of points that did not make the fit.
-    """
-    best: tuple[ImageModel, ImageModel] | None = None
-    best_rms = np.inf
-    for n in SIZES:
-        models = _fit_images(points, surface, rotation, n)
-        rms = max(float(np.sqrt(np.mean(_parallax(*models, check) ** 2))) for check in checks)
-        gain = 1.0 - rms / best_rms
-        if best is None or gain > 0:
-            best, best_rms = models, rms
-        if best_rms <= GOOD_RMS or gain < 0.1:
-            break
-    assert best is not None
-    return best, best_rms
 
 
 def _grid(
     left: ImageModel,
     right: ImageModel,
     sizes: tuple[tuple[int, int], tuple[int, int]],
-    points: _Points,
+    points: Points,
     names: tuple[str, str],
 ) -> tuple[int, int, tuple[int, int], tuple[float, float]]:
     """Origin (x0, y0), shape (rows, cols) of the common grid, and the disparity range in px.
@@ -377,7 +55,7 @@ def _grid(
     d = left.forward(*points.left)[0] - right.forward(*points.right)[0]
     bounds = []
     for model, size in zip((left, right), sizes):
-        col, row = _frame(size, 129)
+        col, row = frame(size, 129)
         bounds.append(np.array(model.forward(col, row)))
     (xl, yl), (xr, yr) = bounds
     x0 = int(np.floor(max(xl.min(), xr.min() + d.min())))
@@ -404,7 +82,7 @@ def _figures(parallax: Floats) -> dict[str, Any]:
 def _scales(model: ImageModel, size: tuple[int, int], name: str) -> list[float]:
     """Smallest and largest scale (epipolar px per image px) of a model over an image's frame."""
     slopes = np.array(
-        [forward_with_slopes(model.packed, c, r)[2:] for c, r in zip(*_frame(size, 17))]
+        [forward_with_slopes(model.packed, c, r)[2:] for c, r in zip(*frame(size, 17))]
     ).reshape(-1, 2, 2)
     determinants = np.linalg.det(slopes)
     if determinants.min() * determinants.max() <= 0:
@@ -422,23 +100,21 @@ def _report(
     right: ImageModel,
     sizes: tuple[tuple[int, int], tuple[int, int]],
     names: tuple[str, str],
-    in_frames: _Points,
-    in_box: _Points | None,
+    in_frames: Points,
+    in_box: Points | None,
 ) -> dict[str, Any]:
     """Quality of the image models on points that did not make the fit."""
     return {
         "y_parallax_over_fit_box": (
-            None if in_box is None else _figures(_parallax(left, right, in_box))
+            None if in_box is None else _figures(y_parallax(left, right, in_box))
         ),
-        "y_parallax_over_image_footprints": _figures(_parallax(left, right, in_frames)),
+        "y_parallax_over_image_footprints": _figures(y_parallax(left, right, in_frames)),
         "scale_left": _scales(left, sizes[0], names[0]),
         "scale_right": _scales(right, sizes[1], names[1]),
     }
 
 
-def _px_per_m(
-    left: ImageModel, right: ImageModel, points: _Points, reference: float
-) -> list[float]:
+def _px_per_m(left: ImageModel, right: ImageModel, points: Points, reference: float) -> list[float]:
     """Mean, smallest and largest ratio of disparity to height above the reference, px per m."""
     rise = points.ground[2] - reference
     far = np.abs(rise) > 5.0
@@ -466,29 +142,29 @@ def fit_epipolar(
     Raises InputError if the images do not overlap or see the ground from one direction.
     """
     sizes = (left_size, right_size)
-    box, rpc_heights = _common_box(left, right)
+    box, rpc_heights = common_box(left, right)
     low, high = height_range or rpc_heights
     low, high = min(low, reference_height - 10.0), max(high, reference_height + 10.0)
-    overlap = _overlap(left, right, sizes, reference_height, (low, high), names)
-    convergence = _convergence(left, right, overlap, reference_height, names)
-    rotation, angle = _rotation(left, right, overlap, reference_height)
+    overlap = find_overlap(left, right, sizes, reference_height, (low, high), names)
+    convergence = convergence_angle(left, right, overlap, reference_height, names)
+    rotation, angle = find_rotation(left, right, overlap, reference_height)
 
-    heights, check_heights = _steps(low, high, 7, 0.0), _steps(low, high, 6, 0.07)
+    heights, check_heights = steps(low, high, 7, 0.0), steps(low, high, 6, 0.07)
     at_reference = np.array([reference_height])
-    in_frames = _of_frames(left, right, sizes, heights, 11)
-    check_frames = _of_frames(left, right, sizes, check_heights, 14)
-    surface = _of_frames(left, right, sizes, at_reference, 25)
-    in_box = _of_box(left, right, box, heights, 25, 0.0)
-    check_box = _of_box(left, right, box, check_heights, 24, 0.02)
-    defect = _box_defect(left, right, box, in_box, 25 * 25 * heights.size)
+    in_frames = of_frames(left, right, sizes, heights, 11)
+    check_frames = of_frames(left, right, sizes, check_heights, 14)
+    surface = of_frames(left, right, sizes, at_reference, 25)
+    in_box = of_box(left, right, box, heights, 25, 0.0)
+    check_box = of_box(left, right, box, check_heights, 24, 0.02)
+    defect = box_defect(left, right, box, in_box, 25 * 25 * heights.size)
     if not defect:
-        wide = surface + _of_box(left, right, box, at_reference, 25, 0.0)
-        images, rms = _grow(in_box + in_frames, [check_box, check_frames], wide, rotation)
+        wide = surface + of_box(left, right, box, at_reference, 25, 0.0)
+        images, rms = grow(in_box + in_frames, [check_box, check_frames], wide, rotation)
         if rms > ACCEPTED_RMS:
             defect = f"y-parallax of {rms:.3f} px rms where the RPCs are valid"
     if defect:
         log.warning("epipolar model: %s; fitted to the image footprints only", defect)
-        images, rms = _grow(in_frames, [check_frames], surface, rotation)
+        images, rms = grow(in_frames, [check_frames], surface, rotation)
         if rms > ACCEPTED_RMS:
             log.warning("epipolar model: %.3f px rms remain even so", rms)
 
@@ -505,7 +181,7 @@ def fit_epipolar(
         "epipolar_angle_meaning": "direction of +x in the left image, from +col towards +row",
         "disparity_px_per_m": dict(zip(("mean", "min", "max"), ratio)),
         "disparity_range_px": [round(d, 2) for d in disparities],
-        "view_order": _view_order(left, right, overlap, reference_height),
+        "view_order": view_order(left, right, overlap, reference_height),
     }
     reach = in_frames if defect else in_frames + in_box
     low_high = np.concatenate([reach.ground[:2].min(axis=1), reach.ground[:2].max(axis=1)])

@@ -329,18 +329,15 @@ class SensorModel:
         """
         return _batch(localize_points, self._packed, col, row, height)
 
-    def corrected_rpc(
-        self, box: tuple[float, float, float, float, float, float] | None = None
-    ) -> tuple[RPC, float]:
+    def corrected_rpc(self) -> tuple[RPC, float]:
         """One RPC with the affine folded in, for software that knows RPCs only.
 
-        Denominators are kept and numerators refitted by linear least squares over the ground
-        ``box`` (lon_min, lat_min, lon_max, lat_max, height_min, height_max; default the RPC's
-        own). Returns the RPC and its largest difference from this model in px, on points that
-        did not make the fit.
+        Denominators are kept and numerators refitted by linear least squares over the RPC's ground
+        box. Returns the RPC and its largest difference from this model in px, on points that did
+        not make the fit.
         """
         rpc = self.rpc
-        lon0, lat0, lon1, lat1, h0, h1 = box or rpc.ground_box
+        lon0, lat0, lon1, lat1, h0, h1 = rpc.ground_box
 
         def grid(n: int, inset: float) -> tuple[Floats, Floats, Floats]:
             t = np.linspace(inset, 1 - inset, n)

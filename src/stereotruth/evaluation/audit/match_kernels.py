@@ -7,11 +7,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...alignment.window_fit import (
-    centre,
     gain_and_correlation,
-    normal_equations,
-    solve,
-    solve_two,
+    mean_slopes,
+    misfit,
+    shift,
     weighted_mean,
 )
 
@@ -42,8 +41,8 @@ def _taps(f: float, value: Floats, slope: Floats) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats) -> bool:
-    """Fill ``out`` [3] by value and slopes of a spline; False next to its border and outside."""
+def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats, k: int) -> bool:
+    """Fill ``out[k]`` by value and slopes of a spline; False next to its border and outside."""
     if not (x >= 2.0 and y >= 2.0 and x <= c.shape[1] - 4.0 and y <= c.shape[0] - 4.0):
         return False
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -59,7 +58,29 @@ def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats) -> bool:
         value += taps[2, b] * v
         along += taps[2, b] * s
         down += taps[3, b] * v
-    out[0], out[1], out[2] = value, along, down
+    out[k, 0], out[k, 1], out[k, 2] = value, along, down
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve(a: Floats, b: Floats) -> bool:
+    """Solve a @ p = b, positive definite, in place: p in ``b``, the inverse in ``a``."""
+    n = b.size
+    for k in range(n):
+        pivot = a[k, k]
+        if not pivot > 1e-12:
+            return False
+        a[k, k] = 1.0
+        for j in range(n):
+            a[k, j] /= pivot
+        b[k] /= pivot
+        for i in range(n):
+            if i != k:
+                factor = a[i, k]
+                a[i, k] = 0.0
+                for j in range(n):
+                    a[i, j] -= factor * a[k, j]
+                b[i] -= factor * b[k]
     return True
 
 
@@ -76,31 +97,44 @@ def _match(
     out[:] = np.nan
     taps = np.empty((4, 4))
     a, b, weights = np.empty((n, 3)), np.empty((n, 3)), weight.reshape(-1)
-    moves = np.zeros((n, 2, 4))
-    moves[:, 0, 0], moves[:, 1, 3] = -1.0, 1.0
+    u, v = np.empty(n), np.empty(n)  # from the middle pixel
     total = 0.0
     for k in range(n):
-        u, v = k % side - half, k // side - half
-        if not _sample(left, float(x0 + u), float(y0 + v), taps, a[k]):
+        u[k], v[k] = k % side - half, k // side - half
+        if not _sample(left, x0 + u[k], y0 + v[k], taps, a, k):
             return
-        moves[k, 0, 1], moves[k, 0, 2] = -u, -v
         total += weights[k]
     mean_a = weighted_mean(a, weights)
     at = np.array([d, 0.0, 0.0, p])
-    normal, rhs, middle = np.empty((4, 4)), np.empty(4), np.empty(4)
+    design, middle = np.empty(4), np.empty(4)
     for _ in range(ITERATIONS):
         for k in range(n):
-            u, v = k % side - half, k // side - half
-            x = x0 + u - (at[0] + at[1] * u + at[2] * v)
-            if not _sample(right, x, y0 + v + at[3], taps, b[k]):
+            x = x0 + u[k] - (at[0] + at[1] * u[k] + at[2] * v[k])
+            if not _sample(right, x, y0 + v[k] + at[3], taps, b, k):
                 return
         mean_b = weighted_mean(b, weights)
         gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)
         if np.isnan(gain):
             return
-        misfit = normal_equations(a, b, weights, mean_a, mean_b, gain, moves, normal, rhs, middle)
-        centre(normal, middle, total)
-        if not solve(normal, rhs):
+        normal, rhs = np.zeros((4, 4)), np.zeros(4)
+        middle[:] = 0.0
+        squared = 0.0
+        for k in range(n):
+            w = weights[k]
+            gx, gy = mean_slopes(a, b, gain, k)
+            design[0], design[3] = -gx, gy
+            design[1], design[2] = -gx * u[k], -gx * v[k]
+            miss = misfit(a, b, mean_a, mean_b, gain, k)
+            squared += w * miss * miss
+            for m in range(4):
+                middle[m] += w * design[m]
+                rhs[m] += w * design[m] * miss
+                for q in range(4):
+                    normal[m, q] += w * design[m] * design[q]
+        for m in range(4):  # the means of the windows are taken out: so are those of the design
+            for q in range(4):
+                normal[m, q] -= middle[m] * middle[q] / total
+        if not _solve(normal, rhs):
             return
         at += rhs
         if abs(at[0] - d) > MOVE_PX or abs(at[3] - p) > MOVE_PX:
@@ -109,7 +143,7 @@ def _match(
             return
         if max(abs(rhs[0]), abs(rhs[3])) < CONVERGED:
             out[:4] = at
-            out[4] = np.sqrt(misfit / (total - 4.0) * normal[0, 0])
+            out[4] = np.sqrt(squared / (total - 4.0) * normal[0, 0])
             out[5] = correlation
             return
 
@@ -156,31 +190,26 @@ def _offset(
             if np.isnan(labels[y, x]):
                 continue
             place[n, 0], place[n, 1] = x - labels[y, x], y
-            _sample(left, float(x), float(y), taps, a[n])
+            _sample(left, float(x), float(y), taps, a, n)
             some[n] = weight[j, i]
             total += weight[j, i]
             n += 1
     if total < LABELLED * whole:
         return
     weights = some[:n]
-    moves = np.zeros((n, 2, 2))
-    moves[:, 0, 0], moves[:, 1, 1] = 1.0, 1.0
     mean_a = weighted_mean(a, weights)
     first = labels[y0, x0] - d
     offset, parallax = first, p
-    normal, rhs, middle = np.empty((2, 2)), np.empty(2), np.empty(2)
     for _ in range(ITERATIONS):
         for k in range(n):
-            if not _sample(right, place[k, 0] + offset, place[k, 1] + parallax, taps, b[k]):
+            if not _sample(right, place[k, 0] + offset, place[k, 1] + parallax, taps, b, k):
                 return
         mean_b = weighted_mean(b, weights)
         gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)
         if np.isnan(gain):
             return
-        normal_equations(a, b, weights, mean_a, mean_b, gain, moves, normal, rhs, middle)
-        centre(normal, middle, total)
-        along, down, det = solve_two(normal, rhs)
-        if np.isnan(det):
+        along, down, _ = shift(a, b, weights, mean_a, mean_b, gain, True)
+        if np.isnan(along):
             return
         offset += along
         parallax += down

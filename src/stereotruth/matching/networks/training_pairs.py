@@ -1,8 +1,8 @@
 """Stereo pairs with labels as a PyTorch dataset.
 
     from torch.utils.data import DataLoader
-    from stereotruth.matching.data import LabelledPairs
-    from stereotruth.matching.layouts import StereoDataset
+    from stereotruth.matching.networks.training_pairs import LabelledPairs
+    from stereotruth.dataset.stereo_dataset import StereoDataset
 
     whu = StereoDataset("whu", Path("WHU-Stereo"), "whu", (-128, 64))
     loader = DataLoader(LabelledPairs.of(whu, "train", crop_px=(512, 512)), num_workers=4)

@@ -1,0 +1,42 @@
+"""The programs of bench/ at least start: everything that they take from the package is there."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import runpy
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+PROGRAMS = sorted((Path(__file__).parents[2] / "bench").glob("*.py"))
+
+
+def check(source: str) -> int:
+    """Count the names that a program takes from the package, all of which exist."""
+    tree, modules, count = ast.parse(source), {}, 0
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stereotruth"):
+            for alias in node.names:
+                try:
+                    value = importlib.import_module(f"{node.module}.{alias.name}")
+                except ModuleNotFoundError:
+                    value = getattr(importlib.import_module(node.module), alias.name)
+                if isinstance(value, ModuleType):
+                    modules[alias.asname or alias.name] = value
+                count += 1
+        elif isinstance(node, ast.Constant) and "from stereotruth" in str(node.value):
+            count += check(node.value)  # a program that is handed to other processes
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = modules.get(node.value.id)
+            assert module is None or hasattr(module, node.attr), f"{node.value.id}.{node.attr}"
+    return count
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
+def test_what_is_taken_from_the_package_exists(program: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(program.parent)  # they import each other
+    assert check(program.read_text())
+    assert callable(runpy.run_path(str(program), run_name=program.stem)["main"])
