@@ -336,6 +336,8 @@ def write_tile(folder: Path, scene: Scene, labels: np.ndarray) -> None:
         {
             "tile": "T_1",
             "scene": scene_id,
+            "city": "S",
+            "split": "test",
             "row0": row0,
             "col0": col0,
             "size": size,
