@@ -39,7 +39,7 @@ from stereotruth.evaluation.labels_against_truth import (
     status_names,
 )
 from stereotruth.products.files import replacing
-from stereotruth.products.grids import blocks, require_complete
+from stereotruth.products.grids import blocks, open_grid
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
 # name: occlusion method, representative, thresholds of the correlation (None: it takes none)
@@ -73,7 +73,7 @@ def measure(
         out = Path(folder) / "disparity.zarr"
         with patch("stereotruth.disparity.project.blocks", lambda *_: list(windows)):
             project_scene(made.left, made.right, made.points, out, **settings, workers=workers)
-        store = require_complete(out)
+        store = open_grid(out)
         true = open_truth(truth, store.attrs["epipolar"])
         for window in windows:
             labels = Labels.read(store, *window)

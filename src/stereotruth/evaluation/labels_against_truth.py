@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
+import xarray as xr
 from numpy.typing import NDArray
 
 from ..dataset.manifest import Tile, labelled_tiles
@@ -24,7 +24,7 @@ from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
 from ..products.files import write_json, write_table
-from ..products.grids import blocks, require_complete
+from ..products.grids import blocks, open_grid, require_complete
 from ..products.rasters import read_tile
 
 log = logging.getLogger("stereotruth")
@@ -83,16 +83,17 @@ class Truth:
     kind: Flags
 
     @classmethod
-    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Truth:
+    def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Truth:
         """The truth in a window [rows, cols]."""
+        window = store.isel(y=rows, x=cols)
         flags = ("visible", "hidden", "changed", "changed_right", "covered")
-        surface, edge = store["surface"][rows, cols], store["edge"][rows, cols]
+        surface, edge = window["surface"].values, window["edge"].values
         kind = surface.copy()
         kind[((surface == GROUND) | (surface == ROOF)) & (edge == 1)] = ROOF_EDGE
         kind[(surface == GROUND) & (edge == 2)] = TREE_EDGE
         return cls(
-            *(store[name][rows, cols].astype(np.float64) for name in ("disparity", "y_parallax")),
-            *(store[name][rows, cols] for name in flags),
+            *(window[name].values.astype(np.float64) for name in ("disparity", "y_parallax")),
+            *(window[name].values for name in flags),
             kind=kind,
         )
 
@@ -125,16 +126,17 @@ class Labels:
     uncertainty: Floats
 
     @classmethod
-    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Labels:
+    def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Labels:
         """The labels of a disparity store in a window [rows, cols]."""
+        window = store.isel(y=rows, x=cols)
         return cls(
-            store["disparity"][rows, cols].astype(np.float64),
-            store["status"][rows, cols],
-            store["uncertainty"][rows, cols].astype(np.float64),
+            window["disparity"].values.astype(np.float64),
+            window["status"].values,
+            window["uncertainty"].values.astype(np.float64),
         )
 
 
-def status_names(store: zarr.Group) -> tuple[str, ...]:
+def status_names(store: xr.Dataset) -> tuple[str, ...]:
     """Names of the status values of a disparity store, by value."""
     attrs = store["status"].attrs
     names = dict(zip(attrs["flag_values"], attrs["flag_meanings"].split()))
@@ -250,12 +252,12 @@ class SceneComparison:
         }
 
 
-def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> zarr.Group:
+def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> xr.Dataset:
     """The truth of a synthetic scene on its epipolar grid.
 
     Raises InputError if it is missing, unfinished, or of another epipolar model than ``epipolar``.
     """
-    group = require_complete(path)
+    group = open_grid(path)
     if group.attrs.get("kind") != "truth":
         raise InputError("no truth store", file=path, remedy="run the rule grid_truth")
     if epipolar is not None and group.attrs["epipolar"] != epipolar:
@@ -292,7 +294,7 @@ def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     return result
 
 
-def read_tile_labels(tiles: Path, tile: Tile, store: zarr.Group) -> Labels:
+def read_tile_labels(tiles: Path, tile: Tile, store: xr.Dataset) -> Labels:
     """Labels of an exported tile.
 
     Its right offset is added to the disparity, px of the scene's grid. The uncertainty, which is
@@ -301,7 +303,7 @@ def read_tile_labels(tiles: Path, tile: Tile, store: zarr.Group) -> Labels:
     return Labels(
         read_tile(tiles / tile.row["disp"]) + tile.right_offset_px,
         np.nan_to_num(read_tile(tiles / tile.row["status"])).astype(np.uint8),
-        store["uncertainty"][tile.window].astype(np.float64),
+        store["uncertainty"][tile.window].values.astype(np.float64),
     )
 
 
@@ -323,7 +325,7 @@ def compare_scene(
 
     Raises InputError for missing, unfinished or unlike stores.
     """
-    store = require_complete(disparity)
+    store = open_grid(disparity)
     true = open_truth(truth, store.attrs["epipolar"])
     statuses = status_names(store)
 
