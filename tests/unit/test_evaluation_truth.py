@@ -20,7 +20,7 @@ from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.error_statistics import Calibration, ErrorSum, median_and_nmad
 from stereotruth.errors import InputError
-from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
+from stereotruth.evaluation import checkpoints, geometry_errors, labels_against_truth, scene_warping
 from stereotruth.products import grids
 
 from .test_alignment import LAT, LON, linear_rpc
@@ -249,10 +249,10 @@ def test_errors_are_those_of_the_alignment(scene, tmp_path):
     moved = np.array(scene.model.right_to_epipolar(*(at + np.array([0.3, -0.4])))) - before
     errors = compared(scene, store).whole.figures()["errors"]
     assert errors["bias"] == pytest.approx(-moved[0], abs=0.003)
-    disparity, parallax = labels_against_truth.geometry_errors(wrong, scene.raw_truth, step=5)
+    disparity, parallax = geometry_errors.geometry_errors(wrong, scene.raw_truth, step=5)
     assert disparity.figures()["bias"] == pytest.approx(-moved[0], abs=0.003)
     assert parallax.figures()["rms"] < 1e-3  # measured in the images, whatever the sensor says
-    disparity, parallax = labels_against_truth.geometry_errors(scene.model, scene.raw_truth, step=5)
+    disparity, parallax = geometry_errors.geometry_errors(scene.model, scene.raw_truth, step=5)
     assert disparity.figures()["max"] < 1e-6
     assert disparity.count > 4000
 
