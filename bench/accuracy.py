@@ -29,7 +29,7 @@ from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.error_statistics import LIMITS
 from stereotruth.errors import InputError
-from stereotruth.evaluation import checkpoints, labels_against_truth, scene_warping
+from stereotruth.evaluation import checkpoints, geometry_errors, labels_against_truth, scene_warping
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
@@ -219,7 +219,7 @@ def table4(city: str) -> list[dict[str, str]]:
 
 
 def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
-    disparity, parallax = (e.figures() for e in labels_against_truth.geometry_errors(model, store))
+    disparity, parallax = (e.figures() for e in geometry_errors.geometry_errors(model, store))
     return {
         "scene": scene,
         "alignment": alignment,

@@ -40,7 +40,7 @@ from stereotruth.evaluation.labels_against_truth import (
     status_names,
 )
 from stereotruth.products.files import replacing
-from stereotruth.products.grids import blocks, require_complete
+from stereotruth.products.grids import blocks, open_grid
 from stereotruth.products.provenance import source_digest
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
@@ -83,7 +83,7 @@ def measure(
                 workers=workers,
                 code=source_digest("disparity.project"),
             )
-        store = require_complete(out)
+        store = open_grid(out)
         true = open_truth(truth, store.attrs["epipolar"])
         for window in windows:
             labels = Labels.read(store, *window)

@@ -58,7 +58,7 @@ def write_store(path: Path, layers: dict[str, np.ndarray], **attrs) -> Path:
         group = zarr.open_group(scratch, mode="w", zarr_format=3)
         group.attrs.update(attrs)
         for name, values in layers.items():
-            group.create_array(name, data=values, chunks=(100, 100))
+            group.create_array(name, data=values, chunks=(100, 100), dimension_names=("y", "x"))
     return path
 
 

@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
+import xarray as xr
 from numpy.typing import NDArray
 
 from ..dataset.manifest import Tile, labelled_tiles
-from ..epipolar.model import EpipolarModel
 from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
 from ..products.files import write_json, write_table
-from ..products.grids import blocks, require_complete
+from ..products.grids import blocks, open_grid
 from ..products.rasters import read_tile
 
 log = logging.getLogger("stereotruth")
@@ -83,16 +82,17 @@ class Truth:
     kind: Flags
 
     @classmethod
-    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Truth:
+    def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Truth:
         """The truth in a window [rows, cols]."""
+        window = store.isel(y=rows, x=cols)
         flags = ("visible", "hidden", "changed", "changed_right", "covered")
-        surface, edge = store["surface"][rows, cols], store["edge"][rows, cols]
+        surface, edge = window["surface"].values, window["edge"].values
         kind = surface.copy()
         kind[((surface == GROUND) | (surface == ROOF)) & (edge == 1)] = ROOF_EDGE
         kind[(surface == GROUND) & (edge == 2)] = TREE_EDGE
         return cls(
-            *(store[name][rows, cols].astype(np.float64) for name in ("disparity", "y_parallax")),
-            *(store[name][rows, cols] for name in flags),
+            *(window[name].values.astype(np.float64) for name in ("disparity", "y_parallax")),
+            *(window[name].values for name in flags),
             kind=kind,
         )
 
@@ -125,16 +125,17 @@ class Labels:
     uncertainty: Floats
 
     @classmethod
-    def read(cls, store: zarr.Group, rows: slice, cols: slice) -> Labels:
+    def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Labels:
         """The labels of a disparity store in a window [rows, cols]."""
+        window = store.isel(y=rows, x=cols)
         return cls(
-            store["disparity"][rows, cols].astype(np.float64),
-            store["status"][rows, cols],
-            store["uncertainty"][rows, cols].astype(np.float64),
+            window["disparity"].values.astype(np.float64),
+            window["status"].values,
+            window["uncertainty"].values.astype(np.float64),
         )
 
 
-def status_names(store: zarr.Group) -> tuple[str, ...]:
+def status_names(store: xr.Dataset) -> tuple[str, ...]:
     """Names of the status values of a disparity store, by value."""
     attrs = store["status"].attrs
     names = dict(zip(attrs["flag_values"], attrs["flag_meanings"].split()))
@@ -250,12 +251,12 @@ class SceneComparison:
         }
 
 
-def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> zarr.Group:
+def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> xr.Dataset:
     """The truth of a synthetic scene on its epipolar grid.
 
     Raises InputError if it is missing, unfinished, or of another epipolar model than ``epipolar``.
     """
-    group = require_complete(path)
+    group = open_grid(path)
     if group.attrs.get("kind") != "truth":
         raise InputError("no truth store", file=path, remedy="run the rule grid_truth")
     if epipolar is not None and group.attrs["epipolar"] != epipolar:
@@ -292,7 +293,7 @@ def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     return result
 
 
-def read_tile_labels(tiles: Path, tile: Tile, store: zarr.Group) -> Labels:
+def read_tile_labels(tiles: Path, tile: Tile, store: xr.Dataset) -> Labels:
     """Labels of an exported tile.
 
     Its right offset is added to the disparity, px of the scene's grid. The uncertainty, which is
@@ -301,7 +302,7 @@ def read_tile_labels(tiles: Path, tile: Tile, store: zarr.Group) -> Labels:
     return Labels(
         read_tile(tiles / tile.row["disp"]) + tile.right_offset_px,
         np.nan_to_num(read_tile(tiles / tile.row["status"])).astype(np.uint8),
-        store["uncertainty"][tile.window].astype(np.float64),
+        store["uncertainty"][tile.window].values.astype(np.float64),
     )
 
 
@@ -323,7 +324,7 @@ def compare_scene(
 
     Raises InputError for missing, unfinished or unlike stores.
     """
-    store = require_complete(disparity)
+    store = open_grid(disparity)
     true = open_truth(truth, store.attrs["epipolar"])
     statuses = status_names(store)
 
@@ -448,34 +449,3 @@ def evaluate_truth(
         ),
     )
     return result
-
-
-def geometry_errors(
-    model: EpipolarModel, raw_truth: str | Path, *, step: int = 7
-) -> tuple[ErrorSum, ErrorSum]:
-    """How far alignment and epipolar model alone are off: (disparity, y-parallax), px.
-
-    The exact ground points of every ``step``-th raw pixel that both views see go through the
-    pipeline's sensor models. The first is the error of a label on an exact point, compared with
-    the truth of the same pixel; the second the y-parallax of the true correspondences.
-    ``raw_truth``: the truth on the raw left image's grid.
-    """
-    group = require_complete(raw_truth)
-    disparity, parallax = ErrorSum(), ErrorSum()
-    height, width = group["right_col"].shape
-    for top in range(0, height, BLOCK):
-        window = np.s_[top : min(top + BLOCK, height)]
-        thin = np.s_[-top % step :: step, ::step]
-        seen = np.asarray(group["visible_right"][window])[thin] == 1
-        row, col = np.mgrid[window, 0:width]
-        row, col = row[thin][seen].astype(float), col[thin][seen].astype(float)
-        lon, lat, h, right_col, right_row = (
-            np.asarray(group[name][window], dtype=np.float64)[thin][seen]
-            for name in ("lon", "lat", "height", "right_col", "right_row")
-        )
-        x_left, y_left = model.left_to_epipolar(col, row)
-        x_right, y_right = model.right_to_epipolar(right_col, right_row)
-        found = model.ground_to_epipolar(lon, lat, h)
-        disparity.add(found[0] - found[2] - (x_left - x_right))
-        parallax.add(y_right - y_left)
-    return disparity, parallax

@@ -12,7 +12,7 @@ from ..dataset.warped_tile import WarpedTile
 from ..epipolar.warping import CorrelationSum, agreement, warp_window
 from ..errors import InputError
 from ..products.files import replacing
-from ..products.grids import blocks, require_complete
+from ..products.grids import blocks, open_grid
 
 BLOCK = 1024  # px
 
@@ -37,17 +37,17 @@ def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> Sc
 
     Raises InputError for unfinished stores.
     """
-    left_image, right_image = (require_complete(path)["image"] for path in (left, right))
-    labels = require_complete(disparity)["disparity"]
+    left_image, right_image = (open_grid(path)["image"] for path in (left, right))
+    labels = open_grid(disparity)["disparity"]
     if not left_image.shape == right_image.shape == labels.shape:
         raise InputError(
             "images and disparity differ in size", file=disparity, remedy="run project again"
         )
     total = SceneWarping()
     for rows, cols in blocks(labels.shape, BLOCK):
-        values = labels[rows, cols].astype(np.float64)
+        values = labels[rows, cols].values.astype(np.float64)
         warped = warp_window(right_image, values, rows, cols)
-        reference = left_image[rows, cols].astype(np.float64)
+        reference = left_image[rows, cols].values.astype(np.float64)
         labelled = int(np.isfinite(values).sum())
         total.merge(
             SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))

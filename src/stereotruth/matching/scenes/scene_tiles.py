@@ -23,7 +23,7 @@ SAME_PX, OTHER_PX = 2.0, 4.0
 
 
 def _padded(part: Any, window: Window, shape: tuple[int, int]) -> NDArray[Any]:
-    """A part that :func:`.tiling.inside` gave as the whole window, 0 beyond the ``shape``."""
+    """A part as :func:`.tiling.inside` gives it as the whole window, 0 beyond the image."""
     part = np.asarray(part)
     sizes = tuple(w.stop - w.start for w in window)
     if part.shape[:2] == sizes:
