@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -35,7 +36,14 @@ def sample(image, x, y):
     return map_coordinates(image, [y + 64, x + 64], order=5, mode="wrap")
 
 
-def make(seed=0, *, noise=3.0, shift=(0.0, 0.0), tilt=0.0, size=SIZE, offset=0.0, slope=SLOPE):
+def make(seed=0, **options):
+    """A scene of its own, to be spoiled, see :func:`made`."""
+    found = made(seed, **options)
+    return replace(found, **{name: array.copy() for name, array in vars(found).items()})
+
+
+@cache
+def made(seed=0, *, noise=3.0, shift=(0.0, 0.0), tilt=0.0, size=SIZE, offset=0.0, slope=SLOPE):
     """``shift``: the right image's content moves by this much (x, y) against labels and rows.
 
     ``tilt``: of the rows along x, px from the middle to the edge. ``offset`` of all

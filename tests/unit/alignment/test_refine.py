@@ -21,6 +21,7 @@ from stereotruth.errors import InputError
 from ...synthetic.box_scene import write_points
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
 from ...synthetic.images import write_image
+from ...synthetic.pictures import colours_in, read_picture, share_of
 from ...synthetic.textured_pair import NONE, SIZE, TRUE, start, surface
 
 SHIFT = np.array([0.0, 0.0, 1.0])
@@ -222,6 +223,11 @@ def test_json_keeps_the_refinement(found, tmp_path):
         rows = list(csv.DictReader(stream))
     assert len(rows) == refined.refinement["tie_points"]
     assert sum(row["used"] == "yes" for row in rows) == refined.refinement["used"]
-    assert files[2].stat().st_size > 10_000
+    picture = read_picture(files[2])
+    assert picture.shape[:2] == pytest.approx((10.0 * 110, 11.5 * 110), rel=0.1)
+    upper = picture[: picture.shape[0] // 2]
+    assert share_of(upper, "C0") > 1e-3  # arrows of the sites
+    assert colours_in(picture[picture.shape[0] // 2 :]) > 0.01  # and histograms below
     write_refinement(replace(refined, refinement={"applied": False, "reason": "x"}), None, *files)
     assert len(files[1].read_text().splitlines()) == 1
+    assert colours_in(read_picture(files[2])) == 0  # nothing but its title

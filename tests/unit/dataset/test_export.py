@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import rasterio
 
+from stereotruth.dataset.quick_looks import SPLIT_COLOURS
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.splits import shared_ground
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.errors import InputError
 
+from ...synthetic.pictures import colours_in, read_picture, share_of
 from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -46,8 +48,15 @@ def test_folder_is_as_the_contract_says(exported: tuple[Path, dict]) -> None:
             assert float(row["disparity_mean_px"]) == pytest.approx(np.nanmean(disparity), abs=1e-3)
             assert abs(np.nanmean(disparity)) < 0.51  # less than the offset's rounding
             assert np.array_equal(np.isfinite(disparity), read(folder / row["status"]) == 1)
-    assert (folder.parent / "coverage.png").stat().st_size > 10_000
-    assert (folder.parent / "contact.png").stat().st_size > 10_000
+    coverage = read_picture(folder.parent / "coverage.png")
+    assert (coverage[0, 0] == 255).all()
+    assert share_of(coverage, (0.45, 0.62, 1.0)) > 0.1  # labelled ground
+    for split in ("train", "val", "test"):
+        assert share_of(coverage, SPLIT_COLOURS[split]) > 1e-4
+    contact = read_picture(folder.parent / "contact.png")
+    assert contact.shape[1] == pytest.approx(13.0 * 110, rel=0.1)
+    assert contact.shape[0] > 2.2 * 110 * summary["labelled_pairs"] / 2 * 0.8
+    assert 0.05 < colours_in(contact) < 0.5  # a third of it shows disparities
     assert not list(folder.parent.glob("*.partial"))
     assert any("labelled pairs" in line for line in summary_lines(summary, folder))
 

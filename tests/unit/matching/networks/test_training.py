@@ -23,6 +23,7 @@ from stereotruth.matching.networks.training_settings import TrainingSettings
 from stereotruth.matching.networks.training_state import start
 from stereotruth.matching.networks.weights import SavedNetwork, load_weights, save_weights
 
+from ....synthetic.pictures import read_picture, share_of
 from ....synthetic.small_pairs import RANGE
 
 pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
@@ -53,7 +54,11 @@ def test_training_lowers_the_loss_and_keeps_the_best(
     assert json.loads((out / "training.json").read_text())["best"] == summary["best"]
     assert summary["parameters"] == 621380 and summary["pairs"] == {"train": 3, "val": 1}
     assert load_weights(out / "best.pt")[2]["code"] == "x"
-    assert (out / "curves.png").stat().st_size > 1000
+    picture = read_picture(out / "curves.png")
+    assert picture.shape[1] == pytest.approx(7 * 110, rel=0.1) and (picture[0, 0] == 255).all()
+    middle = picture.shape[1] // 2  # a curve of the loss, and one of the error beside it
+    assert share_of(picture[:, :middle], "C0") > 1e-3 > share_of(picture[:, :middle], "C1")
+    assert share_of(picture[:, middle:], "C1") > 1e-3 > share_of(picture[:, middle:], "C0")
 
 
 SCRIPT = """
@@ -62,6 +67,7 @@ from pathlib import Path
 from stereotruth.matching.layouts import StereoDataset
 from stereotruth.matching.networks import Model
 from stereotruth.matching.training import Training, train
+from ....synthetic.pictures import read_picture, share_of
 if __name__ == "__main__":
     root, out = map(Path, sys.argv[1:])
     train(

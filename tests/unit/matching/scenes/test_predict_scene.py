@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from stereotruth.products.grids import Layer, building, create_grid, open_grid
 from ....synthetic.images import textured
 from ....synthetic.stores import Killed, tree
 
-SHAPE = (600, 900)
+SHAPE = (540, 800)
 SETTINGS = {"kind": "sgm", "mode": "sgbm"}
 GIVEN = {
     "method": "sgm",
@@ -66,6 +67,13 @@ def fresh(images, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("fresh") / "sgm.zarr"
     predict(*images, out, **GIVEN, workers=1)
     return out
+
+
+@pytest.fixture
+def carried(fresh, tmp_path) -> Path:
+    """The scene with its finished pieces, in a folder of its own."""
+    shutil.copytree(fresh.parent, tmp_path, dirs_exist_ok=True)
+    return tmp_path / fresh.name
 
 
 def tiles_made(monkeypatch, stop_after: int | None = None) -> list[tuple[int, int]]:
@@ -139,9 +147,8 @@ def test_a_killed_job_goes_on_where_it_was(images, fresh, tmp_path, monkeypatch,
     assert tree(out) == tree(fresh)
 
 
-def test_a_lost_block_needs_the_tiles_around_it(images, fresh, tmp_path, monkeypatch):
-    out = tmp_path / "sgm.zarr"
-    predict(*images, out, **GIVEN)
+def test_a_lost_block_needs_the_tiles_around_it(images, fresh, carried, tmp_path, monkeypatch):
+    out = carried
     (tmp_path / ".sgm.zarr.work" / "store" / "disparity" / "c" / "2" / "3").write_bytes(b"spoilt")
     made = tiles_made(monkeypatch)
     predict(*images, out, **GIVEN)
@@ -157,9 +164,8 @@ def test_a_lost_block_needs_the_tiles_around_it(images, fresh, tmp_path, monkeyp
         {"disparity_range": (-16, 48)},
     ],
 )
-def test_other_code_settings_or_range_make_all_anew(images, fresh, tmp_path, monkeypatch, other):
-    out = tmp_path / "sgm.zarr"
-    predict(*images, out, **GIVEN)
+def test_other_code_settings_or_range_make_all_anew(images, carried, monkeypatch, other):
+    out = carried
     made = tiles_made(monkeypatch)
     predict(*images, out, **{**GIVEN, **other})
     assert len(made) == 12
