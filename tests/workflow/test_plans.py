@@ -156,4 +156,4 @@ def test_code_digests_name_the_modules_that_the_scripts_import(project):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth."):
                 module = node.module.removeprefix("stereotruth.")
                 # who reports and records does not change what is computed
-                assert module in covered | {"runlog", "provenance", "workers"}, (rule, module)
+                assert module in covered | {"job", "products.provenance"}, (rule, module)
