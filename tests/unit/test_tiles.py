@@ -30,7 +30,6 @@ from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.errors import InputError
 from stereotruth.products.grids import Layer, building, create_grid
 from stereotruth.products.rasters import write_tiff
-from stereotruth.settings import fields_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -154,7 +153,9 @@ COUNTS = {"training": 600, "validation": 80, "testing": 200}
 def run(scenes, out: Path, **options) -> dict:
     """Export with other settings than the configuration's; ``options``: settings and the rest."""
     given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
-    settings = {name: given.pop(name) for name in list(given) if name in fields_of(Settings)}
+    settings = {
+        name: given.pop(name) for name in list(given) if name in Settings.__dataclass_fields__
+    }
     return export_city("Town", "TN", scenes, out, settings=Settings(**settings), **COUNTS | given)
 
 

@@ -30,7 +30,7 @@ rule align:
     params:
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
-        code=source_digest("alignment.align_report"),
+        code=source_digest("alignment.align", "alignment.align_report"),
     message:
         "Aligning scene {wildcards.scene} to its ground control points"
     script:

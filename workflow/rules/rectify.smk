@@ -19,7 +19,12 @@ rule rectify:
         mem_mb=2000,
         runtime=120,
     params:
-        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.label_uncertainty"),
+        code=source_digest(
+            "epipolar.rectify",
+            "epipolar.fit",
+            "alignment.aligned_pair",
+            "alignment.label_uncertainty",
+        ),
     message:
         "Making epipolar images of scene {wildcards.scene}"
     script:
@@ -45,7 +50,12 @@ rule rectify_strip:
         runtime=60,
     params:
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
-        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.label_uncertainty"),
+        code=source_digest(
+            "epipolar.rectify",
+            "epipolar.fit",
+            "alignment.aligned_pair",
+            "alignment.label_uncertainty",
+        ),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"
     script:

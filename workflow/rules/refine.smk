@@ -30,7 +30,7 @@ rule refine:
         runtime=30,
     params:
         strict=SETTINGS.strict,
-        code=source_digest("alignment.refine_report"),
+        code=source_digest("alignment.refine", "alignment.refine_report"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:
