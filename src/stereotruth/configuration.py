@@ -26,7 +26,8 @@ from .matching.benchmark.settings import Settings as Benchmark
 from .matching.networks.training_settings import Training
 from .matching.scenes.settings import Predict
 from .report.settings import Settings as Report
-from .settings import Flag, Key, Text, Unit, Whole, check, fields_of, nested, settings, values_of
+from .settings import Flag, Text, Unit, Whole, settings
+from .settings_text import Key, check, fields_of, nested, values_of
 from .sheets import City, Scene
 from .simulate.settings import Settings as Simulate
 

@@ -8,22 +8,9 @@ the reference table from them.
 
 from __future__ import annotations
 
-import difflib
-import re
-import types
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    TypeVar,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-)
+from importlib import import_module
+from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from pydantic import (
     AfterValidator,
@@ -55,7 +42,8 @@ class Unit:
     text: str
 
 
-def _odd(value: int) -> int:
+def is_odd(value: int) -> int:
+    """The value; ValueError if it is even."""
     if value % 2 == 0:
         raise ValueError("should be odd")
     return value
@@ -68,7 +56,7 @@ def each_once(values: Values) -> Values:
     return values
 
 
-Odd = Annotated[Whole, AfterValidator(_odd)]
+Odd = Annotated[Whole, AfterValidator(is_odd)]
 Share = Annotated[Number, Field(ge=0, le=1), Unit("share")]
 Range = Annotated[tuple[Whole, Whole], Unit("px, px")]  # the second is excluded
 
@@ -93,179 +81,11 @@ def settings(made: Class | None = None, *, more: bool = False) -> Any:
         try:
             init(self, *args, **values)
         except ValidationError as error:
-            problem, remedy = complaint(error, found)
+            # by its name, so that the words of errors do not enter the code digests of stages
+            words = import_module("stereotruth.settings_text")
+            problem, remedy = words.complaint(error, found)
             raise InputError(problem, remedy=remedy) from None
 
     __init__.__signature__ = getattr(init, "__signature__", None)
     found.__init__ = __init__
     return found
-
-
-AT_FIRST = re.compile("^(Input|String|Tuple|Dictionary|Value error,) ")  # of pydantic's messages
-ALTERNATIVE = re.compile(r"int|float|str|bool|constrained-\w+|(dict|tuple|literal)\[.*\]|\[key\]")
-
-
-class Key(NamedTuple):
-    """One key: its name with dots, type, and what its docstring says ("" if it has none)."""
-
-    name: str
-    type: Any
-    metadata: Sequence[Any]
-    meaning: str
-
-
-def fields_of(of: Any) -> dict[str, Key]:
-    """The keys of a class of settings by the names that the user writes."""
-    found = {}
-    for name, info in of.__pydantic_fields__.items():
-        key = info.alias or name
-        parents = (vars(c).get("__pydantic_fields__", {}).get(name) for c in of.__mro__)
-        said = next((f.description for f in parents if f and f.description), "")
-        meaning = " ".join(said.split())
-        found[key] = Key(key, info.annotation, info.metadata, meaning)
-    return found
-
-
-def _unwrapped(kind: Any, metadata: Sequence[Any] = ()) -> tuple[list[Any], list[Any]]:
-    """The alternatives of a type, without None, and all that is said of them."""
-    if get_origin(kind) is Annotated:
-        inner, *more = get_args(kind)
-        return _unwrapped(inner, [*metadata, *more])
-    if get_origin(kind) in (Union, types.UnionType):
-        kinds, said = [], list(metadata)
-        for one in get_args(kind):
-            if one is not type(None):
-                some, more = _unwrapped(one)
-                kinds += some
-                said += more
-        return kinds, said
-    return [kind], list(metadata)
-
-
-def nested(kind: Any) -> tuple[Any, bool]:
-    """The class of settings that a key's value is made of, or None; whether it is one by name."""
-    for one in _unwrapped(kind)[0]:
-        if get_origin(one) is dict:
-            inner = nested(get_args(one)[1])[0]
-            if inner is not None:
-                return inner, True
-        if hasattr(one, "__pydantic_fields__"):
-            return one, False
-    return None, False
-
-
-def values_of(key: Key) -> str:
-    """Unit, limits and values of a key in a few words, such as ``px, odd, 3 … 31``."""
-    kinds, said = _unwrapped(key.type, key.metadata)
-    words = [of.text for of in said if isinstance(of, Unit)][:1]
-    limits = {}
-    for of in said:
-        for one in getattr(of, "metadata", [of]):
-            for name in ("ge", "gt", "le", "lt", "multiple_of"):
-                if getattr(one, name, None) is not None:
-                    limits[name] = getattr(one, name)
-    if any(getattr(of, "func", None) is _odd for of in said):
-        words.append("odd")
-    low, high = (limits.get(a, limits.get(b)) for a, b in (("ge", "gt"), ("le", "lt")))
-    if high is not None:
-        words.append(f"{low:g} … {high:g}".replace("-", "−"))
-    elif "multiple_of" in limits:
-        words.append(f"multiple of {limits['multiple_of']}")
-    elif "gt" in limits:
-        words.append(f"above {low:g}")
-    elif low is not None and low > 1:
-        words.append(f"{low:g} or more")
-    for one in kinds:
-        if get_origin(one) is Literal:
-            words += [str(value) for value in get_args(one) if value is not None]
-        elif one is bool:
-            words += ["true", "false"]
-    if any(of is type(None) for of in get_args(key.type)) or _allows_none(key.type):
-        words.append("null")
-    return ", ".join(words)
-
-
-def _allows_none(kind: Any) -> bool:
-    if get_origin(kind) is Annotated:
-        return _allows_none(get_args(kind)[0])
-    if get_origin(kind) in (Union, types.UnionType):
-        return any(_allows_none(one) for one in get_args(kind))
-    return kind is type(None) or (get_origin(kind) is Literal and None in get_args(kind))
-
-
-class _Place(NamedTuple):
-    """Where an error lies: names of the keys that lead there, the class, the last known key."""
-
-    names: tuple[str, ...]
-    inside: Any
-    key: Key | None
-    known: str  # the key's full name
-
-
-def _located(of: Any, parts: Sequence[Any]) -> _Place:
-    """What the parts of an error's place mean, of which some only name alternatives of a type."""
-    found, by_name = _Place((), of, None, ""), False
-    for part in parts:
-        if isinstance(part, str) and ALTERNATIVE.fullmatch(part):
-            continue
-        names = (*found.names, str(part))
-        keys = {} if found.inside is None or isinstance(part, int) else fields_of(found.inside)
-        if by_name or part not in keys:
-            found, by_name = found._replace(names=names), False
-            continue
-        key = keys[part]
-        inner, _ = nested(key.type)
-        by_name = any(get_origin(one) is dict for one in _unwrapped(key.type)[0])
-        found = _Place(names, inner or (None if by_name else found.inside), key, ".".join(names))
-    return found
-
-
-def complaint(error: ValidationError, of: Any) -> tuple[str, str]:
-    """What is wrong with the values of a class, and the remedy, in the user's words."""
-    every = error.errors(include_url=False)
-    unknown = [e for e in every if e["type"] == "unexpected_keyword_argument"]
-    if unknown:
-        first = min(unknown, key=lambda e: len(e["loc"]))["loc"][:-1]
-        surplus = sorted(str(e["loc"][-1]) for e in unknown if e["loc"][:-1] == first)
-        place = _located(of, first)
-        known = sorted(fields_of(place.inside))
-        close = difflib.get_close_matches(surplus[0], known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
-        under = f" under {'.'.join(place.names)!r}" if place.names else ""
-        return f"unknown key {', '.join(map(repr, surplus))}{under}", hint
-    of_first = [e for e in every if e["loc"][:1] == every[0]["loc"][:1]]
-    one = max(reversed(of_first), key=lambda e: len(e["loc"]))  # of alternatives the last
-    place = _located(of, one["loc"])
-    name = ".".join(place.names)
-    told = one.get("ctx", {}).get("error")
-    if isinstance(told, InputError):
-        return (f"{name}: " if name else "") + told.problem, told.remedy
-    if one["type"] == "dataclass_type":
-        keys = ", ".join(fields_of(place.inside))
-        return f"{name}: {one['input']!r} has no keys", f"its keys are {keys}"
-    if one["type"] == "missing":
-        return f"{name}: is required", f"add it: {_meaning(place.key)}"
-    said = AT_FIRST.sub("", one["msg"])
-    problem = f"{name or 'value'}: {one['input']!r} {said}"
-    if place.key is None:
-        return problem, "see config/README.md"
-    return problem, f"{place.known} is: {_meaning(place.key)}"
-
-
-def _meaning(key: Key) -> str:
-    return ": ".join(filter(None, (values_of(key), _first(key.meaning))))
-
-
-def _first(meaning: str) -> str:
-    """What stands before the first full stop or semicolon of a meaning."""
-    for mark in (". ", "; "):
-        meaning = meaning.split(mark)[0]
-    return meaning
-
-
-def check(values: Mapping[str, Any], of: Callable[..., Any], file: Any) -> Any:
-    """The settings of a class that the user's values make. InputError names ``file`` and key."""
-    try:
-        return of(**values)
-    except InputError as error:
-        raise InputError(error.problem, file=file, remedy=error.remedy) from None

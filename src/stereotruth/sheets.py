@@ -19,7 +19,8 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from .errors import InputError
-from .settings import Text, Whole, check, settings
+from .settings import Text, Whole, settings
+from .settings_text import check
 
 LIDAR_SUFFIXES = (".las", ".laz")
 

@@ -7,7 +7,7 @@ import pytest
 from stereotruth import sheets
 from stereotruth.configuration import Configuration, with_tables
 from stereotruth.errors import InputError
-from stereotruth.settings import fields_of, nested
+from stereotruth.settings_text import fields_of, nested
 
 ROOT = Path(__file__).parents[2]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"

@@ -139,7 +139,6 @@ def align(
     *,
     model: str = Settings.model,
     scene: str = "",
-    blunder_floor: float = BLUNDER_FLOOR,
     estimator: str = "robust",
     seed: int = 0,
     strict: bool = False,
@@ -148,7 +147,7 @@ def align(
     """Correct the RPCs of a pair by ground control points.
 
     ``model``: affine (6 parameters per image, at least 4 GCPs), similarity (4; 3) or shift (2; 2).
-    A GCP is left out of a view if its studentised residual exceeds ``blunder_floor`` px and 4.5
+    A GCP is left out of a view if its studentised residual exceeds :data:`BLUNDER_FLOOR` px and 4.5
     times the GCPs' robust deviation; up to a third of a view's GCPs. ``estimator`` "opencv" takes
     the inliers of OpenCV's RANSAC at its defaults, as in the paper. ``seed`` is for the samples
     among more than 23 GCPs. The result does not depend on the order of the GCPs. ``strict``
@@ -190,10 +189,10 @@ def align(
         refuse_fit(model, view, points, everything, of)
         system = System.of(model, view.predicted, view.measured)
         if estimator == "opencv":
-            kept = opencv_inliers(model, view.predicted, view.measured, blunder_floor)
+            kept = opencv_inliers(model, view.predicted, view.measured, BLUNDER_FLOOR)
             length, limit = studentised(system, kept), np.inf
         else:
-            kept, length, limit = find_blunders(system, floor=blunder_floor, seed=seed)
+            kept, length, limit = find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)
         views.append(view)
         systems.append(system)
         used.append(kept)
@@ -249,7 +248,7 @@ def align(
         )
     heights = {g.id: g.height for fit in fits for g in fit.gcps if g.used}
     if provenance is None:
-        settings = {"model": model, "estimator": estimator, "blunder_floor_px": blunder_floor}
+        settings = {"model": model, "estimator": estimator, "blunder_floor_px": BLUNDER_FLOOR}
         provenance = describe([points.file, *images], settings, source_digest("alignment.align"))
     return Alignment(
         scene=scene,

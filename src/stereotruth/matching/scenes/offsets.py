@@ -75,14 +75,14 @@ def reduced(image: Any, factor: int) -> NDArray[np.float32]:
 
 
 def coarse_disparity(
-    left: Any, right: Any, search: DisparityRange, reduced_px: int = REDUCED_PX
+    left: Any, right: Any, search: DisparityRange
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], int]:
     """Disparity in px of the full images on the reduced left one, where it has data, its factor.
 
     NaN where semi-global matching finds none.
     """
     longest = max(left.shape[:2])
-    factor = max(1, math.ceil(longest / reduced_px), min(4, longest // 512))
+    factor = max(1, math.ceil(longest / REDUCED_PX), min(4, longest // 512))
     small = [reduced(image, factor) for image in (left, right)]
     bounds = math.floor(search[0] / factor), math.ceil(search[1] / factor) + 1
     matcher = SemiGlobalMatcher(mode="sgbm", uniqueness_percent=10, speckle_px=50)

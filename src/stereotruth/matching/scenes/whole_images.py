@@ -37,14 +37,13 @@ def match(
     block: int = BLOCK_PX,
     overlap: int = OVERLAP_PX,
     offset: str | int | NDArray[np.int64] = 0,
-    search: DisparityRange | None = None,
 ) -> Any:
     """Disparity of whole images [h, w] or [h, w, 3] of one shape, NumPy or Dask; 0 is nodata.
 
     Of NumPy arrays the disparity itself, float32[h, w] px (NaN: invalid); of Dask arrays a lazy
     array in chunks of ``block``, whose memory is that of some tiles. ``offset``: of the right
-    image, px; one for all, one for each block [n, m], or "auto": found from the images within the
-    ``search`` range, see :mod:`.offsets`.
+    image, px; one for all, one for each block [n, m], or "auto": found from the images, see
+    :mod:`.offsets`.
     """
     import dask
     import dask.array as da
@@ -55,7 +54,7 @@ def match(
     tiling = Tiling(tuple(left.shape[:2]), block, overlap)
     scaling = matcher.scaling(left, right)
     if isinstance(offset, str):
-        offset = find_offsets(left, right, tiling, disparity_range, search).offsets
+        offset = find_offsets(left, right, tiling, disparity_range).offsets
     offsets = np.broadcast_to(offset, tiling.count)
     tiles = {}
     for place in tiling.places():

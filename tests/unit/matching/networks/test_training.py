@@ -177,8 +177,10 @@ def test_mistakes_are_named(dataset: StereoDataset, tmp_path: Path) -> None:
         TrainingSettings.of({"epoch": 3})
     with pytest.raises(InputError, match=r"crop_px \[30, 64\]: no multiples of 8 px"):
         train(MODEL, dataset, tmp_path / "net", replace(SHORT, crop_px=(30, 64)))
+    none = replace(SHORT, epochs=1)
+    object.__setattr__(none, "epochs", 0)  # which the configuration refuses
     with pytest.raises(InputError, match="no epoch was done"):
-        train(MODEL, dataset, tmp_path / "net", replace(SHORT, epochs=0))
+        train(MODEL, dataset, tmp_path / "net", none)
     save_weights(
         tmp_path / "p.pt", SavedNetwork("psmnet", RANGE), SavedNetwork("psmnet", RANGE).build(), {}
     )
