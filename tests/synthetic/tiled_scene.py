@@ -15,7 +15,6 @@ from stereotruth.dataset.settings import Limits, Settings
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.products.grids import Layer, building, create_grid
-from stereotruth.settings import fields_of
 
 SIZE = 64
 PIXELS = 360  # side of the original images
@@ -132,7 +131,8 @@ COUNTS = {"training": 600, "validation": 80, "testing": 200}
 def run(scenes, out: Path, **options) -> dict:
     """Export with other settings than the configuration's; ``options``: settings and the rest."""
     given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
-    settings = {name: given.pop(name) for name in list(given) if name in fields_of(Settings)}
+    known = Settings.__dataclass_fields__
+    settings = {name: given.pop(name) for name in list(given) if name in known}
     return export_city("Town", "TN", scenes, out, settings=Settings(**settings), **COUNTS | given)
 
 
