@@ -29,15 +29,15 @@ REACH = {
     "export": {"dataset", "epipolar", "products"},
     "dataset": {"dataset", "products"},
     "grid_truth": {"evaluation", "epipolar", "simulate", "products"},
-    "evaluate_truth": {"evaluation", "dataset", "epipolar", "products"},
-    "evaluate_truth_city": {"evaluation", "dataset", "epipolar", "products"},
+    "evaluate_truth": {"evaluation", "dataset", "products"},
+    "evaluate_truth_city": {"evaluation", "dataset", "products"},
     "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
     "report_city": {"report", "dataset", "epipolar", "products"},
-    "audit": {"evaluation", "dataset", "disparity", "epipolar", "products"},
+    "audit": {"evaluation", "alignment", "dataset", "epipolar", "products"},
     "train": {"matching", "dataset", "products"},
     "match": {"matching", "dataset", "products"},
-    "score": {"matching", "dataset", "disparity", "products"},
-    "benchmark_tables": {"matching", "dataset", "disparity", "products"},
+    "score": {"matching", "dataset", "products"},
+    "benchmark_tables": {"matching", "dataset", "products"},
     "predict_scene": {"matching", "products"},
     "dsm": {"matching", "epipolar", "products"},
 }
@@ -52,7 +52,7 @@ def covered(rule) -> set[str]:
     """All modules that a rule's digests hold, those of every kind of method too."""
     named = {module for modules in rule.digests().values() for module in modules}
     if rule.digest_of_method():
-        named |= {module for module in kinds.MODULES.values() if module}
+        named |= {module for kind in kinds.KINDS.values() for module in kind.modules}
     return set(source_modules(*named))
 
 
