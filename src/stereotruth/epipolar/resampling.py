@@ -36,7 +36,7 @@ TAP_POLYNOMIALS = (
     / 12
 ).astype(np.float32)
 # Unsigned: of signed indices Numba asks whether they count from the end, a quarter slower.
-ONE, TWO, THREE, FOUR, FIVE = np.arange(1, 6, dtype=np.uint64)
+ONE, TWO, THREE, FOUR, FIVE, SIX, SEVEN = np.arange(1, 8, dtype=np.uint64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -107,7 +107,9 @@ def _six_by_six(
     """The value of 6 x 6 taps, from a flat image whose rows are ``width`` samples apart.
 
     ``first`` is the index of the upper-left tap; ``across`` and ``down`` [6, n] are the weights of
-    all px of a row, of which this is the one with number ``k``. NaN in any sample makes NaN.
+    all px of a row, of which this is the one with number ``k``. NaN in any sample makes NaN, and in
+    any of the two to the right of a row: such px always went the way of :func:`_at_an_edge`, whose
+    last bits differ.
     """
     v = down[0, k], down[1, k], down[2, k], down[3, k], down[4, k], down[5, k]
     a = _column(source, first, width, v) * across[0, k]
@@ -116,7 +118,9 @@ def _six_by_six(
     d = _column(source, first + THREE, width, v) * across[3, k]
     e = _column(source, first + FOUR, width, v) * across[4, k]
     f = _column(source, first + FIVE, width, v) * across[5, k]
-    return (a + e + c) + (b + f + d)  # three terms each: the sums need not wait for one another
+    g = _column(source, first + SIX, width, v) * np.float32(0.0)
+    h = _column(source, first + SEVEN, width, v) * np.float32(0.0)
+    return ((a + e) + (c + g)) + ((b + f) + (d + h))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -132,12 +136,12 @@ def _at_an_edge(
 ) -> np.float32:
     """:func:`_six_by_six` where samples are nodata or missing; those without weight do not count.
 
-    (row, col) is the third tap. The same bits as without an edge where all samples are there.
+    (row, col) is the third tap. Samples of less weight than NO_WEIGHT are taken for 0.
     """
     exact_down, exact_across = np.empty(6), np.empty(6)
     tap_weights(f_row[k], -2, 1.0, exact_down)
     tap_weights(f_col[k], -2, 1.0, exact_across)
-    patch = np.zeros(36, np.float32)
+    patch = np.zeros(48, np.float32)  # six rows of eight
     for j in range(6):
         if abs(exact_down[j]) < NO_WEIGHT:
             continue
@@ -147,8 +151,8 @@ def _at_an_edge(
             r, c = row - 2 + j, col - 2 + i
             if r < 0 or c < 0 or r >= source.shape[0] or c >= source.shape[1]:
                 return np.float32(np.nan)
-            patch[6 * j + i] = source[r, c]
-    return _six_by_six(patch, np.uint64(0), np.uint64(6), across, down, k)
+            patch[8 * j + i] = source[r, c]
+    return _six_by_six(patch, np.uint64(0), np.uint64(8), across, down, k)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -204,7 +208,7 @@ def _resample(source: Picture, lattice: Floats, step: int, out: NDArray[np.uint1
                 for k in range(width):
                     c, r = col[k], row[k]
                     value = np.float32(np.nan)
-                    if c >= 2.0 and r >= 2.0 and c <= cols - 4.0 and r <= rows - 4.0:
+                    if c >= 2.0 and r >= 2.0 and c <= cols - 6.0 and r <= rows - 4.0:
                         first = np.uint64((int(r) - 2) * cols + int(c) - 2)
                         value = _six_by_six(flat, first, np.uint64(cols), across, down, k)
                     if np.isnan(value) and (

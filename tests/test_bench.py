@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-PROGRAMS = sorted((Path(__file__).parents[2] / "bench").glob("*.py"))
+PROGRAMS = sorted((Path(__file__).parents[1] / "bench").glob("*.py"))
 
 
 def check(source: str) -> int:
