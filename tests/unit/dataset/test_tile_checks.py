@@ -158,14 +158,13 @@ def test_evaluation_of_a_city(made, tmp_path):
     kinds = {tile["class"] for tile in tiles}
     for kind, colour in curves.items():
         assert (share_of(sift[: sift.shape[0] // 2], colour) > 1e-3) == (kind in kinds)
-    assert share_of(sift[sift.shape[0] // 2 :], "0.85") > 0.01  # cells of few matches
+    assert colours_in(sift[sift.shape[0] // 2 :]) > 1e-3  # maps and their colour bars
     warping = read_picture(files["warping_figure"])
     assert warping.shape[:2] == pytest.approx((3 * 3.7 * 90, 16.0 * 90), rel=0.1)
     middle = warping[len(warping) // 2 - 90 : len(warping) // 2 + 90]
     for part in np.split(middle[:, : warping.shape[1] // 5 * 5], 5, axis=1):
         assert part.std() > 30
-    grey, _, disparity = (warping[:, k * warping.shape[1] // 5 :][:, :150] for k in range(3))
-    assert colours_in(grey) == 0 and colours_in(disparity) > 0.1
+    assert colours_in(warping[:, :150]) == 0 and colours_in(warping) > 0.05  # grey at the left
 
 
 def test_a_line_of_table_4_by_hand():
