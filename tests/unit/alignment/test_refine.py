@@ -227,7 +227,7 @@ def test_json_keeps_the_refinement(found, tmp_path):
     assert picture.shape[:2] == pytest.approx((10.0 * 110, 11.5 * 110), rel=0.1)
     upper = picture[: picture.shape[0] // 2]
     assert share_of(upper, "C0") > 1e-3  # arrows of the sites
-    assert colours_in(picture[picture.shape[0] // 2 :]) > 0.01  # and histograms below
+    assert colours_in(picture[picture.shape[0] // 2 :]) > 2e-3  # and histograms below
     write_refinement(replace(refined, refinement={"applied": False, "reason": "x"}), None, *files)
     assert len(files[1].read_text().splitlines()) == 1
     assert colours_in(read_picture(files[2])) == 0  # nothing but its title

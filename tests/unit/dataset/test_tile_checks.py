@@ -17,7 +17,7 @@ from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
 from stereotruth.evaluation import labels_against_images
 
-from ...synthetic.pictures import colours_in, read_picture, share_of
+from ...synthetic.pictures import colours_in, read_picture
 from ...synthetic.tiled_scene import (
     LAT,
     LON,
@@ -165,18 +165,18 @@ def test_evaluation_of_a_city(made, tmp_path):
     assert 0.3 < float(warped["scene", "s1"]["labelled_share"]) < 0.8
     sift = read_picture(files["sift_figure"])
     assert sift.shape[:2] == pytest.approx((2 * 4.2 * 110, 13.0 * 110), rel=0.1)
-    curves = {"building": "#d62728", "vegetation": "#2ca02c"}
+    red, green, blue = np.moveaxis(sift[: sift.shape[0] // 2].astype(int), 2, 0)
     kinds = {tile["class"] for tile in tiles}
-    for kind, colour in curves.items():
-        assert (share_of(sift[: sift.shape[0] // 2], colour) > 1e-3) == (kind in kinds)
-    assert share_of(sift[sift.shape[0] // 2 :], "0.85") > 0.01  # cells of few matches
+    curves = {"building": red - green > 40, "vegetation": green - np.maximum(red, blue) > 40}
+    for kind, curve in curves.items():
+        assert (curve.mean() > 1e-3) == (kind in kinds)
+    assert colours_in(sift[sift.shape[0] // 2 :]) > 1e-3  # maps and their colour bars
     warping = read_picture(files["warping_figure"])
     assert warping.shape[:2] == pytest.approx((3 * 3.7 * 90, 16.0 * 90), rel=0.1)
     middle = warping[len(warping) // 2 - 90 : len(warping) // 2 + 90]
     for part in np.split(middle[:, : warping.shape[1] // 5 * 5], 5, axis=1):
         assert part.std() > 30
-    grey, _, disparity = (warping[:, k * warping.shape[1] // 5 :][:, :150] for k in range(3))
-    assert colours_in(grey) == 0 and colours_in(disparity) > 0.1
+    assert colours_in(warping[:, :150]) == 0 and colours_in(warping) > 0.05  # grey at the left
 
 
 def test_a_line_of_table_4_by_hand():
