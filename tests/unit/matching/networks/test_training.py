@@ -64,17 +64,17 @@ def test_training_lowers_the_loss_and_keeps_the_best(
 SCRIPT = """
 import sys
 from pathlib import Path
-from stereotruth.matching.layouts import StereoDataset
-from stereotruth.matching.networks import Model
-from stereotruth.matching.training import Training, train
-from ....synthetic.pictures import read_picture, share_of
+from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.matching.networks.training import train
+from stereotruth.matching.networks.training_settings import TrainingSettings
+from stereotruth.matching.networks.weights import SavedNetwork
 if __name__ == "__main__":
     root, out = map(Path, sys.argv[1:])
     train(
-        Model("stereonet", (-16, 16)),
+        SavedNetwork("stereonet", (-16, 16)),
         StereoDataset("small", root, "whu", (-16, 16)),
         out,
-        Training(
+        TrainingSettings(
             epochs=2, crop_px=(32, 64), device="cpu", threads=1, seed=4, checkpoint_minutes=0,
         ),
     )
