@@ -27,10 +27,10 @@ dataset verify: %: $(READY) FORCE
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
 
 test: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup -m "not slow"
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) -m "not slow"
 
 test-all: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) --dist loadgroup
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES)
 
 networks: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'

@@ -6,10 +6,6 @@ import csv
 import json
 import shutil
 
-import pytest
-
-pytestmark = pytest.mark.xdist_group("tiny")
-
 ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 

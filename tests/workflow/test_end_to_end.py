@@ -15,8 +15,6 @@ import rioxarray
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
-pytestmark = pytest.mark.xdist_group("tiny")
-
 STAGES = {"align", "refine", "rectify", "project", "export"}
 
 

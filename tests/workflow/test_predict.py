@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import rasterio
 
 from stereotruth.epipolar.model import EpipolarModel
@@ -13,7 +12,6 @@ from stereotruth.products.grids import open_grid
 
 from ..synthetic.project import TINY
 
-pytestmark = pytest.mark.xdist_group("tiny")
 TARGET = "results/predict/Tiny/Tiny-1/sgm_dsm.tif"
 ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 

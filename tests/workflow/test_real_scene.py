@@ -13,7 +13,6 @@ SCENE = ROOT.parent / "shared" / "real" / "marseille"
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("real"),
     pytest.mark.skipif(not SCENE.is_dir(), reason="the real scene is not beside the project"),
 ]
 

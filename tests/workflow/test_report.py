@@ -9,8 +9,6 @@ import pytest
 
 from ..browser import look, needs_chromium, screenshot
 
-pytestmark = pytest.mark.xdist_group("tiny")
-
 PAGE = "results/report/Tiny/index.html"
 
 

@@ -14,7 +14,7 @@ import pytest
 from ..synthetic.project import MADE, Project
 from .killing import disturb, hashes, kill, start
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+pytestmark = pytest.mark.slow
 ARGUMENTS = ["tiles/Tiny", "--configfile", "tiny.yaml"]
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 

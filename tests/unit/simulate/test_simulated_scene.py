@@ -46,4 +46,5 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.grids",
         "products.locks",
         "products.provenance",
+        "settings",
     }
