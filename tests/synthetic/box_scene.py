@@ -131,3 +131,28 @@ class Scene:
         out = self.folder / name
         self.summary = project_with(*self.images, stores or [self.store], out, **options)
         return open_grid(out)
+
+
+def hidden_truth(scene: Scene) -> np.ndarray:
+    """Pixels of the left image whose surface the box hides from the right camera."""
+    model = scene.model
+    east, north, height = scene.surface
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = model.ground_to_epipolar(lon, lat, height)
+    col, row = model.epipolar_to_right(xy[2], xy[3])
+    hidden = np.zeros(col.size, dtype=bool)
+    low, high = (on_ground(model.right, col, row, h) for h in (HEIGHT, ROOF))
+    for h in np.linspace(HEIGHT, ROOF, 301)[1:]:
+        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
+        inside = (np.abs(e) < HALF[0] - 1e-6) & (np.abs(n) < HALF[1] - 1e-6)
+        hidden |= inside & (h > height.reshape(-1) + 0.11)
+    return hidden.reshape(model.shape)
+
+
+def dilated(mask: np.ndarray, by: int = 1) -> np.ndarray:
+    padded = np.pad(mask, by)
+    out = np.zeros_like(mask)
+    for r in range(2 * by + 1):
+        for c in range(2 * by + 1):
+            out |= padded[r : r + mask.shape[0], c : c + mask.shape[1]]
+    return out

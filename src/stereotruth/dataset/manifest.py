@@ -72,3 +72,8 @@ def labelled_tiles(folder: Path, scene: str) -> list[Tile]:
             "no manifest of tiles", file=manifest, remedy="run the export stage"
         ) from None
     return [tile for tile in tiles if tile.scene == scene and tile.labelled]
+
+
+def carries_label(status: str) -> bool:
+    """Whether pixels of a status have a label: measured by points in them, or between points."""
+    return status.startswith("labelled")

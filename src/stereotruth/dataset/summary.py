@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from .manifest import carries_label
+
 
 def in_counts(counts: Mapping[str, int]) -> str:
     """Counts in words: 3 train, 1 val."""
@@ -59,7 +61,8 @@ def summarise(
 
 def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
     """What was made and where to look, for the end of a run."""
-    labelled = summary["share_of_pixels"].get("labelled", 0.0)
+    shares = summary["share_of_pixels"]
+    labelled = sum(share for name, share in shares.items() if carries_label(name))
     low, high = summary["disparity_px"]["min"], summary["disparity_px"]["max"]
     lines = [
         f"{summary['city']}: {summary['labelled_pairs']} labelled pairs of "

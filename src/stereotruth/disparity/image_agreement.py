@@ -10,6 +10,7 @@ one surface only:
 - :func:`outvoted`: whether most pixels of the same surface around a pixel fail the threshold. A
   building that only the LiDAR or only the images have fails as a whole; single failures among
   agreeing pixels, by noise or in shadow, do not;
+- :func:`outvoted_nearby`: the same for what is smaller, by what is usual around it;
 - :func:`supported`: whether enough of the eight neighbours carry the same surface. Which surface
   the centre of a pixel sees is least certain where neighbours differ.
 
@@ -49,37 +50,70 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _outvoted(
-    against: Singles, disparity: Singles, voters: Singles, slope: Singles, out: Bools
+def _surface_mean(
+    values: Singles,
+    disparity: Singles,
+    voters: Singles,
+    slope: Singles,
+    reach: int,
+    every: int,
+    out: Singles,
 ) -> None:
-    """``voters``: disparity of the pixels that vote, else NaN; ``against``: 1 or 0."""
+    """``voters``: disparity of the pixels that count, else NaN."""
     rows, cols = disparity.shape
     surface = np.empty(3 * BLOCK, np.float32)
-    votes = np.empty(2 * BLOCK, np.float32)
+    sums = np.empty(2 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
         for x0 in range(0, cols, BLOCK):
             size = min(BLOCK, cols - x0)
             surface_of_row(disparity, slope, y, x0, size, surface)
-            votes[:] = zero
-            for step_down in range(-VOTE_PX, VOTE_PX + 1, VOTE_STEP):
+            sums[:] = zero
+            for step_down in range(-reach, reach + 1, every):
                 b = y + step_down
                 if b < 0 or b >= rows:
                     continue
                 down = np.float32(step_down)
-                for step in range(-VOTE_PX, VOTE_PX + 1, VOTE_STEP):
+                for step in range(-reach, reach + 1, every):
                     across, tolerance = np.float32(step), tolerance_px(step_down, step)
                     first, end = columns_inside(x0, size, cols, step)
                     d = voters[b, x0 + step + first : x0 + step + end]
-                    no = against[b, x0 + step + first : x0 + step + end]
-                    p, s = surface[first:], votes[first:]
+                    value = values[b, x0 + step + first : x0 + step + end]
+                    p, s = surface[first:], sums[first:]
                     for k in range(d.size):
                         plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
                         same = one if abs(d[k] - plane) <= tolerance else zero
                         s[k] += same
-                        s[BLOCK + k] += same * no[k]
+                        s[BLOCK + k] += same * value[k]
             for k in range(size):
-                out[y, x0 + k] = 2 * votes[BLOCK + k] > votes[k]
+                out[y, x0 + k] = sums[BLOCK + k] / sums[k]
+
+
+def surface_mean(
+    values: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    reach: int = VOTE_PX,
+    every: int = VOTE_STEP,
+) -> Singles:
+    """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
+
+    ``disparity`` (px) and its ``slope`` [2, h, w] tell what belongs to a surface. Pixels up to
+    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value.
+    """
+    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
+    known = np.isfinite(values)
+    out = np.empty(disparity.shape, dtype=np.float32)
+    _surface_mean(
+        np.where(known, values, 0).astype(np.float32),
+        disparity,
+        np.where(known, disparity, np.float32(np.nan)),
+        np.ascontiguousarray(slope, dtype=np.float32),
+        reach,
+        every,
+        out,
+    )
+    return out
 
 
 def outvoted(
@@ -92,16 +126,27 @@ def outvoted(
 
     ``disparity`` (px) and its ``slope`` [2, h, w] tell what belongs to a surface.
     """
-    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    out = np.empty(disparity.shape, dtype=np.bool_)
-    _outvoted(
-        (correlation < threshold).astype(np.float32),
-        disparity,
-        np.where(np.isfinite(correlation), disparity, np.float32(np.nan)),
-        np.ascontiguousarray(slope, dtype=np.float32),
-        out,
-    )
-    return out
+    against = np.where(np.isfinite(correlation), correlation < threshold, np.nan)
+    return surface_mean(against, disparity, slope) > 0.5
+
+
+def outvoted_nearby(
+    correlation: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    threshold: float,
+    share: float,
+    reach: int,
+) -> Bools:
+    """Pixels [h, w] within ``reach`` px of which most correlate less than is usual around there.
+
+    That is less than ``threshold``, or than a ``share`` of the mean over their surface up to
+    VOTE_PX off: noise lowers both. Small things are found that :func:`outvoted` lets their
+    surroundings outvote.
+    """
+    least = np.fmax(share * surface_mean(correlation, disparity, slope), threshold)
+    against = np.where(np.isfinite(correlation), correlation < least, np.nan)
+    return surface_mean(against, disparity, slope, reach, 1) > 0.5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

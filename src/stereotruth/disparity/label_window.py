@@ -15,11 +15,14 @@ of its point that got furthest:
 
 So the method ``correlation`` is the paper's filter, ``geometric`` is visibility in both views from
 the points, ``both`` is geometric, and what the images contradict is changed; ``none`` is neither.
+With ``fill`` the surface between the points takes the place of 2. in all but the agreement of the
+images, and gives labels where no point falls (:mod:`.surface_between`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,23 +30,27 @@ from numpy.typing import NDArray
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .hidden_pixels import Surface, SurfaceBuilder, hidden_pixels
-from .image_agreement import outvoted, supported, warp_to_left
+from .image_agreement import outvoted, outvoted_nearby, supported, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .paper_correlation import correlate
 from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
 from .pixel_points import Collection, PixelPoints
+from .point_triangles import VertexBuilder, Vertices
 from .point_windows import Box, Reach
 from .scene_inputs import SceneInputs
 from .seen_surface import seen_surface
 from .settings import Settings
-from .status import WATER_CLASS, Status
+from .smooth_triangles import ground_surface
+from .status import WATER_CLASS, Status, is_labelled
+from .surface_between import between_labels, surface_between
 
 Floats = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
+USUAL_SHARE = 0.8  # of the correlation around: with less, a pixel between points disagrees
 
 
 def label_window(
@@ -66,6 +73,8 @@ def label_window(
     if found is None:
         return None
     points, local, surface = found
+    if isinstance(surface, Vertices):
+        return _between_points(scene, points, local, surface, left, right, wide)
     use, edge = np.ones(points.points.size, dtype=np.bool_), None
     if settings.uses_seen_surface:
         use, edge = seen_surface(points, settings.edge_margin_px)
@@ -84,7 +93,7 @@ def label_window(
     labels = _labels(scene, pixels, status == Status.LABELLED, wide)
     agreement = pixels.correlation
     if settings.method == "both":
-        agreement = _test_agreement(settings, labels, pixels, status, left, right, wide)
+        agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
     if settings.uses_geometry:
         known = np.where(status == Status.LABELLED, labels.disparity, np.nan)
         alone = np.isfinite(known) & ~supported(known, status != Status.NO_POINTS)
@@ -93,6 +102,39 @@ def label_window(
     status[few] = Status.BELOW_MINIMUM_COUNT
     layers = _layers(scene, pixels, labels, agreement, status, wide)
     return layers, _counts(points, pixels, status, margin)
+
+
+def _between_points(
+    scene: SceneInputs,
+    points: PixelPoints,
+    local: LocalProjection,
+    vertices: Vertices,
+    left: Patch,
+    right: Patch,
+    wide: Window,
+) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
+    """As :func:`label_window`, with labels between the points, too."""
+    settings, px_per_m = scene.settings, scene.rays.px_per_m
+    first = wide[0].start, wide[1].start
+    use, _ = seen_surface(points, settings.edge_margin_px)
+    pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
+    own = _labels(scene, pixels, pixels.count >= max(settings.min_points, 1), wide)
+    surface = ground_surface(vertices, scene.scale, px_per_m)
+    between = surface_between(surface, local, first, points.shape, px_per_m)
+    labels, status = between_labels(between, own, left, right, first)
+    status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
+    measured = status == Status.LABELLED
+    pixels = replace(
+        pixels,
+        count=np.where(measured, pixels.count, 0),
+        highest=np.where(measured, pixels.highest, between.height),
+        surface_class=np.where(measured, pixels.surface_class, between.surface_class),
+    )
+    agreement = pixels.correlation
+    if settings.method == "both":
+        agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
+    layers = _layers(scene, pixels, labels, agreement, status, wide)
+    return layers, _counts(points, pixels, status, settings.margin)
 
 
 def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Patch]:
@@ -116,8 +158,11 @@ def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Pat
 
 def _collect(
     scene: SceneInputs, strips: Sequence[Box], wide: Window, left: Patch, right: Patch
-) -> tuple[PixelPoints, LocalProjection, Surface | None] | None:
-    """The points of a window by pixel, and the surface of all points around; None if none."""
+) -> tuple[PixelPoints, LocalProjection, Surface | Vertices | None] | None:
+    """The points of a window by pixel, and the surface of all points around; None if none.
+
+    With ``fill``, the vertices of that surface.
+    """
     if not strips:
         return None
     box = [step(strip[k] for strip in strips) for k, step in enumerate((min, min, max, max))]
@@ -131,8 +176,10 @@ def _collect(
     local = LocalProjection.of(scene.pair.model, (*low, low_h), (*high, high_h))
     first = wide[0].start, wide[1].start
     collection = Collection(shape, first, (low[0], low[1]), left, right)
-    builder = None
-    if scene.settings.uses_geometry:
+    builder = vertices = None
+    if scene.settings.fills:
+        vertices = VertexBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
+    elif scene.settings.uses_geometry:
         builder = SurfaceBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
     for strip in strips:
         for store in scene.stores:
@@ -143,7 +190,13 @@ def _collect(
                 collection.add(*lattice, points.classification[where], local.at_points(*lattice))
                 if builder is not None:
                     builder.add(*lattice)
-    surface = None if builder is None else builder.built()
+                if vertices is not None:
+                    # Later returns of a pulse lie below what the cameras see.
+                    top = points.return_number[where] <= 1
+                    classes = points.classification[where][top]
+                    vertices.add(*(values[top] for values in lattice), classes)
+    made = builder or vertices
+    surface = None if made is None else made.built()
     points = collection.sorted()
     if points.points.size == 0 and not points.outside.any():
         return None
@@ -172,7 +225,7 @@ def _labels(scene: SceneInputs, pixels: Pixels, valid: NDArray[np.bool_], wide: 
 
 
 def _test_agreement(
-    settings: Settings,
+    scene: SceneInputs,
     labels: Labels,
     pixels: Pixels,
     status: NDArray[np.uint8],
@@ -181,13 +234,19 @@ def _test_agreement(
     wide: Window,
 ) -> Floats:
     """Correlation of the images over each pixel's surface; sets what has changed in status."""
+    settings = scene.settings
     warped = warp_to_left(right, *wide, labels.disparity)
     top, side = wide[0].start - left.row, wide[1].start - left.col
     shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
     surface = labels.disparity, labels.slope
     found = surface_correlation(shown, warped, *surface, settings.window)
     changed = outvoted(found, *surface, settings.correlation_threshold)
-    changed |= (status == Status.LABELLED) & (pixels.surface_class == WATER_CLASS)
+    if settings.fills:
+        # Points far apart miss what is small: the pixels of one window are asked again.
+        share = 1.0 - (1.0 - USUAL_SHARE) * scene.scale.trust
+        limits = settings.correlation_threshold, share, settings.window // 2
+        changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
+    changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
     return found
 
@@ -214,7 +273,7 @@ def _layers(
         "correlation": correlation[inner],
         "uncertainty": np.sqrt(variance),
     }
-    known = status[inner] == Status.LABELLED
+    known = is_labelled(status[inner])
     result = {name: np.where(known, v, np.nan).astype(np.float32) for name, v in values.items()}
     kept = known | (status[inner] == Status.BELOW_MINIMUM_COUNT)
     count = np.where(kept, np.minimum(pixels.count[inner], 65535), 0)

@@ -6,7 +6,6 @@ import numpy as np
 
 from ..products.grids import Layer
 from .settings import Settings
-from .status import Status
 
 
 def layers(settings: Settings, view: str) -> dict[str, Layer]:
@@ -27,6 +26,16 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
         "both": f"correlation coefficient of {view} and warped {other} image over the pixels of "
         f"the same surface in {settings.window} x {settings.window} px",
     }
+    between, lonely = {}, {}
+    if settings.fills:
+        between = {
+            "between": "where the status is labelled_between, or a point is less sure than those "
+            "around it: linear in the triangle of points that the pixel's centre sees"
+        }
+        lonely = {
+            "edge_in_pixel": "no smooth triangle of points, or a step between points may be "
+            "nearer to one of the cameras",
+        }
     return {
         "disparity": Layer(
             "float32",
@@ -38,7 +47,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
                 "match": f"what the {view} image shows at (x, y), the {other} one shows at "
                 f"({match}, y)",
                 "representative": f"{settings.representative}: {condensed}",
-            },
+            }
+            | between,
         ),
         "status": Layer(
             "uint8",
@@ -46,8 +56,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
             {
                 "units": "1",
                 "long_name": "why a pixel has a label or none",
-                "flag_values": [int(status) for status in Status],
-                "flag_meanings": " ".join(status.name.lower() for status in Status),
+                "flag_values": [int(status) for status in settings.statuses],
+                "flag_meanings": " ".join(status.name.lower() for status in settings.statuses),
                 f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre "
                 "sees",
                 "changed": "LiDAR and images show different surfaces there, or water",
@@ -55,7 +65,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
                 "surfaces",
                 "precedence": f"frame, {view} view, correlation of points; {other} view, edge, "
                 "change, number of points of pixels",
-            },
+            }
+            | lonely,
         ),
         "height": Layer(
             "float32",

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG
 from ..lidar.point_store import PointStore
-from .hidden_pixels import FILL_RADII, Rays
+from .hidden_pixels import Rays
 from .settings import Settings
 from .view_geometry import ViewGeometry
 
@@ -40,12 +40,16 @@ class Reach(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PointWindows:
-    """The points of ``stores`` by windows (rows, cols) of the left epipolar grid."""
+    """The points of ``stores`` by windows (rows, cols) of the left epipolar grid.
+
+    ``halo``: cells around, whose points have a say in what a window shows.
+    """
 
     model: ViewGeometry
     rays: Rays
     stores: tuple[PointStore, ...]
     settings: Settings
+    halo: int
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
@@ -101,8 +105,8 @@ class PointWindows:
 
     @property
     def spare(self) -> Floats:
-        """Degrees (lon, lat) around the ground that a window needs: holes are filled from there."""
-        return (sum(FILL_RADII) + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
+        """Degrees (lon, lat) around the ground that a window needs: its ``halo`` of cells."""
+        return (self.halo + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
 
     def strips(self, rows: slice, cols: slice, reach: Reach) -> list[Box]:
         """Boxes, one for some rows of cells of the stores each, of the points a window needs.

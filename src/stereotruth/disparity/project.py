@@ -34,7 +34,6 @@ from .layers import layers
 from .overlap_check import apart, refuse_apart
 from .scene_inputs import SceneInputs
 from .settings import Settings
-from .status import Status
 
 log = logging.getLogger("stereotruth")
 
@@ -79,7 +78,7 @@ class _Blocks:
             points += found[1]
         arrays = self.scene.pair.arrays(arrays)
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
-        counts = np.bincount(status.reshape(-1), minlength=len(Status))
+        counts = np.bincount(status.reshape(-1), minlength=len(self.scene.settings.statuses))
         out.write((rows, cols), key, arrays, [*counts.tolist(), *points.tolist()])
 
 
@@ -167,7 +166,7 @@ def project_scene(
             "images": [_identity(require_complete(p).attrs) for p in (left_store, right_store)],
             "epipolar": left_attrs["epipolar"],
             "uncertainty": inputs.pair.uncertainty.to_attrs(),
-            "parameters": parameters,
+            "parameters": parameters | ({"scale": asdict(inputs.scale)} if settings.fills else {}),
             "code": code,
         }
     )
@@ -195,21 +194,22 @@ def project_scene(
         if strip is not None:
             return None
         counts = np.sum(unfinished.results(every), axis=0).tolist()
-        pixels = {status.name.lower(): counts[status] for status in Status}
-        in_grid, framed, used = counts[len(Status) :]
+        pixels = {status.name.lower(): counts[status] for status in settings.statuses}
+        in_grid, framed, used = counts[len(settings.statuses) :]
         if framed == 0:
             refuse_apart(tuple(bounds), images, heights, where)
         reached = sum(pixels.values()) - pixels["no_points"] - pixels["out_of_frame"]
+        labelled = pixels["labelled"] + pixels.get("labelled_between", 0)
         summary = {
             "pixels": pixels,
             "points": {"in_grid": in_grid, "in_frame": framed, "used": used},
-            "labelled_share": round(pixels["labelled"] / max(reached, 1), 6),
+            "labelled_share": round(labelled / max(reached, 1), 6),
         }
         unfinished.publish(out, every, attrs | {"summary": summary})
     log.info(
         "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
         settings.method,
-        pixels["labelled"],
+        labelled,
         100.0 * summary["labelled_share"],
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )

@@ -7,14 +7,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from ..lidar.point_store import PointStore
 from ..products.grids import require_complete
-from .hidden_pixels import Rays
+from .hidden_pixels import FILL_RADII, Rays
 from .point_windows import PointWindows
 from .right_view import Pair, seen_from
 from .settings import Settings
+from .smooth_triangles import Scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,19 @@ class SceneInputs:
         return tuple(PointStore(path) for path in self.point_stores)
 
     @cached_property
+    def scale(self) -> Scale:
+        """Of the triangles between the points."""
+        cells = np.concatenate([(s.cell_row << 32) + s.cell_col for s in self.stores])
+        counts = np.concatenate([s.cell_counts for s in self.stores])
+        _, which = np.unique(cells, return_inverse=True)
+        return Scale.of(np.bincount(which, weights=counts), self.rays.cell)
+
+    @property
+    def halo(self) -> int:
+        """Cells around all that a window shows and what hides it, whose points have a say."""
+        return self.scale.halo if self.settings.fills else sum(FILL_RADII)
+
+    @cached_property
     def windows(self) -> PointWindows:
         """Where the points of windows of the pair's left image are."""
-        return PointWindows(self.pair.model, self.rays, self.stores, self.settings)
+        return PointWindows(self.pair.model, self.rays, self.stores, self.settings, self.halo)

@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from ..errors import InputError
 from ..settings import Flag, Number, Odd, Unit, Whole, settings
+from .status import Status
 
 
 @settings
@@ -44,6 +46,15 @@ class Representative:
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
     """a pixel with fewer stays unlabelled"""
 
+    fill: Literal["none", "surface"] = "none"
+    """`none`: a pixel has a label if points fall into it. `surface`: also between points, for LiDAR
+    from 0.25 points/m² on. The points are triangles over the ground; those that go on the plane of
+    their neighbours give labels, all others are swept vertically as what may hide a pixel in either
+    view. The value is always the LiDAR's. Such labels have the status `labelled_between` (9) and an
+    `uncertainty` of their own; pixels with points on the surface keep `labelled` (1). Where a step
+    lies between points, pixels are `edge_in_pixel`. Needs `occlusion.method` geometric or both, and
+    `representative` top"""
+
 
 @settings
 class Project(Representative):
@@ -52,6 +63,20 @@ class Project(Representative):
     right_view: Flag = False
     """also the labels of the right images: `results/project/<City>/<scene>_right.zarr`, and
     `disp_right`, `status_right` of the tiles"""
+
+
+def check_fill(occlusion: Occlusion, project: Representative) -> None:
+    """Raises InputError if labels between points cannot be had with the other keys."""
+    if project.fill == "none" or (
+        occlusion.method in ("geometric", "both") and project.representative == "top"
+    ):
+        return
+    raise InputError(
+        f"project.fill: {project.fill!r} with occlusion.method {occlusion.method!r} and "
+        f"project.representative {project.representative!r}",
+        remedy="what lies between points is hidden by geometry only: take the method both or "
+        "geometric, and the representative top",
+    )
 
 
 @settings
@@ -63,6 +88,19 @@ class Settings(Representative, Occlusion):
         """From the configuration."""
         project = {k: v for k, v in config.get("project", {}).items() if k != "right_view"}
         return cls(**config.get("occlusion", {}), **project)
+
+    def __post_init__(self) -> None:
+        check_fill(self, self)
+
+    @property
+    def fills(self) -> bool:
+        """Whether there are labels between points."""
+        return self.fill != "none"
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Those that occur."""
+        return [s for s in Status if self.fills or s != Status.LABELLED_BETWEEN]
 
     @property
     def uses_seen_surface(self) -> bool:
@@ -88,4 +126,7 @@ class Settings(Representative, Occlusion):
 
         # one for each ring of neighbours: planes, their pooled noise, support
         reach = EDGE + 3
-        return reach + VOTE_PX + self.window // 2 if self.method == "both" else reach
+        if self.method != "both":
+            return reach
+        # windows, votes about them, and what is asked of the votes nearby
+        return reach + VOTE_PX + self.window // 2 * (2 if self.fills else 1)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 WATER_CLASS = 9  # ASPRS
 
 
@@ -19,3 +22,9 @@ class Status(IntEnum):
     OUT_OF_FRAME = 6
     BELOW_MINIMUM_COUNT = 7
     EDGE_IN_PIXEL = 8
+    LABELLED_BETWEEN = 9
+
+
+def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where a status says that there is a label, measured or between points."""
+    return (status == Status.LABELLED) | (status == Status.LABELLED_BETWEEN)

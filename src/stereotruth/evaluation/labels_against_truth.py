@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..dataset.manifest import Tile, labelled_tiles
+from ..dataset.manifest import Tile, carries_label, labelled_tiles
 from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
@@ -172,7 +172,8 @@ class Comparison:
     def figures(self) -> dict[str, Any]:
         """JSON-ready; px and shares 0 … 1 (null where there are no such pixels)."""
         pixels = dict(zip(GROUPS, self.counts.sum(axis=1).tolist()))
-        labelled = dict(zip(GROUPS, self.counts[:, self.statuses.index("labelled")].tolist()))
+        labels = [k for k, name in enumerate(self.statuses) if carries_label(name)]
+        labelled = dict(zip(GROUPS, self.counts[:, labels].sum(axis=1).tolist()))
         return {
             "labels": self.labels,
             "errors": self.errors.figures(),

@@ -137,6 +137,11 @@ class PointStore:
         self._key = cell_key(self.cell_row, self.cell_col)
         self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=self.cell_row[0] - 1))
 
+    @property
+    def cell_counts(self) -> Integers:
+        """Points in each cell."""
+        return np.diff(self._start)
+
     def _cells(self, box: tuple[int, int, int, int]) -> list[tuple[int, int]]:
         """Ranges [first, end) of cells that a lattice box touches, in order."""
         low_col, low_row, high_col, high_row = (value >> CELL_BITS for value in box)

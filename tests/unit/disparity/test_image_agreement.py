@@ -7,7 +7,9 @@ import pytest
 
 from stereotruth.disparity.image_agreement import (
     outvoted,
+    outvoted_nearby,
     supported,
+    surface_mean,
     warp_to_left,
 )
 from stereotruth.disparity.image_patches import read_patch
@@ -111,3 +113,27 @@ def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
     changed = outvoted(correlation, disparity, np.zeros((2, 60, 60)), 0.5)
     assert changed[roof].all()
     assert changed.sum() == 256
+
+
+def test_surface_mean_is_that_of_the_surface() -> None:
+    values = np.ones((60, 60))
+    disparity = np.zeros((60, 60))
+    disparity[:, 30:], values[:, 30:] = 20.0, 5.0
+    values[10, 10] = np.nan
+    level = LEVEL[:, :60, :60]
+    found = surface_mean(values, disparity, level, 4, 1)
+    assert found[:, :30] == pytest.approx(1.0)
+    assert found[:, 30:] == pytest.approx(5.0)
+    assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level)).all()
+
+
+@pytest.mark.parametrize("usual", [0.95, 0.65])
+def test_what_is_small_is_told_by_what_is_usual_around_it(usual) -> None:
+    """A tree of 6 px amid agreeing ground: its surroundings outvote it, its own pixels do not."""
+    correlation = np.full((80, 80), usual)
+    correlation[37:43, 37:43] = 0.45
+    level = np.zeros((80, 80))
+    assert not outvoted(correlation, level, LEVEL, 0.5).any()
+    found = outvoted_nearby(correlation, level, LEVEL, 0.0, 0.8, 2)
+    assert found[39:41, 39:41].all()
+    assert not found[:30].any() and not found[:, 50:].any()

@@ -23,11 +23,11 @@ from stereotruth.lidar.point_store import PointStore, query_points
 from stereotruth.products.grids import open_grid
 
 from ...synthetic.box_scene import (
-    HALF,
     ROOF,
     UTM,
     Scene,
-    on_ground,
+    dilated,
+    hidden_truth,
     project_with,
     seen,
     write_image,
@@ -148,31 +148,6 @@ def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
         off[representative + " wrong"] = (known & ~right).sum()
     assert off["top"] == 0
     assert off["top wrong"] < 0.5 * off["paper wrong"]
-
-
-def hidden_truth(scene: Scene) -> np.ndarray:
-    """Pixels of the left image whose surface the box hides from the right camera."""
-    model = scene.model
-    east, north, height = scene.surface
-    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
-    xy = model.ground_to_epipolar(lon, lat, height)
-    col, row = model.epipolar_to_right(xy[2], xy[3])
-    hidden = np.zeros(col.size, dtype=bool)
-    low, high = (on_ground(model.right, col, row, h) for h in (HEIGHT, ROOF))
-    for h in np.linspace(HEIGHT, ROOF, 301)[1:]:
-        e, n = low + (high - low) * ((h - HEIGHT) / (ROOF - HEIGHT))
-        inside = (np.abs(e) < HALF[0] - 1e-6) & (np.abs(n) < HALF[1] - 1e-6)
-        hidden |= inside & (h > height.reshape(-1) + 0.11)
-    return hidden.reshape(model.shape)
-
-
-def dilated(mask: np.ndarray, by: int = 1) -> np.ndarray:
-    padded = np.pad(mask, by)
-    out = np.zeros_like(mask)
-    for r in range(2 * by + 1):
-        for c in range(2 * by + 1):
-            out |= padded[r : r + mask.shape[0], c : c + mask.shape[1]]
-    return out
 
 
 @pytest.mark.parametrize("method", ["geometric", "both"])
@@ -394,7 +369,7 @@ def test_attributes_and_summary(plane) -> None:
         assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
     status = grid["status"]
     assert status.attrs["flag_values"] == list(range(9))
-    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status]
+    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Settings().statuses]
     assert grid.attrs["provenance"]["code"] == "abc"
     assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}
     assert EpipolarModel.from_dict(grid.attrs["epipolar"]).shape == plane.model.shape

@@ -1,0 +1,458 @@
+"""The points of a window as triangles over the ground: vertices on a lattice, exact Delaunay.
+
+The surface between points (:mod:`.surface_between`) needs triangles that are the same
+whatever window, block, file or order the points come in. So
+
+- a ground cell (:class:`.hidden_pixels.Rays`, half a pixel) gives one vertex at most: the
+  mean of its top surface. This bounds memory at any density, averages noise where points are dense,
+  and no two vertices coincide;
+- plan places are integers (``PART`` parts of a cell) counted on the global lattice, and every test
+  is exact in 64-bit integers;
+- cocircular vertices, as a gridded cloud has them everywhere, are told apart by a symbolic
+  perturbation: each vertex is lifted off the paraboloid by an infinitesimal that grows with its
+  rank, south to north, then west to east (Devillers and Teillaud 2011). The Delaunay triangulation
+  is then unique, so that neither the order of insertion nor the window leaves a trace;
+- a triangle of the points of a window is one of all points if its circumcircle lies where all
+  points are known. Triangles of a greater circumradius than asked for are dropped, and a window
+  knows the points of a halo around what it needs (:class:`.smooth_triangles.Scale`).
+
+Why not Qhull (scipy.spatial.Delaunay): it joggles or merges cocircular points as their order has
+it, and took 13 us a vertex where the insertion here takes 1.3 us.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..lidar.lattice import LATTICE_M
+from .hidden_pixels import SURFACE_PX, Rays
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+
+PART_BITS = 5
+PART = 1 << PART_BITS  # parts of a cell along each axis: 1 cm at pixels of 0.65 m
+# Beyond this width (parts of a cell) the sums of the exact tests could leave 64 bits: 8000 px.
+MAX_PARTS = 1 << 19
+_SPLIT = 20  # bits; see _in_circle
+_LOWEST = np.iinfo(np.int32).min
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """Vertices [n] of a window, in the order of their cells: south to north, then west to east.
+
+    ``lon_q``, ``lat_q``, ``h_q`` int64: global lattice steps; ``x``, ``y`` int64: plan place in
+    parts of a cell from the window's first cell; ``surface_class`` ASPRS class of the highest point
+    of the cell; ``count`` of points that the vertex is the mean of.
+    """
+
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+    x: Ints
+    y: Ints
+    surface_class: NDArray[np.uint8]
+    count: Steps
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _raise_tops(
+    lon_q: Ints,
+    lat_q: Ints,
+    h_q: Ints,
+    classes: NDArray[np.uint8],
+    first: tuple[int, int],
+    cell: tuple[int, int],
+    top: Steps,
+    top_class: NDArray[np.uint8],
+    index: Steps,
+    place: Steps,
+) -> None:
+    """Takes points into the greatest height of each cell, of equals the greater class.
+
+    Fills ``index`` (cell) and ``place`` [n, 3] (steps from the cell's corner, height).
+    """
+    cols = top.shape[1]
+    for k in range(lon_q.size):
+        i, j = lon_q[k] // cell[0] - first[0], lat_q[k] // cell[1] - first[1]
+        index[k] = j * cols + i
+        place[k, 0] = lon_q[k] % cell[0]
+        place[k, 1] = lat_q[k] % cell[1]
+        place[k, 2] = h = np.int32(h_q[k])
+        if h > top[j, i]:
+            top[j, i] = h
+            top_class[j, i] = classes[k]
+        elif h == top[j, i]:
+            top_class[j, i] = max(top_class[j, i], classes[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_tops(
+    index: Steps, place: Steps, top: Steps, number: Steps, tolerance: int, sums: Ints
+) -> None:
+    """Per vertex, of the points at most ``tolerance`` below the cell's top: count, sums."""
+    for k in range(index.size):
+        if top[index[k]] - place[k, 2] <= tolerance:
+            n = number[index[k]]
+            sums[n, 0] += 1
+            sums[n, 1] += place[k, 0]
+            sums[n, 2] += place[k, 1]
+            sums[n, 3] += place[k, 2]
+
+
+@dataclass(eq=False)
+class VertexBuilder:
+    """Takes points, block by block, into the vertices of a box of the ground.
+
+    ``low``, ``high``: corners (lattice lon, lat), both included; no point lies beyond.
+    """
+
+    rays: Rays
+    low: tuple[int, int]
+    high: tuple[int, int]
+    parts: list[tuple[Steps, Steps]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.first = tuple(int(q // side) for q, side in zip(self.low, self.rays.cell))
+        last = [q // side for q, side in zip(self.high, self.rays.cell)]
+        shape = last[1] - self.first[1] + 1, last[0] - self.first[0] + 1
+        self.top = np.full(shape, _LOWEST, dtype=np.int32)
+        self.top_class = np.zeros(shape, dtype=np.uint8)
+
+    def add(self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8]) -> None:
+        """Points by lattice coordinates and class."""
+        index, place = np.empty(lon_q.size, np.int32), np.empty((lon_q.size, 3), np.int32)
+        _raise_tops(
+            lon_q,
+            lat_q,
+            h_q,
+            surface_class,
+            self.first,
+            self.rays.cell,
+            self.top,
+            self.top_class,
+            index,
+            place,
+        )
+        self.parts.append((index, place))
+
+    def built(self) -> Vertices:
+        """The vertices of all that was taken."""
+        top = self.top.reshape(-1)
+        cells = np.flatnonzero(top > _LOWEST)
+        number = np.full(top.size, -1, np.int32)
+        number[cells] = np.arange(cells.size, dtype=np.int32)
+        sums = np.zeros((cells.size, 4), np.int64)
+        tolerance = int(SURFACE_PX / self.rays.px_per_m / LATTICE_M)
+        for index, place in self.parts:
+            _sum_tops(index, place, top, number, tolerance, sums)
+        self.parts = []
+        n, lon, lat, height = sums.T
+        n = np.maximum(n, 1)
+        row, col = np.divmod(cells, self.top.shape[1])
+        side = self.rays.cell
+        within = lon // n, lat // n
+        return Vertices(
+            lon_q=(col + self.first[0]) * side[0] + within[0],
+            lat_q=(row + self.first[1]) * side[1] + within[1],
+            h_q=height // n,
+            x=(col << PART_BITS) + within[0] * PART // side[0],
+            y=(row << PART_BITS) + within[1] * PART // side[1],
+            surface_class=self.top_class.reshape(-1)[cells],
+            count=n.astype(np.int32),
+        )
+
+
+# ---------------------------------------------------------------------------------- exact tests
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn(x: Ints, y: Ints, a: int, b: int, c: int) -> int:
+    """Twice the signed area of a triangle: positive if it runs counter-clockwise."""
+    return (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_circle(x: Ints, y: Ints, a: int, b: int, c: int, d: int) -> bool:
+    """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie.
+
+    Of products of 40 and 40 bits the first factor is split, so that no sum leaves 64 bits.
+    """
+    ax, ay = x[a] - x[d], y[a] - y[d]
+    bx, by = x[b] - x[d], y[b] - y[d]
+    cx, cy = x[c] - x[d], y[c] - y[d]
+    p, q, r = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+    u, v, w = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
+    mask = (1 << _SPLIT) - 1
+    low = (p & mask) * u + (q & mask) * v + (r & mask) * w
+    high = (p >> _SPLIT) * u + (q >> _SPLIT) * v + (r >> _SPLIT) * w + (low >> _SPLIT)
+    if high != 0:
+        return high > 0
+    if low & mask:
+        return True
+    # Cocircular: the vertex of the highest rank is lifted most. Its cofactor decides, or, where
+    # the other three lie on a line, that of the next.
+    s0, s1, s2, s3 = a, b, c, d
+    for _ in range(3):  # four entries, sorted by falling rank
+        if _before(x, y, s0, s1):
+            s0, s1 = s1, s0
+        if _before(x, y, s1, s2):
+            s1, s2 = s2, s1
+        if _before(x, y, s2, s3):
+            s2, s3 = s3, s2
+    for s in (s0, s1, s2, s3):
+        if s == d:
+            return False  # -turn(a, b, c), which is not 0
+        if s == a:
+            sign = _turn(x, y, d, b, c)
+        elif s == b:
+            sign = _turn(x, y, a, d, c)
+        else:
+            sign = _turn(x, y, a, b, d)
+        if sign != 0:
+            return sign > 0
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
+    return y[s] < y[t] or (y[s] == y[t] and x[s] < x[t])
+
+
+# ------------------------------------------------------------------------------------ insertion
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
+    """Order of insertion: rounds that double the vertices, each along a Hilbert curve."""
+    for k in range(x.size):
+        mixed = (np.uint64(x[k]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
+            np.uint64(y[k]) * np.uint64(0xC2B2AE3D27D4EB4F)
+        )
+        mixed ^= mixed >> np.uint64(29)
+        mixed *= np.uint64(0xBF58476D1CE4E5B9)
+        mixed ^= mixed >> np.uint64(32)
+        level = np.int64(0)
+        while level < 12 and mixed & np.uint64(1):
+            mixed >>= np.uint64(1)
+            level += 1
+        px, py = x[k], y[k]
+        key = np.int64(0)
+        side = np.int64(1) << (bits - 1)
+        while side > 0:
+            rx = np.int64(1) if px & side else np.int64(0)
+            ry = np.int64(1) if py & side else np.int64(0)
+            key = (key << 2) | ((3 * rx) ^ ry)
+            if ry == 0:
+                if rx == 1:
+                    px, py = ~px, ~py
+                px, py = py, px
+            side >>= 1
+        out[k] = ((12 - level) << 40) | key
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _replace(neighbour: Steps, t: int, old: int, new: int) -> None:
+    if t >= 0:
+        for i in range(3):
+            if neighbour[t, i] == old:
+                neighbour[t, i] = new
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set(corner: Steps, neighbour: Steps, t: int, v: tuple, n: tuple) -> None:
+    corner[t, 0], corner[t, 1], corner[t, 2] = v
+    neighbour[t, 0], neighbour[t, 1], neighbour[t, 2] = n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _insert_all(x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps) -> int:
+    """Delaunay triangles of vertices inside the square of the last four; returns their number.
+
+    ``corner`` [m, 3] vertices counter-clockwise, ``neighbour`` [m, 3]: the triangle opposite each.
+    """
+    size = x.size
+    south_west, south_east, north_east, north_west = size - 4, size - 3, size - 2, size - 1
+    _set(corner, neighbour, 0, (south_west, south_east, north_east), (-1, 1, -1))
+    _set(corner, neighbour, 1, (south_west, north_east, north_west), (-1, -1, 0))
+    n = 2
+    t = 0
+    stack = np.empty(1024, np.int32)
+    for p in order:
+        while True:  # walk
+            edge = -1
+            moved = False
+            for i in range(3):
+                a, b = corner[t, (i + 1) % 3], corner[t, (i + 2) % 3]
+                turn = _turn(x, y, a, b, p)
+                if turn < 0:
+                    t = neighbour[t, i]
+                    moved = True
+                    break
+                if turn == 0:
+                    edge = i
+            if not moved:
+                break
+        if edge < 0:
+            a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
+            na, nb, nc = neighbour[t, 0], neighbour[t, 1], neighbour[t, 2]
+            t1, t2 = n, n + 1
+            n += 2
+            _set(corner, neighbour, t, (a, b, p), (t1, t2, nc))
+            _set(corner, neighbour, t1, (b, c, p), (t2, t, na))
+            _set(corner, neighbour, t2, (c, a, p), (t, t1, nb))
+            _replace(neighbour, na, t, t1)
+            _replace(neighbour, nb, t, t2)
+            stack[0], stack[1], stack[2] = t, t1, t2
+            waiting = 3
+        else:
+            c, a, b = corner[t, edge], corner[t, (edge + 1) % 3], corner[t, (edge + 2) % 3]
+            opposite_a, opposite_b = neighbour[t, (edge + 1) % 3], neighbour[t, (edge + 2) % 3]
+            u = neighbour[t, edge]
+            k = 0
+            while neighbour[u, k] != t:
+                k += 1
+            d = corner[u, k]
+            # u runs (d, b, a)
+            beyond_b, beyond_a = neighbour[u, (k + 1) % 3], neighbour[u, (k + 2) % 3]
+            t2, u2 = n, n + 1
+            n += 2
+            _set(corner, neighbour, t, (c, a, p), (u2, t2, opposite_b))
+            _set(corner, neighbour, t2, (b, c, p), (t, u, opposite_a))
+            _set(corner, neighbour, u, (d, b, p), (t2, u2, beyond_a))
+            _set(corner, neighbour, u2, (a, d, p), (u, t, beyond_b))
+            _replace(neighbour, opposite_a, t, t2)
+            _replace(neighbour, beyond_b, u, u2)
+            stack[0], stack[1], stack[2], stack[3] = t, t2, u, u2
+            waiting = 4
+        while waiting:
+            waiting -= 1
+            t = stack[waiting]
+            u = neighbour[t, 2]
+            if u < 0:
+                continue
+            k = 0
+            while neighbour[u, k] != t:
+                k += 1
+            q = corner[u, k]
+            a, b = corner[t, 0], corner[t, 1]
+            if not _in_circle(x, y, a, b, p, q):
+                continue
+            # u runs (q, b, a)
+            beyond_b, beyond_a = neighbour[u, (k + 1) % 3], neighbour[u, (k + 2) % 3]
+            before_a, before_b = neighbour[t, 0], neighbour[t, 1]
+            _set(corner, neighbour, t, (a, q, p), (u, before_b, beyond_b))
+            _set(corner, neighbour, u, (q, b, p), (before_a, t, beyond_a))
+            _replace(neighbour, before_a, t, u)
+            _replace(neighbour, beyond_b, u, t)
+            if waiting + 2 > stack.size:
+                longer = np.empty(2 * stack.size, np.int32)
+                longer[: stack.size] = stack
+                stack = longer
+            stack[waiting], stack[waiting + 1] = t, u
+            waiting += 2
+    return n
+
+
+# ------------------------------------------------------------------------------------ triangles
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Triangles [m], counter-clockwise over the ground, in the order of their vertices.
+
+    ``corner`` int32[m, 3]: vertices, the first of the lowest number; ``neighbour`` int32[m, 3]: the
+    triangle opposite each vertex, -1 for none; ``radius`` float64[m]: of the circumcircle, in parts
+    of a cell.
+    """
+
+    corner: Steps
+    neighbour: Steps
+    radius: Floats
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _circumradius(x: Ints, y: Ints, a: int, b: int, c: int) -> float:
+    u, v = float(x[b] - x[a]), float(y[b] - y[a])
+    s, t = float(x[c] - x[b]), float(y[c] - y[b])
+    p, q = float(x[a] - x[c]), float(y[a] - y[c])
+    sides = (u * u + v * v) * (s * s + t * t) * (p * p + q * q)
+    return np.sqrt(sides) / (2.0 * float(_turn(x, y, a, b, c)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tidy(
+    x: Ints, y: Ints, corner: Steps, neighbour: Steps, vertices: int, limit: float
+) -> tuple[Steps, Steps, Floats]:
+    """Triangles of circumradius up to ``limit`` without the square's corners, in order."""
+    size = len(corner)
+    radius = np.empty(size)
+    start = np.zeros(vertices + 1, np.int32)
+    for t in range(size):
+        while corner[t, 1] < corner[t, 0] or corner[t, 2] < corner[t, 0]:
+            for array in (corner, neighbour):
+                array[t, 0], array[t, 1], array[t, 2] = array[t, 1], array[t, 2], array[t, 0]
+        radius[t] = np.inf
+        if max(corner[t, 1], corner[t, 2]) < vertices:
+            radius[t] = _circumradius(x, y, corner[t, 0], corner[t, 1], corner[t, 2])
+        if radius[t] <= limit:
+            start[corner[t, 0] + 1] += 1
+    for v in range(vertices):
+        start[v + 1] += start[v]
+    kept = start[vertices]
+    order = np.empty(kept, np.int32)
+    filled = start.copy()
+    for t in range(size):
+        if radius[t] <= limit:
+            v = corner[t, 0]
+            k = filled[v]
+            filled[v] += 1
+            while k > start[v] and corner[order[k - 1], 1] > corner[t, 1]:
+                order[k] = order[k - 1]
+                k -= 1
+            order[k] = t
+    place = np.full(size, -1, np.int32)
+    for k in range(kept):
+        place[order[k]] = k
+    corners, neighbours, radii = (
+        np.empty((kept, 3), np.int32),
+        np.empty((kept, 3), np.int32),
+        np.empty(kept),
+    )
+    for k in range(kept):
+        t = order[k]
+        radii[k] = radius[t]
+        for i in range(3):
+            corners[k, i] = corner[t, i]
+            other = neighbour[t, i]
+            neighbours[k, i] = place[other] if other >= 0 else -1
+    return corners, neighbours, radii
+
+
+def triangulate(x: Ints, y: Ints, max_radius: float) -> Triangles:
+    """Delaunay triangles of circumradius up to ``max_radius`` of distinct integer places [n].
+
+    ``x``, ``y`` int64 [n], no smaller than 0, sorted by (y, x) as far as the result's order is to
+    tell something; less than MAX_PARTS apart. ``max_radius`` in the same units.
+    """
+    n = x.size
+    # The square's corners lie beyond all circumcircles that are kept.
+    spare = 2 * int(np.ceil(max_radius)) + 2
+    end = int(max(x.max(initial=0), y.max(initial=0))) + spare
+    if end + spare >= MAX_PARTS:
+        raise ValueError(f"places {end} parts of a cell apart, at most {MAX_PARTS} are exact")
+    every_x = np.concatenate([x, [-spare, end, end, -spare]]).astype(np.int64)
+    every_y = np.concatenate([y, [-spare, -spare, end, end]]).astype(np.int64)
+    keys = np.empty(n, np.int64)
+    _keys(x, y, max(end.bit_length(), 1), keys)
+    corner, neighbour = (np.empty((2 * n + 2, 3), np.int32) for _ in range(2))
+    count = _insert_all(every_x, every_y, np.argsort(keys, kind="stable"), corner, neighbour)
+    return Triangles(
+        *_tidy(every_x, every_y, corner[:count], neighbour[:count], n, float(max_radius))
+    )

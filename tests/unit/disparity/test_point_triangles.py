@@ -1,0 +1,121 @@
+"""Triangles over the ground against Qhull, and the same whatever the order and the window."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from stereotruth.disparity.hidden_pixels import Rays
+from stereotruth.disparity.point_triangles import MAX_PARTS, PART, VertexBuilder, triangulate
+
+
+def places(n: int, side: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct integer places [<= n] in a square, sorted by (y, x)."""
+    key = np.unique(np.random.default_rng(seed).integers(0, side * side, n))
+    return key % side, key // side
+
+
+def corners(triangles, x: np.ndarray, y: np.ndarray) -> set[frozenset[tuple[int, int]]]:
+    """The triangles by the places of their corners."""
+    points = list(zip(x.tolist(), y.tolist()))
+    return {frozenset(points[v] for v in corner) for corner in triangles.corner.tolist()}
+
+
+def test_triangles_are_those_of_qhull() -> None:
+    x, y = places(3000, 4000)
+    found = triangulate(x, y, 300.0)
+    points = np.column_stack([x, y]).astype(float)
+    expected = Delaunay(points).simplices
+    a, b, c = (points[expected[:, k]] for k in range(3))
+    sides = [np.hypot(*(p - q).T) for p, q in ((a, b), (b, c), (c, a))]
+    area = np.abs(np.cross(b - a, c - a))
+    radius = np.prod(sides, axis=0) / (2.0 * area)
+    kept = expected[radius <= 300.0]
+    whole = {frozenset(map(int, corner)) for corner in kept}
+    assert {frozenset(map(int, corner)) for corner in found.corner} == whole
+    assert np.sort(found.radius) == pytest.approx(np.sort(radius[radius <= 300.0]))
+
+
+def test_triangles_turn_left_and_know_their_neighbours() -> None:
+    x, y = places(500, 1000)
+    found = triangulate(x, y, 100.0)
+    for t, (corner, beside) in enumerate(zip(found.corner, found.neighbour)):
+        a, b, c = corner
+        assert (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]) > 0
+        assert a < min(b, c)
+        for k, other in enumerate(beside):
+            if other >= 0:
+                shared = set(corner.tolist()) - {int(corner[k])}
+                assert shared <= set(found.corner[other].tolist())
+                assert t in found.neighbour[other]
+
+
+@pytest.mark.parametrize("gridded", [False, True])
+def test_order_of_points_does_not_matter(gridded: bool) -> None:
+    if gridded:  # all squares are cocircular
+        y, x = (c.reshape(-1) * PART for c in np.mgrid[:40, :40])
+    else:
+        x, y = places(2000, 3000)
+    order = np.random.default_rng(1).permutation(x.size)
+    found, again = triangulate(x, y, 200.0), triangulate(x[order], y[order], 200.0)
+    assert corners(found, x, y) == corners(again, x[order], y[order])
+    if gridded:
+        assert len(found.corner) == 2 * 39 * 39
+
+
+@pytest.mark.parametrize("gridded", [False, True])
+def test_a_window_has_the_triangles_of_the_whole(gridded: bool) -> None:
+    if gridded:
+        y, x = (c.reshape(-1) * PART for c in np.mgrid[:60, :60])
+    else:
+        x, y = places(4000, 2000)
+    limit = 80.0
+    low, high = 600, 1300
+    near = (x >= low) & (x <= high) & (y >= low) & (y <= high)
+    whole, part = triangulate(x, y, limit), triangulate(x[near] - low, y[near] - low, limit)
+    halo = 2 * limit  # the circumcircle of a triangle in here lies in the window
+
+    def inside(found: set[frozenset[tuple[int, int]]]) -> set[frozenset[tuple[int, int]]]:
+        a, b = low + halo, high - halo
+        return {t for t in found if all(a <= u <= b and a <= v <= b for u, v in t)}
+
+    expected = inside(corners(whole, x, y))
+    assert len(expected) > 100
+    assert inside(corners(part, x[near], y[near])) == expected
+
+
+def test_places_in_a_line_have_no_triangles() -> None:
+    x = np.arange(10, dtype=np.int64) * 7
+    assert len(triangulate(x, np.zeros_like(x), 50.0).corner) == 0
+    none = np.empty(0, np.int64)
+    assert len(triangulate(none, none, 50.0).corner) == 0
+
+
+def test_too_wide_a_window_is_refused() -> None:
+    x = np.array([0, MAX_PARTS], dtype=np.int64)
+    with pytest.raises(ValueError, match="exact"):
+        triangulate(x, x, 50.0)
+
+
+def test_vertices_are_means_of_the_tops_of_cells() -> None:
+    rays = Rays(np.zeros((2, 2, 3)), (3000, 2500), 1.0)
+    lon = np.array([6010, 6030, 6020, 9001])
+    lat = np.array([2600, 2700, 2650, 2510])
+    height = np.array([100_000, 100_200, 60_000, 50_000])  # the third lies 4 m below
+    classes = np.array([6, 5, 2, 2], np.uint8)
+    whole = VertexBuilder(rays, (0, 0), (20_000, 20_000))
+    whole.add(lon, lat, height, classes)
+    found = whole.built()
+    assert found.lon_q.tolist() == [6020, 9001]
+    assert found.lat_q.tolist() == [2650, 2510]
+    assert found.h_q.tolist() == [100_100, 50_000]
+    assert found.count.tolist() == [2, 1]
+    assert found.surface_class.tolist() == [5, 2]  # that of the highest
+    other = VertexBuilder(rays, (3000, 2500), (20_000, 20_000))
+    for k in (3, 1, 2, 0):
+        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes)))
+    again = other.built()
+    for name in ("lon_q", "lat_q", "h_q", "surface_class", "count"):
+        assert getattr(again, name).tolist() == getattr(found, name).tolist()
+    assert (found.x - again.x).tolist() == [PART, PART]

@@ -1,0 +1,184 @@
+"""Labels between points on a textured plane with a box, whose exact disparities are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.disparity.hidden_pixels import Rays
+from stereotruth.disparity.label_window import label_window
+from stereotruth.disparity.point_triangles import VertexBuilder
+from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.disparity.settings import Settings
+from stereotruth.disparity.smooth_triangles import STEP_PX, Scale, ground_surface
+from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.errors import InputError
+from stereotruth.lidar.lattice import LATTICE_M
+
+from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
+from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
+
+SPACING = 2.5  # m: one point in 13 px
+FLAT = Rays(np.zeros((2, 2, 3)), (3000, 3000), 1.0)  # cells of 0.33 m at the equator
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("plane"), box=False, spacing=SPACING)
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("box"), box=True, spacing=SPACING)
+
+
+@pytest.mark.parametrize("method", ["geometric", "both"])
+def test_a_plane_is_labelled_between_its_points(plane, method) -> None:
+    grid = plane.project(method=method, fill="surface")
+    disparity, status = grid["disparity"].values, grid["status"].values
+    labelled = is_labelled(status)
+    assert np.array_equal(labelled, np.isfinite(disparity))
+    assert np.abs(disparity - plane.truth)[labelled].max() < 1e-3
+    inner = dilated(dilated(labelled, 2), 2)
+    inner[:20] = inner[-20:] = inner[:, :50] = inner[:, -50:] = False
+    assert inner.sum() > 20_000
+    assert labelled[inner].mean() > 0.999
+    assert 0.04 < (status == Status.LABELLED)[inner].mean() < 0.12
+    assert grid["point_count"].values[status == Status.LABELLED].min() == 1
+    assert grid["point_count"].values[status == Status.LABELLED_BETWEEN].max() == 0
+    assert np.abs(grid["height"].values[labelled] - HEIGHT).max() < 1e-2
+    pixels = plane.summary["pixels"]
+    assert pixels["labelled_between"] == (status == Status.LABELLED_BETWEEN).sum()
+    assert "labelled_between" in grid["status"].attrs["flag_meanings"].split()
+
+
+def test_without_fill_nothing_tells_of_it(plane) -> None:
+    grid = plane.project(method="geometric")
+    assert "labelled_between" not in grid["status"].attrs["flag_meanings"]
+    assert "labelled_between" not in plane.summary["pixels"]
+    assert not (grid["status"].values == Status.LABELLED_BETWEEN).any()
+
+
+@pytest.mark.parametrize("method", ["geometric", "both"])
+def test_nothing_hidden_by_a_box_has_a_label(box, method) -> None:
+    """No hidden pixel, no wall, no label of the wrong surface; what is clear keeps its label."""
+    grid = box.project(method=method, fill="surface")
+    status, disparity = grid["status"].values, grid["disparity"].values
+    labelled = is_labelled(status)
+    hidden = hidden_truth(box)
+    assert hidden.sum() > 800
+    assert not labelled[hidden].any()
+    wall = (box.surface[2] > HEIGHT) & (box.surface[2] < ROOF)
+    assert not labelled[wall].any()
+    # A corner of the roof may reach in between three points of the ground, and no point tells.
+    assert (np.abs(disparity - box.truth) > 1e-3).sum() < 4 * (SPACING / 0.65 / 2) ** 2
+    # The step lies somewhere between points: a distance of points around it is given up, in each
+    # view, and around what the prism over it may hide.
+    reach = int(np.ceil(1.5 * SPACING / 0.65))
+    roof = box.surface[2] == ROOF
+    assert labelled[roof & ~dilated(~roof, reach)].mean() > 0.95  # triangles at its corners fail
+    ground = ~dilated(roof | wall | hidden, reach)
+    ground[:20] = ground[-20:] = ground[:, :80] = ground[:, -80:] = False
+    assert ground.sum() > 5_000
+    assert labelled[ground].mean() > 0.995
+
+
+def test_right_view_is_labelled_between_points_too(box) -> None:
+    east, north, height = seen(box.model, "right", box=True)
+    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
+    xy = box.model.ground_to_epipolar(lon, lat, height)
+    truth = (xy[0] - xy[2]).reshape(box.model.shape)
+    grid = box.project("of_right.zarr", method="both", fill="surface", view="right")
+    labelled = is_labelled(grid["status"].values)
+    assert labelled.sum() > 20_000
+    assert np.abs(grid["disparity"].values - truth)[labelled].max() < 1e-3
+
+
+@pytest.mark.parametrize("view", ["left", "right"])
+def test_any_cut_and_any_order_give_the_same_bytes(box, view) -> None:
+    def scene() -> SceneInputs:
+        settings = Settings(method="both", fill="surface")
+        return SceneInputs(*box.images, (box.store,), settings, view)
+
+    rows, cols = slice(60, 220), slice(70, 250)
+    whole = label_window(scene(), rows, cols)[0]
+    assert is_labelled(whole["status"]).mean() > 0.5
+    part = scene()
+    store = part.stores[0]
+    read = store.query
+
+    def shuffled(*corners: float):
+        points = read(*corners)
+        order = np.random.default_rng(0).permutation(len(points))
+        names = points.__dataclass_fields__
+        return type(points)(*(getattr(points, name)[order] for name in names))
+
+    store.query = shuffled
+    for row, col in ((slice(60, 130), cols), (slice(130, 220), slice(70, 160)),
+                     (slice(130, 220), slice(160, 250))):  # fmt: skip
+        found = label_window(part, row, col)[0]
+        where = np.s_[row.start - 60 : row.stop - 60, col.start - 70 : col.stop - 70]
+        for name, values in found.items():
+            assert values.tobytes() == np.ascontiguousarray(whole[name][where]).tobytes(), name
+
+
+@pytest.mark.parametrize("options", [{"method": "correlation"}, {"representative": "paper"}])
+def test_fill_needs_geometry(options) -> None:
+    with pytest.raises(InputError, match="fill"):
+        Settings(**({"method": "both", "fill": "surface"} | options))
+
+
+def surface_of(height_at, spacing: float = 1.0, side: float = 40.0):
+    """Which triangles of a jittered grid over x, y (m) are smooth, and their corners [m, 3, 2]."""
+    rng = np.random.default_rng(0)
+    x, y = np.mgrid[0:side:spacing, 0:side:spacing].reshape(2, -1)
+    x, y = (c + rng.uniform(-0.3, 0.3, c.size) * spacing + 5.0 for c in (x, y))
+    height = height_at(x, y) + rng.normal(0.0, 0.03, x.size)
+    lon, lat = (np.rint(c / 0.33 * 3000).astype(np.int64) for c in (x, y))
+    builder = VertexBuilder(FLAT, (0, 0), (500_000, 500_000))
+    h = np.rint(height / LATTICE_M).astype(np.int64)
+    builder.add(lon, lat, h, np.full(x.size, 2, np.uint8))
+    per_cell = (0.33 / spacing) ** 2 * (1 << 40) / 9e6
+    found = ground_surface(builder.built(), Scale.of(np.array([per_cell]), FLAT.cell), 1.0)
+    v = found.vertices
+    places = np.stack([v.lon_q, v.lat_q], axis=1) / 3000 * 0.33
+    corner = places[found.triangles.corner]
+    middle = corner.mean(axis=1)
+    inner = (np.abs(middle - 25.0) < 15.0).all(axis=1)
+    return found, corner, inner
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, 1.0])
+def test_slopes_are_smooth_and_noise_is_told(slope) -> None:
+    found, _, inner = surface_of(lambda x, y: slope * x)
+    assert found.smooth[inner].mean() > 0.99
+    assert np.sqrt(np.median(found.noise[inner])) * LATTICE_M == pytest.approx(0.03, rel=0.35)
+
+
+def test_a_gabled_roof_is_smooth_across_its_ridge() -> None:
+    found, _, inner = surface_of(lambda x, y: -0.6 * np.abs(x - 25.0))
+    assert found.smooth[inner].mean() > 0.9
+
+
+@pytest.mark.parametrize("height", [2.0, 30.0])
+@pytest.mark.parametrize("width", [1.2, 8.0])
+def test_a_step_is_smooth_nowhere(height, width) -> None:
+    """A block of one row of points, or of many: no smooth triangle joins its top and its foot."""
+
+    def block(x, y):
+        return np.where(np.abs(x - 25.0) < width / 2, height, 0.0)
+
+    found, corner, inner = surface_of(block)
+    top = np.abs(corner[..., 0] - 25.0) < width / 2
+    spans = top.any(axis=1) & ~top.all(axis=1)
+    assert spans[inner].sum() > 50
+    assert not found.smooth[spans].any()
+    flat = inner & ~top.any(axis=1)
+    assert found.smooth[flat].mean() > 0.95
+
+
+def test_thresholds_follow_the_distance_of_points() -> None:
+    dense, sparse = (Scale.of(np.array([n]), (3000, 3000)) for n in (1e6, 1e3))
+    assert sparse.smooth == pytest.approx(dense.smooth * 11, rel=0.1)
+    assert dense.trust == 1.0 and sparse.trust < 0.5
+    assert STEP_PX <= 0.5  # a label of the wrong surface stays below a pixel
