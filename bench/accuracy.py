@@ -272,19 +272,6 @@ class Made:
         return folder / "truth.zarr"
 
 
-def project_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of project_scene as the workflow would give them."""
-    occlusion, project = config["occlusion"], config["project"]
-    return {
-        "method": occlusion["method"],
-        "window": occlusion["window"],
-        "correlation_threshold": occlusion["correlation_threshold"],
-        "representative": project["representative"],
-        "edge_margin_px": project["edge_margin_px"],
-        "min_points": project["min_points_per_px"],
-    }
-
-
 def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
     """Align with noise-free GCPs, rectify and project again; the disparity store."""
     from stereotruth.disparity.project import project_scene
@@ -317,7 +304,7 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         folder / "right.zarr",
         made.points,
         folder / "disparity.zarr",
-        Settings(**project_settings(config)),
+        Settings.of(config),
         workers=workers,
         code=source_digest("disparity.project"),
     )

@@ -22,6 +22,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -706,12 +707,7 @@ def main() -> int:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.workers])
     arguments.folder.mkdir(parents=True, exist_ok=True)
     config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
-    project = config["project"]
-    settings = dict(config["occlusion"]) | {
-        "pixel_labels": project["representative"],
-        "edge_margin_px": project["edge_margin_px"],
-        "min_points": project["min_points_per_px"],
-    }
+    settings = asdict(Settings.of(config))
     report: dict[str, Any] = {"machine": machine(arguments.workers)}
     print(", ".join(f"{k} {v}" for k, v in report["machine"].items()))
     if not arguments.kernels:

@@ -11,6 +11,7 @@ import logging
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -20,7 +21,6 @@ from accuracy import (
     Made,
     pixels,
     print_table,
-    project_settings,
     read_config,
     scenes_made,
     share,
@@ -102,7 +102,7 @@ def rows_of_city(
         windows = fullest(truth, arguments.blocks)
         for way, (method, representative, thresholds) in WAYS.items():
             for threshold in thresholds:
-                settings = project_settings(config)
+                settings = asdict(Settings.of(config)) | {"fill": "none"}
                 settings |= {"method": method, "representative": representative}
                 if threshold is not None:
                     settings["correlation_threshold"] = threshold
