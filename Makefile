@@ -36,7 +36,7 @@ networks: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
 
 test-cluster: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" tests/cluster/run.sh
