@@ -90,43 +90,13 @@ def _triple(values: Floats, t: Steps) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _nearest_smooth(
-    xy: Floats, corner: Steps, smooth: Bools, first: tuple[int, int], nearest: Floats, shown: Steps
+def _face_in_left(
+    x: tuple, y: tuple, d: tuple, first: tuple[int, int], number: int, nearest: Floats, shown: Steps
 ) -> None:
-    """The smooth triangle of the greatest disparity at each pixel's centre, and that disparity.
+    """Raises ``nearest`` [rows, cols] to a face's disparity, and sets ``shown`` to its ``number``.
 
-    ``xy`` [4, vertices]: places in both images, px. Of equals, the triangle of the lower number.
+    Of faces of equal disparity the first one stays.
     """
-    rows, cols = nearest.shape
-    for t in range(len(corner)):
-        if not smooth[t]:
-            continue
-        x, y, xr = _triple(xy[0], corner[t]), _triple(xy[1], corner[t]), _triple(xy[2], corner[t])
-        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-        gx, gy = _plane(x, y, d)
-        if not np.isfinite(gx + gy):
-            continue
-        top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
-        bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
-        lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
-        for row in range(top, bottom + 1):
-            low, high = _span(x, y, float(row))
-            if not low <= high:
-                continue
-            left = max(int(np.ceil(low)), first[1])
-            right = min(int(np.floor(high)), first[1] + cols - 1)
-            for col in range(left, right + 1):
-                value = d[0] + gx * (col - x[0]) + gy * (row - y[0])
-                value = min(max(value, lowest), highest)
-                j, i = row - first[0], col - first[1]
-                if value > nearest[j, i]:  # -inf at first; of equals the first one stays
-                    nearest[j, i] = value
-                    shown[j, i] = t
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _face_in_left(x: tuple, y: tuple, d: tuple, first: tuple[int, int], nearest: Floats) -> None:
-    """Raises ``nearest`` [rows, cols] to a face's disparity."""
     rows, cols = nearest.shape
     gx, gy = _plane(x, y, d)
     if not np.isfinite(gx + gy):
@@ -146,6 +116,23 @@ def _face_in_left(x: tuple, y: tuple, d: tuple, first: tuple[int, int], nearest:
             j, i = row - first[0], col - first[1]
             if value > nearest[j, i]:
                 nearest[j, i] = value
+                shown[j, i] = number
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_smooth(
+    xy: Floats, corner: Steps, smooth: Bools, first: tuple[int, int], nearest: Floats, shown: Steps
+) -> None:
+    """The smooth triangle of the greatest disparity at each pixel's centre, and that disparity.
+
+    ``xy`` [4, vertices]: places in both images, px. Of equals, the triangle of the lower number.
+    """
+    for t in range(len(corner)):
+        if smooth[t]:
+            x, y = _triple(xy[0], corner[t]), _triple(xy[1], corner[t])
+            xr = _triple(xy[2], corner[t])
+            d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+            _face_in_left(x, y, d, first, t, nearest, shown)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -203,11 +190,12 @@ _FACES = ((0, 1, 2), (0, 1, 3), (1, 3, 4), (1, 2, 4), (2, 4, 5), (2, 0, 5), (0, 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _prisms_in_left(xy: Floats, first: tuple[int, int], nearest: Floats) -> None:
     """``xy`` [4, prisms, 6]."""
+    any_prism = np.empty(nearest.shape, np.int32)
     for t in range(xy.shape[1]):
         x, y, xr = xy[0, t], xy[1, t], xy[2, t]
         for a, b, c in _FACES:
             d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
-            _face_in_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, nearest)
+            _face_in_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, t, nearest, any_prism)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
