@@ -16,7 +16,8 @@ of its point that got furthest:
 So the method ``correlation`` is the paper's filter, ``geometric`` is visibility in both views from
 the points, ``both`` is geometric, and what the images contradict is changed; ``none`` is neither.
 With ``fill`` the surface between the points takes the place of 2. in all but the agreement of the
-images, and gives labels where no point falls (:mod:`.surface_between`).
+images, and gives labels where no point falls (:mod:`.surface_between`); the images may tell the
+surface of pixels that it leaves open (:mod:`.open_pixels`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from .hidden_pixels import Surface, SurfaceBuilder, hidden_pixels
 from .image_agreement import outvoted, outvoted_nearby, supported, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
+from .open_pixels import surfaces_by_images
 from .paper_correlation import correlate
 from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
 from .pixel_points import Collection, PixelPoints
@@ -43,7 +45,13 @@ from .seen_surface import seen_surface
 from .settings import Settings
 from .smooth_triangles import ground_surface
 from .status import WATER_CLASS, Status, is_labelled
-from .surface_between import between_labels, surface_between
+from .surface_between import (
+    STEP_IN_LEFT,
+    STEP_IN_RIGHT,
+    Between,
+    between_labels,
+    surface_between,
+)
 
 Floats = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -119,7 +127,7 @@ def _between_points(
     use, _ = seen_surface(points, settings.edge_margin_px)
     pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
     own = _labels(scene, pixels, pixels.count >= max(settings.min_points, 1), wide)
-    surface = ground_surface(vertices, scene.scale, px_per_m)
+    surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell)
     between = surface_between(surface, local, first, points.shape, px_per_m)
     labels, status = between_labels(between, own, left, right, first)
     status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
@@ -133,8 +141,75 @@ def _between_points(
     agreement = pixels.correlation
     if settings.method == "both":
         agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
+    if settings.asks_images:
+        labels, pixels = _by_images(scene, between, labels, pixels, status, left, right, wide)
     layers = _layers(scene, pixels, labels, agreement, status, wide)
     return layers, _counts(points, pixels, status, settings.margin)
+
+
+def _by_images(
+    scene: SceneInputs,
+    between: Between,
+    labels: Labels,
+    pixels: Pixels,
+    status: NDArray[np.uint8],
+    left: Patch,
+    right: Patch,
+    wide: Window,
+) -> tuple[Labels, Pixels]:
+    """With the open pixels of which both images tell the surface; sets these in ``status``.
+
+    Where a step of two known surfaces lies is known better than to a pixel (:mod:`.outlines`), and
+    no pixel tells more: only where what a pixel may show is unknown, or what hides it from the
+    right camera, images have a say.
+    """
+    top, side, (rows, cols) = wide[0].start - left.row, wide[1].start - left.col, status.shape
+    shown = left.pixels[top : top + rows, side : side + cols].astype(np.float64)
+    top = wide[0].start - right.row
+    warped_from = right.pixels[top : top + rows].astype(np.float64)
+    is_open = between.outcome == STEP_IN_RIGHT
+    is_open |= (between.outcome == STEP_IN_LEFT) & between.rough
+    found = surfaces_by_images(
+        is_open & (status != Status.CHANGED) & (status != Status.OUT_OF_FRAME),
+        np.where(is_labelled(status), labels.disparity, np.nan),
+        labels.slope,
+        between.disparity,
+        between.slope,
+        between.highest,
+        shown,
+        warped_from,
+        right.col - wide[1].start,
+        between.places.hide_from_right,
+    )
+    at, (y, x) = (found.row, found.col), found.source.T
+    own = (found.row == y) & (found.col == x)
+    told = {
+        "disparity": np.where(is_labelled(status), labels.disparity, between.disparity),
+        "variance": np.where(is_labelled(status), labels.variance, between.variance),
+        "height": np.where(is_labelled(status), pixels.highest, between.height),
+        "class": np.where(is_labelled(status), pixels.surface_class, between.surface_class),
+    }
+    dry = told["class"][y, x] != WATER_CLASS
+    own, y, x = own[dry], y[dry], x[dry]
+    at = found.row[dry], found.col[dry]
+    disparity = found.disparity[dry]
+    # a plane is less sure the farther it is drawn out beyond its points
+    far = np.hypot(at[0] - y, at[1] - x) / scene.scale.distance_px
+    rise = (disparity - told["disparity"][y, x]) / scene.rays.px_per_m
+    values = {
+        "disparity": disparity,
+        "variance": told["variance"][y, x] * (1.0 + far) ** 2,
+        "height": told["height"][y, x] + np.where(own, 0.0, rise),
+        "class": told["class"][y, x],
+    }
+    status[at] = Status.LABELLED_BY_IMAGES
+    slope = labels.slope.copy()
+    slope[:, at[0], at[1]] = found.slope[:, dry]
+    for name, array in told.items():
+        array[at] = values[name]
+    return Labels(told["disparity"], slope, told["variance"]), replace(
+        pixels, highest=told["height"], surface_class=told["class"]
+    )
 
 
 def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Patch]:

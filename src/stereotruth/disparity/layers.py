@@ -30,7 +30,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
     if settings.fills:
         between = {
             "between": "where the status is labelled_between, or a point is less sure than those "
-            "around it: linear in the triangle of points that the pixel's centre sees"
+            "around it: linear in the triangle of points that the pixel's centre sees; where it is "
+            "labelled_by_images: on the plane of the label that both images tell"
         }
         lonely = {
             "edge_in_pixel": "no smooth triangle of points, or a step between points may be "

@@ -200,6 +200,7 @@ def project_scene(
             refuse_apart(tuple(bounds), images, heights, where)
         reached = sum(pixels.values()) - pixels["no_points"] - pixels["out_of_frame"]
         labelled = pixels["labelled"] + pixels.get("labelled_between", 0)
+        labelled += pixels.get("labelled_by_images", 0)
         summary = {
             "pixels": pixels,
             "points": {"in_grid": in_grid, "in_frame": framed, "used": used},

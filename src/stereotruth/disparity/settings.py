@@ -46,14 +46,17 @@ class Representative:
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
     """a pixel with fewer stays unlabelled"""
 
-    fill: Literal["none", "surface"] = "none"
+    fill: Literal["none", "surface", "surface_and_images"] = "none"
     """`none`: a pixel has a label if points fall into it. `surface`: also between points, for LiDAR
     from 0.25 points/m² on. The points are triangles over the ground; those that go on the plane of
-    their neighbours give labels, all others are swept vertically as what may hide a pixel in either
-    view. The value is always the LiDAR's. Such labels have the status `labelled_between` (9) and an
-    `uncertainty` of their own; pixels with points on the surface keep `labelled` (1). Where a step
-    lies between points, pixels are `edge_in_pixel`. Needs `occlusion.method` geometric or both, and
-    `representative` top"""
+    their neighbours give labels; those between two surfaces are cut at the outline that the points
+    on both sides of it tell; all others are swept vertically as what may hide a pixel in either
+    view. Such labels have the status `labelled_between` (9) and an `uncertainty` of their own;
+    pixels with points on the surface keep `labelled` (1). Where a step lies between points, pixels
+    are `edge_in_pixel`. `surface_and_images`: of these, pixels that only one of the surfaces around
+    explains in both images are on that surface, `labelled_by_images` (10): more labels in crowns
+    and behind roofs, and more of the hidden pixels. A value is always the LiDAR's. Needs
+    `occlusion.method` both (or geometric, without images), and `representative` top"""
 
 
 @settings
@@ -67,15 +70,19 @@ class Project(Representative):
 
 def check_fill(occlusion: Occlusion, project: Representative) -> None:
     """Raises InputError if labels between points cannot be had with the other keys."""
-    if project.fill == "none" or (
-        occlusion.method in ("geometric", "both") and project.representative == "top"
-    ):
+    methods = {
+        "none": ("correlation", "geometric", "both", "none"),
+        "surface": ("geometric", "both"),
+        "surface_and_images": ("both",),
+    }[project.fill]
+    fits = project.fill == "none" or project.representative == "top"
+    if occlusion.method in methods and fits:
         return
     raise InputError(
         f"project.fill: {project.fill!r} with occlusion.method {occlusion.method!r} and "
         f"project.representative {project.representative!r}",
-        remedy="what lies between points is hidden by geometry only: take the method both or "
-        "geometric, and the representative top",
+        remedy="what lies between points is hidden by geometry, and judged by the images: take the "
+        "method both (geometric does for surface), and the representative top",
     )
 
 
@@ -98,9 +105,19 @@ class Settings(Representative, Occlusion):
         return self.fill != "none"
 
     @property
+    def asks_images(self) -> bool:
+        """Whether images tell the surface of pixels that points leave open."""
+        return self.fill == "surface_and_images"
+
+    @property
     def statuses(self) -> list[Status]:
         """Those that occur."""
-        return [s for s in Status if self.fills or s != Status.LABELLED_BETWEEN]
+        return [
+            s
+            for s in Status
+            if (self.fills or s != Status.LABELLED_BETWEEN)
+            and (self.asks_images or s != Status.LABELLED_BY_IMAGES)
+        ]
 
     @property
     def uses_seen_surface(self) -> bool:
@@ -122,6 +139,7 @@ class Settings(Representative, Occlusion):
         """Pixels around a window whose points have a say in it."""
         # here, since these load compiled code and a workflow plans with the settings
         from .image_agreement import VOTE_PX
+        from .open_pixels import MARGIN
         from .seen_surface import EDGE
 
         # one for each ring of neighbours: planes, their pooled noise, support
@@ -129,4 +147,5 @@ class Settings(Representative, Occlusion):
         if self.method != "both":
             return reach
         # windows, votes about them, and what is asked of the votes nearby
-        return reach + VOTE_PX + self.window // 2 * (2 if self.fills else 1)
+        reach += VOTE_PX + self.window // 2 * (2 if self.fills else 1)
+        return reach + (MARGIN if self.asks_images else 0)

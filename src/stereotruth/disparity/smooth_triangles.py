@@ -11,7 +11,7 @@ window that knows the points of its halo (:class:`Scale`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from ..lidar.lattice import CELL_BITS, LATTICE_M
 from .hidden_pixels import CELL_PX
+from .outlines import REACH, Pieces, cut_at_outlines
 from .pixel_labels import FEW_NOISE_M, HEIGHT_NOISE_M
-from .point_triangles import PART, Triangles, Vertices, triangulate
+from .point_triangles import PART, Vertices, triangulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -56,7 +57,8 @@ class Scale:
     window shows and what may hide it. The vertices of a triangle lie within two radii of any place
     in its circumcircle. A label follows from its triangle, the neighbours of that and theirs
     (noise), the neighbours of these (support), the triangles that share a vertex with them
-    (planes), and again (gradients): six steps of two radii.
+    (planes), and again (gradients): six steps of two radii. Where it is cut follows from the points
+    up to REACH around it and the planes there (two radii more).
     """
 
     distance: float
@@ -65,10 +67,15 @@ class Scale:
     halo: int
 
     @property
+    def distance_px(self) -> float:
+        """Mean distance of points in pixels."""
+        return CELL_PX * self.distance / PART
+
+    @property
     def trust(self) -> float:
         """How far a lack of points tells that nothing is there: 1 for dense points, less where
         things of NOTICED_PX fall between them."""
-        return min(1.0, NOTICED_PX / (CELL_PX * self.distance / PART))
+        return min(1.0, NOTICED_PX / self.distance_px)
 
     @classmethod
     def of(cls, counts: Ints, cell: tuple[int, int]) -> Scale:
@@ -80,7 +87,8 @@ class Scale:
         )  # vertices are no denser than cells
         smooth = SMOOTH_RADIUS * distance
         swept = max(SWEPT_RADIUS * smooth, float(SWEPT_CELLS * PART))
-        return cls(distance, smooth, swept, int(np.ceil(max(12 * smooth, 2 * swept) / PART)) + 2)
+        halo = max(12 * smooth, 2 * swept) + REACH * distance + 2 * smooth
+        return cls(distance, smooth, swept, int(np.ceil(halo / PART)) + 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -247,17 +255,27 @@ def _variances(
 
 @dataclass(frozen=True, eq=False)
 class GroundSurface:
-    """Vertices and triangles [m] of a window, which of them are ``smooth`` [m], and the variance
-    ``noise`` [m] of their vertices' heights (lattice steps²)."""
+    """The surface of a window's points, and where it steps.
+
+    ``vertices``, and triangles of them: ``smooth`` [m, 3] on the surface, with the variance
+    ``noise`` [m] of their vertices' heights (lattice steps²); ``steps`` [k, 3] that may hold any
+    surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
+    nobody knows which surfaces they hold, the others lie between two known ones.
+    """
 
     vertices: Vertices
-    triangles: Triangles
-    smooth: Bools
+    smooth: Steps
     noise: Floats
+    steps: Steps
+    span: Ints
+    rough: int
 
 
-def ground_surface(vertices: Vertices, scale: Scale, px_per_m: float) -> GroundSurface:
-    """Triangles of ``vertices``, told apart by STEP_PX; ``px_per_m``: disparity per m of height."""
+def ground_surface(
+    vertices: Vertices, scale: Scale, px_per_m: float, cell: tuple[int, int]
+) -> GroundSurface:
+    """Triangles of ``vertices``, told apart by STEP_PX; ``px_per_m``: disparity per m of height;
+    ``cell``: (lon, lat) size in lattice steps."""
     x, y, h = vertices.x, vertices.y, vertices.h_q
     triangles = triangulate(x, y, scale.swept)
     corner, radius = triangles.corner, triangles.radius
@@ -272,4 +290,50 @@ def ground_surface(vertices: Vertices, scale: Scale, px_per_m: float) -> GroundS
     total, number = _squares(x, y, h, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
-    return GroundSurface(vertices, triangles, smooth, noise)
+    plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)
+    cut, pieces = cut_at_outlines(
+        x, y, h, corner, radius, smooth, plane, scale.distance, scale.smooth, step, *floors
+    )
+    whole = corner[~smooth & ~cut]
+    span = np.stack([h[whole].min(axis=1), h[whole].max(axis=1)], axis=1)
+    vertices, faces, strips = _with_pieces(vertices, corner, pieces, cell)
+    return GroundSurface(
+        vertices,
+        np.concatenate([corner[smooth], faces]),
+        np.concatenate([noise[smooth], pieces.noise]),
+        np.concatenate([whole, strips]),
+        np.concatenate([span, np.rint(pieces.heights).astype(np.int64)]),
+        len(whole),
+    )
+
+
+def _with_pieces(
+    vertices: Vertices, corner: Steps, pieces: Pieces, cell: tuple[int, int]
+) -> tuple[Vertices, Steps, Steps]:
+    """The vertices and the corners of pieces; these [n, 3] of faces and [k, 3] of strips."""
+    size = vertices.x.size
+    places = np.concatenate([pieces.faces[..., :2].reshape(-1, 2), pieces.strips.reshape(-1, 2)])
+    first = corner[np.concatenate([np.repeat(pieces.face_of, 3), np.repeat(pieces.strip_of, 3)]), 0]
+    faces = pieces.faces.shape[0] * 3
+    height = np.concatenate([pieces.faces[..., 2].reshape(-1), np.repeat(pieces.heights[:, 0], 3)])
+    height = np.rint(height).astype(np.int64)
+    anchor = np.concatenate([np.repeat(pieces.anchor, 3), first[faces:]])
+    moved = (np.rint(places[:, k] * (cell[k] / PART)).astype(np.int64) for k in (0, 1))
+    added = Vertices(
+        *(q[first] + move for q, move in zip((vertices.lon_q, vertices.lat_q), moved)),
+        height,
+        *(
+            q[first] + np.rint(places[:, k]).astype(np.int64)
+            for k, q in enumerate((vertices.x, vertices.y))
+        ),
+        vertices.surface_class[anchor],
+        np.ones(len(places), np.int32),
+    )
+    joined = Vertices(
+        *(
+            np.concatenate([getattr(vertices, f.name), getattr(added, f.name)])
+            for f in fields(Vertices)
+        )
+    )
+    index = np.arange(size, size + len(places), dtype=np.int32)
+    return joined, index[:faces].reshape(-1, 3), index[faces:].reshape(-1, 3)

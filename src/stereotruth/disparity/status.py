@@ -23,8 +23,9 @@ class Status(IntEnum):
     BELOW_MINIMUM_COUNT = 7
     EDGE_IN_PIXEL = 8
     LABELLED_BETWEEN = 9
+    LABELLED_BY_IMAGES = 10
 
 
 def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where a status says that there is a label, measured or between points."""
-    return (status == Status.LABELLED) | (status == Status.LABELLED_BETWEEN)
+    """Where a status says that there is a label: measured, between points, or told by images."""
+    return (status == Status.LABELLED) | (status >= Status.LABELLED_BETWEEN)

@@ -16,6 +16,7 @@ between points, nobody knows where in the triangle (:mod:`.smooth_triangles`). S
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,6 @@ from .hidden_pixels import TOLERANCE_PX
 from .image_patches import Patch
 from .local_projection import LocalProjection
 from .pixel_labels import Labels
-from .point_triangles import Vertices
 from .smooth_triangles import STEP_PX, GroundSurface
 from .status import Status, is_labelled
 
@@ -121,18 +121,17 @@ def _face_in_left(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_smooth(
-    xy: Floats, corner: Steps, smooth: Bools, first: tuple[int, int], nearest: Floats, shown: Steps
+    xy: Floats, corner: Steps, first: tuple[int, int], nearest: Floats, shown: Steps
 ) -> None:
     """The smooth triangle of the greatest disparity at each pixel's centre, and that disparity.
 
     ``xy`` [4, vertices]: places in both images, px. Of equals, the triangle of the lower number.
     """
     for t in range(len(corner)):
-        if smooth[t]:
-            x, y = _triple(xy[0], corner[t]), _triple(xy[1], corner[t])
-            xr = _triple(xy[2], corner[t])
-            d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-            _face_in_left(x, y, d, first, t, nearest, shown)
+        x, y = _triple(xy[0], corner[t]), _triple(xy[1], corner[t])
+        xr = _triple(xy[2], corner[t])
+        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+        _face_in_left(x, y, d, first, t, nearest, shown)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -172,15 +171,14 @@ def _face_in_right(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _smooth_in_right(
-    xy: Floats, corner: Steps, smooth: Bools, first: tuple[int, int], width: int, start: Steps,
-    place: Floats, limit: Floats, hidden: Bools,
+    xy: Floats, corner: Steps, first: tuple[int, int], width: int, start: Steps, place: Floats,
+    limit: Floats, hidden: Bools,
 ) -> None:  # fmt: skip
     for t in range(len(corner)):
-        if smooth[t]:
-            x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
-            d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-            y = _triple(xy[3], corner[t])
-            _face_in_right(xr, y, d, first, width, start, place, limit, hidden)
+        x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
+        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+        y = _triple(xy[3], corner[t])
+        _face_in_right(xr, y, d, first, width, start, place, limit, hidden)
 
 
 # Faces of a prism, of its vertices 0, 1, 2 at the top and 3, 4, 5 below these.
@@ -242,6 +240,50 @@ def _at_pixels(
             surface_class[j, i] = classes[v[0] if a >= b and a >= c else v[1] if b >= c else v[2]]
 
 
+Where = tuple[tuple[int, int], int, NDArray[np.int32], Floats, Floats]
+
+
+def _by_right_column(
+    row: Ints, col: Ints, disparity: Floats, first: tuple[int, int]
+) -> tuple[Ints, Where]:
+    """Pixels [n] of a window, one at least, in their order in the right image, and where they are
+    there: what the tests of that view take."""
+    place = col + first[1] - disparity
+    column = np.floor(place).astype(np.int64)
+    low = int(column.min())
+    width = int(column.max()) - low + 1
+    rows = int(row.max()) + 1
+    key = row.astype(np.int64) * width + column - low
+    order = np.argsort(key, kind="stable")
+    start = np.zeros(rows * width + 1, np.int32)
+    np.cumsum(np.bincount(key, minlength=rows * width), out=start[1:])
+    return order, ((first[0], low), width, start, place[order], disparity[order] + TOLERANCE_PX)
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Smooth triangles ``corner`` [m, 3] of vertices at ``xy`` [4, n] (px in both images), in a
+    window whose first pixel is (row, col) ``first``."""
+
+    xy: Floats
+    corner: Steps
+    first: tuple[int, int]
+
+    def hidden(self, where: Where) -> Bools:
+        """Which places, as :func:`_by_right_column` gives them, lie behind a triangle."""
+        behind = np.zeros(where[3].size, np.bool_)
+        _smooth_in_right(self.xy, self.corner, *where, behind)
+        return behind
+
+    def hide_from_right(self, row: Steps, col: Steps, disparity: Floats) -> Bools:
+        """Whether a triangle hides pixels [n] of the window, of this disparity, from there."""
+        out = np.zeros(row.size, np.bool_)
+        if row.size:
+            order, where = _by_right_column(row, col, disparity, self.first)
+            out[order] = self.hidden(where)
+        return out
+
+
 @dataclass(frozen=True, eq=False)
 class Between:
     """What the surface between the points shows at the centres of pixels; arrays [h, w].
@@ -251,6 +293,8 @@ class Between:
     one), BEHIND_IN_RIGHT (a smooth triangle hides it from there). ``disparity`` px, its ``slope``
     [2, h, w] and ``variance`` px² (of the points alone), ``height`` m and ``surface_class`` (ASPRS,
     of the nearest vertex) of the smooth triangle that is nearest, NaN (0) where there is none.
+    ``highest``: disparity that a pixel has at most; ``rough``: whether a step of unknown surfaces
+    may be nearer. ``places``: the smooth triangles in both images.
     """
 
     outcome: NDArray[np.uint8]
@@ -259,6 +303,9 @@ class Between:
     variance: Floats
     height: Floats
     surface_class: NDArray[np.uint8]
+    highest: Floats
+    rough: Bools
+    places: Places
 
 
 def surface_between(
@@ -272,35 +319,27 @@ def surface_between(
 
     ``local`` projects all that lies in the box of the vertices.
     """
-    vertices, corner, smooth = surface.vertices, surface.triangles.corner, surface.smooth
+    vertices, corner = surface.vertices, surface.smooth
     xy = local.at_points(vertices.lon_q, vertices.lat_q, vertices.h_q)
     nearest, shown = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    _nearest_smooth(xy, corner, smooth, first, nearest, shown)
-    swept = np.flatnonzero(~smooth)
+    _nearest_smooth(xy, corner, first, nearest, shown)
     before = np.full(shape, -np.inf)
-    for chunk in range(0, swept.size, _CHUNK):
-        faces = _prisms(vertices, corner[swept[chunk : chunk + _CHUNK]], local)
-        _prisms_in_left(faces, first, before)
+    for prisms in _prisms(surface, local, 0, surface.rough):
+        _prisms_in_left(prisms, first, before)
+    rough = before > nearest + TOLERANCE_PX
+    for prisms in _prisms(surface, local, surface.rough, len(surface.steps)):
+        _prisms_in_left(prisms, first, before)
     outcome = np.where(shown >= 0, np.uint8(SHOWN), np.uint8(NOTHING))
     outcome[before > nearest + TOLERANCE_PX] = STEP_IN_LEFT
 
+    places = Places(xy, corner, first)
     row, col = np.nonzero(outcome == SHOWN)
     if row.size:
-        disparity = nearest[row, col]
-        place = col + first[1] - disparity
-        column = np.floor(place).astype(np.int64)
-        low = int(column.min())
-        width = int(column.max()) - low + 1
-        key = row * width + column - low
-        order = np.argsort(key, kind="stable")
-        start = np.zeros(shape[0] * width + 1, np.int32)
-        np.cumsum(np.bincount(key, minlength=shape[0] * width), out=start[1:])
-        where = (first[0], low), width, start, place[order], disparity[order] + TOLERANCE_PX
-        behind, unsure = np.zeros(row.size, np.bool_), np.zeros(row.size, np.bool_)
-        _smooth_in_right(xy, corner, smooth, *where, behind)
-        for chunk in range(0, swept.size, _CHUNK):
-            faces = _prisms(vertices, corner[swept[chunk : chunk + _CHUNK]], local)
-            _prisms_in_right(faces, *where, unsure)
+        order, where = _by_right_column(row, col, nearest[row, col], first)
+        behind = places.hidden(where)
+        unsure = np.zeros(row.size, np.bool_)
+        for prisms in _prisms(surface, local, 0, len(surface.steps)):
+            _prisms_in_right(prisms, *where, unsure)
         found = np.where(behind, BEHIND_IN_RIGHT, np.where(unsure, STEP_IN_RIGHT, SHOWN))
         outcome[row[order], col[order]] = found
 
@@ -319,15 +358,22 @@ def surface_between(
         variance=variance * (LATTICE_M * px_per_m) ** 2,
         height=height * LATTICE_M,
         surface_class=classes,
+        highest=np.maximum(before, nearest),
+        rough=rough,
+        places=places,
     )
 
 
-def _prisms(vertices: Vertices, corner: Steps, local: LocalProjection) -> Floats:
-    """Places [4, prisms, 6] (px) of triangles' vertices at their greatest and least height."""
-    height = vertices.h_q[corner]
-    lon, lat = (np.tile(values[corner], 2) for values in (vertices.lon_q, vertices.lat_q))
-    ends = np.repeat(np.stack([height.max(axis=1), height.min(axis=1)], axis=1), 3, axis=1)
-    return local.at_points(*(v.reshape(-1) for v in (lon, lat, ends))).reshape(4, -1, 6)
+def _prisms(
+    surface: GroundSurface, local: LocalProjection, start: int, end: int
+) -> Iterator[Floats]:
+    """Places [4, prisms, 6] (px) of the corners of steps at their greatest and least height."""
+    for first in range(start, end, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, end))
+        corner = surface.steps[chunk]
+        ends = np.repeat(surface.span[chunk, ::-1], 3, axis=1)
+        lon, lat = (np.tile(q[corner], 2) for q in (surface.vertices.lon_q, surface.vertices.lat_q))
+        yield local.at_points(*(v.reshape(-1) for v in (lon, lat, ends))).reshape(4, -1, 6)
 
 
 def between_labels(

@@ -29,6 +29,7 @@ STATUS_COLOURS = {
     "below_minimum_count": "#9c6b4f",
     "edge_in_pixel": "#2a9d8f",
     "labelled_between": "#bcd4e6",
+    "labelled_by_images": "#d9c8e8",
 }
 OTHER_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#937860", "#da8bc3", "#8c8c8c")
 

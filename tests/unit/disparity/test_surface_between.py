@@ -5,21 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity.hidden_pixels import Rays
 from stereotruth.disparity.label_window import label_window
-from stereotruth.disparity.point_triangles import VertexBuilder
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.smooth_triangles import STEP_PX, Scale, ground_surface
 from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.errors import InputError
-from stereotruth.lidar.lattice import LATTICE_M
 
 from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
 
 SPACING = 2.5  # m: one point in 13 px
-FLAT = Rays(np.zeros((2, 2, 3)), (3000, 3000), 1.0)  # cells of 0.33 m at the equator
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +89,12 @@ def test_right_view_is_labelled_between_points_too(box) -> None:
     assert np.abs(grid["disparity"].values - truth)[labelled].max() < 1e-3
 
 
-@pytest.mark.parametrize("view", ["left", "right"])
-def test_any_cut_and_any_order_give_the_same_bytes(box, view) -> None:
+@pytest.mark.parametrize(
+    ("view", "fill"), [("left", "surface"), ("right", "surface"), ("left", "surface_and_images")]
+)
+def test_any_cut_and_any_order_give_the_same_bytes(box, view, fill) -> None:
     def scene() -> SceneInputs:
-        settings = Settings(method="both", fill="surface")
+        settings = Settings(method="both", fill=fill)
         return SceneInputs(*box.images, (box.store,), settings, view)
 
     rows, cols = slice(60, 220), slice(70, 250)
@@ -122,63 +119,14 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view) -> None:
             assert values.tobytes() == np.ascontiguousarray(whole[name][where]).tobytes(), name
 
 
-@pytest.mark.parametrize("options", [{"method": "correlation"}, {"representative": "paper"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"method": "correlation"},
+        {"representative": "paper"},
+        {"method": "geometric", "fill": "surface_and_images"},
+    ],
+)
 def test_fill_needs_geometry(options) -> None:
     with pytest.raises(InputError, match="fill"):
         Settings(**({"method": "both", "fill": "surface"} | options))
-
-
-def surface_of(height_at, spacing: float = 1.0, side: float = 40.0):
-    """Which triangles of a jittered grid over x, y (m) are smooth, and their corners [m, 3, 2]."""
-    rng = np.random.default_rng(0)
-    x, y = np.mgrid[0:side:spacing, 0:side:spacing].reshape(2, -1)
-    x, y = (c + rng.uniform(-0.3, 0.3, c.size) * spacing + 5.0 for c in (x, y))
-    height = height_at(x, y) + rng.normal(0.0, 0.03, x.size)
-    lon, lat = (np.rint(c / 0.33 * 3000).astype(np.int64) for c in (x, y))
-    builder = VertexBuilder(FLAT, (0, 0), (500_000, 500_000))
-    h = np.rint(height / LATTICE_M).astype(np.int64)
-    builder.add(lon, lat, h, np.full(x.size, 2, np.uint8))
-    per_cell = (0.33 / spacing) ** 2 * (1 << 40) / 9e6
-    found = ground_surface(builder.built(), Scale.of(np.array([per_cell]), FLAT.cell), 1.0)
-    v = found.vertices
-    places = np.stack([v.lon_q, v.lat_q], axis=1) / 3000 * 0.33
-    corner = places[found.triangles.corner]
-    middle = corner.mean(axis=1)
-    inner = (np.abs(middle - 25.0) < 15.0).all(axis=1)
-    return found, corner, inner
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.5, 1.0])
-def test_slopes_are_smooth_and_noise_is_told(slope) -> None:
-    found, _, inner = surface_of(lambda x, y: slope * x)
-    assert found.smooth[inner].mean() > 0.99
-    assert np.sqrt(np.median(found.noise[inner])) * LATTICE_M == pytest.approx(0.03, rel=0.35)
-
-
-def test_a_gabled_roof_is_smooth_across_its_ridge() -> None:
-    found, _, inner = surface_of(lambda x, y: -0.6 * np.abs(x - 25.0))
-    assert found.smooth[inner].mean() > 0.9
-
-
-@pytest.mark.parametrize("height", [2.0, 30.0])
-@pytest.mark.parametrize("width", [1.2, 8.0])
-def test_a_step_is_smooth_nowhere(height, width) -> None:
-    """A block of one row of points, or of many: no smooth triangle joins its top and its foot."""
-
-    def block(x, y):
-        return np.where(np.abs(x - 25.0) < width / 2, height, 0.0)
-
-    found, corner, inner = surface_of(block)
-    top = np.abs(corner[..., 0] - 25.0) < width / 2
-    spans = top.any(axis=1) & ~top.all(axis=1)
-    assert spans[inner].sum() > 50
-    assert not found.smooth[spans].any()
-    flat = inner & ~top.any(axis=1)
-    assert found.smooth[flat].mean() > 0.95
-
-
-def test_thresholds_follow_the_distance_of_points() -> None:
-    dense, sparse = (Scale.of(np.array([n]), (3000, 3000)) for n in (1e6, 1e3))
-    assert sparse.smooth == pytest.approx(dense.smooth * 11, rel=0.1)
-    assert dense.trust == 1.0 and sparse.trust < 0.5
-    assert STEP_PX <= 0.5  # a label of the wrong surface stays below a pixel

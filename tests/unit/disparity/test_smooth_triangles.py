@@ -1,0 +1,59 @@
+"""Which triangles of points are smooth, on slopes, ridges and steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.disparity.smooth_triangles import STEP_PX, Scale
+from stereotruth.lidar.lattice import LATTICE_M
+
+from ...synthetic.strewn_points import NOISE_M, parts, surface_of
+
+
+def inner(part) -> np.ndarray:
+    """Triangles well inside of the points."""
+    x, y = part.x.mean(axis=1), part.y.mean(axis=1)
+    return (np.abs(x - 25.0) < 15.0) & (np.abs(y - 25.0) < 15.0)
+
+
+def smooth_share(found) -> float:
+    """Area of the smooth triangles of all, well inside."""
+    smooth, steps = (parts(found, corner) for corner in (found.smooth, found.steps))
+    area = [part.area[inner(part)].sum() for part in (smooth, steps)]
+    return area[0] / sum(area)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, 1.0])
+def test_slopes_are_smooth_and_noise_is_told(slope) -> None:
+    found = surface_of(lambda x, y: slope * x)
+    assert smooth_share(found) > 0.99
+    noise = found.noise[inner(parts(found, found.smooth))]
+    assert np.sqrt(np.median(noise)) * LATTICE_M == pytest.approx(NOISE_M, rel=0.35)
+
+
+def test_a_gabled_roof_is_smooth_across_its_ridge() -> None:
+    assert smooth_share(surface_of(lambda x, y: -0.6 * np.abs(x - 25.0))) > 0.9
+
+
+@pytest.mark.parametrize("height", [2.0, 30.0])
+@pytest.mark.parametrize("width", [1.2, 8.0])
+def test_a_step_is_smooth_nowhere(height, width) -> None:
+    """A block of one row of points, or of many: no smooth triangle joins its top and its foot."""
+
+    def block(x, y):
+        return np.where(np.abs(x - 25.0) < width / 2, height, 0.0)
+
+    found = surface_of(block)
+    smooth = parts(found, found.smooth)
+    assert np.ptp(smooth.h, axis=1).max() < 0.5
+    far = (np.abs(np.abs(smooth.x - 25.0) - width / 2) > 1.0).all(axis=1)
+    assert np.abs(smooth.h - block(smooth.x, smooth.y))[far].max() < 0.5
+    assert smooth_share(found) > 0.8
+
+
+def test_thresholds_follow_the_distance_of_points() -> None:
+    dense, sparse = (Scale.of(np.array([n]), (3000, 3000)) for n in (1e6, 1e3))
+    assert sparse.smooth == pytest.approx(dense.smooth * 11, rel=0.1)
+    assert dense.trust == 1.0 and sparse.trust < 0.5
+    assert STEP_PX <= 0.5  # a label of the wrong surface stays below a pixel
