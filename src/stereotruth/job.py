@@ -28,7 +28,7 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
-    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, mode="w")
+    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
     file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     handlers = (terminal, file)
@@ -40,7 +40,9 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     except InputError as error:
         log.error("error: %s", error)
         raise SystemExit(1) from None
-    except Exception as error:
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:  # panics of libraries in Rust are no Exception
         if (full := _disk_full(error)) is None:
             log.exception("unexpected failure")
             raise

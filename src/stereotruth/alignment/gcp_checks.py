@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from ..epipolar.rpc import SensorModel
-from ..epipolar.rpc_files import read_rpc
+from ..epipolar.rpc_files import read_rpc, rpc_file
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
 from .control_points import ControlPoints
@@ -29,6 +29,8 @@ UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder am
 MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
+PIXEL_M = (0.01, 1000.0)  # m on the ground
+DEGREE_M = 111_320.0  # one degree of latitude, for judging pixels only
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
@@ -93,17 +95,43 @@ def _remedy(model: str, points: Floats) -> str:
 
 
 def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
-    """The RPC of an image and its size (cols, rows)."""
+    """The RPC of an image and its size (cols, rows).
+
+    Raises InputError: unreadable, or an RPC that does not see the ground by the image's pixels.
+    """
     sensor = SensorModel(read_rpc(image))
     try:
         with open_raster(image) as dataset:
-            return sensor, (dataset.width, dataset.height)
+            size = dataset.width, dataset.height
     except RasterioError as error:
         raise InputError(
             f"cannot be opened as the {name} image{of} ({error})",
             file=image,
             remedy="check the file",
         ) from None
+    if defect := _blindness(sensor, size):
+        raise InputError(
+            f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
+            file=rpc_file(image),
+            remedy="check that RPC and image belong together, and get the RPC again from the "
+            "image's supplier",
+        )
+    return sensor, size
+
+
+def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
+    """Why an RPC cannot be that of an image of this size, or an empty string."""
+    cols, rows = size[0] - 1, size[1] - 1
+    col = np.array([cols / 2, 0, cols, 0, cols, cols / 2 + 1, cols / 2])
+    row = np.array([rows / 2, 0, 0, rows, rows, rows / 2, rows / 2 + 1])
+    lon, lat = sensor.localize(col, row, sensor.rpc.height_off)
+    if not (np.isfinite(lon) & np.isfinite(lat)).all():
+        return "lines of sight through its middle and corners do not meet the ground"
+    east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
+    pixels = np.hypot(east, (lat - lat[0]) * DEGREE_M)[5:]
+    if not (PIXEL_M[0] <= pixels.min() and pixels.max() <= PIXEL_M[1]):
+        return f"its pixels would be {pixels[0]:.3g} by {pixels[1]:.3g} m on the ground"
+    return ""
 
 
 def footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
@@ -127,10 +155,28 @@ def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
     return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
 
 
-def check_ground(points: ControlPoints, boxes: Iterable[Floats], of: str) -> Bools:
-    """bool[n]: near either image's footprint. Refuses the file if most points are elsewhere."""
-    boxes = list(boxes)
-    near = np.any([_in_box(box, points.lon, points.lat) for box in boxes], axis=0)
+def check_ground(
+    points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path], of: str
+) -> Bools:
+    """bool[n]: near either image's footprint (``boxes``, left and right).
+
+    Refuses the file if most points are elsewhere, an RPC if it is alone with its ground.
+    """
+    inside = [_in_box(box, points.lon, points.lat) for box in boxes]
+    near = np.any(inside, axis=0)
+    measured = points.in_left, points.in_right
+    shares = [
+        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, measured)
+    ]
+    if min(shares) == 0.0 and max(shares) > 0.5:
+        wrong = int(np.argmin(shares))
+        box = boxes[wrong]
+        raise InputError(
+            f"this RPC leads to ground about lon {(box[0] + box[2]) / 2:.4f}, lat "
+            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere{of}",
+            file=rpc_file(images[wrong]),
+            remedy="check that RPC and image belong together, and the image to this scene",
+        )
     if 2 * near.sum() > len(near):
         return near
     swapped = np.any([_in_box(box, points.lat, points.lon) for box in boxes], axis=0)
@@ -239,12 +285,14 @@ def refuse_misfit(
     residuals = system.residuals(system.solve(used))[used]
     sigma = float(np.sqrt(np.sum(residuals**2) / redundancy))
     where = f"{view.name} image {view.image.name}"
+    if (rpc := rpc_file(view.image)) != view.image:
+        where += f" (RPC: {rpc.name})"
     if n - kept > MAX_LEFT_OUT * n:
         out = [points.ids[i] for i in view.index[~used]]
         raise InputError(
             f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
             file=points.file,
-            remedy="check these GCPs, and that the file belongs to these images",
+            remedy="check these GCPs, and that the file belongs to these images and their RPCs",
         )
     if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
         delta = system.delta
