@@ -84,6 +84,7 @@ def _read_lidar(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
 def _read_image(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     sensor, size = open_view("left", file, "")
     with Source(file) as source:
+        source.check_blocks()  # as rectify does
         pixels = np.concatenate(
             [source.read(0, row, size[0], min(64, size[1] - row)) for row in range(0, size[1], 64)]
         )
@@ -156,8 +157,10 @@ class Reader:
         else:
             good, usual = self.good[name]
             new = [text for text in remarks if text not in usual]
-            came = "right" if value == good else "remarked" if new else "other values"
-            says = "; ".join(new)
+            came, says = "right" if value == good else "remarked", "; ".join(new)
+            if came == "remarked" and not new:
+                hidden = case.cannot_be_told(data, value, good)
+                came = "cannot be told" if hidden else "other values"
         seconds, mib = time.monotonic() - begun, (_kib("VmHWM:") - before) // 1024
         return Outcome(case.format, name, number, what, came, says[:600], round(seconds, 2), mib)
 

@@ -131,6 +131,11 @@ def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
     pixels = np.hypot(east, (lat - lat[0]) * DEGREE_M)[5:]
     if not (PIXEL_M[0] <= pixels.min() and pixels.max() <= PIXEL_M[1]):
         return f"its pixels would be {pixels[0]:.3g} by {pixels[1]:.3g} m on the ground"
+    west, south, east_, north, low, high = sensor.rpc.ground_box
+    axes = (np.linspace(*ends, 5) for ends in ((west, east_), (south, north), (low, high)))
+    terms = sensor.rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
+    if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
+        return "a denominator vanishes within its own ground box"
     return ""
 
 

@@ -17,6 +17,7 @@ from rasterio.windows import Window
 
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
+from .tiff_blocks import damaged_block
 
 log = logging.getLogger("stereotruth")
 
@@ -166,6 +167,13 @@ class Source:
                 )
             values[below] = np.nan
         return values if self.gain == 1.0 else values * np.float32(self.gain)
+
+    def check_blocks(self, workers: int = 1) -> None:
+        """Refuse a TIFF of which GDAL would read damaged blocks in silence; reads all of it."""
+        if problem := damaged_block(self.path, workers):
+            raise InputError(
+                problem, file=self.path, remedy="the file is damaged or cut short: get it again"
+            )
 
     def close(self) -> None:
         """Close the handles of all threads."""
