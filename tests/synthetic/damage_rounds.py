@@ -117,6 +117,20 @@ def _read_rpc(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     return _aligned((image, case.file.parent / "right.tif"), gcps, folder)
 
 
+def _misbehave(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
+    """Does to the process what damaged files must not, to see that it is noticed."""
+    kind = case.reader.removeprefix("misbehave: ")
+    if file == case.file or kind == "other values":
+        return str(file), []
+    if kind == "abort":
+        os.abort()
+    if kind == "hang":
+        time.sleep(1000)
+    if kind == "memory":
+        np.ones(MEMORY)
+    raise BaseException(kind)
+
+
 READERS = {"lidar": _read_lidar, "image": _read_image, "gcps": _read_gcps, "rpc": _read_rpc}
 
 
@@ -132,7 +146,7 @@ class Reader:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def _read(self, case: Case, file: Path) -> tuple[Any, list[str]]:
-        return READERS[case.reader](case, file, self.folder)
+        return READERS.get(case.reader, _misbehave)(case, file, self.folder)
 
     def outcome(self, name: str, number: int) -> Outcome:
         case = self.cases[name]
@@ -159,7 +173,7 @@ class Reader:
             new = [text for text in remarks if text not in usual]
             came, says = "right" if value == good else "remarked", "; ".join(new)
             if came == "remarked" and not new:
-                hidden = case.cannot_be_told(data, value, good)
+                hidden = case.reader in READERS and case.cannot_be_told(data, value, good)
                 came = "cannot be told" if hidden else "other values"
         seconds, mib = time.monotonic() - begun, (_kib("VmHWM:") - before) // 1024
         return Outcome(case.format, name, number, what, came, says[:600], round(seconds, 2), mib)

@@ -1,8 +1,7 @@
 """Strips and tiles of a TIFF held against the file: their places, and the checksums of deflate.
 
-GDAL reads on past both: a block that lies partly behind the end of the file may come out as zeros,
-and libtiff stops inflating before the checksum. Sources: TIFF 6.0 (Adobe), sections 2 and 15;
-BigTIFF (libtiff); zlib (RFC 1950).
+GDAL does not always look: some damaged blocks of deflate come out as other pixels without an
+error. Sources: TIFF 6.0 (Adobe), sections 2 and 15; BigTIFF (libtiff); zlib (RFC 1950).
 """
 
 from __future__ import annotations

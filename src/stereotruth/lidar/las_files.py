@@ -176,8 +176,7 @@ class PointTally:
         """Refuse points far outside of the header's bounds: a damaged LAZ decodes into noise.
 
         ``units_m``: metres per unit of the plane and of the heights. Far is :data:`FAR_SHARE` of
-        the longer side in the plane and :data:`FAR_M` more. Returns a remark where they lie
-        outside at all.
+        the side and :data:`FAR_M` more. Returns a remark where they lie outside at all.
         """
         scale = np.asarray(header.scales)
         mins, maxs = np.asarray(header.mins), np.asarray(header.maxs)
@@ -193,8 +192,7 @@ class PointTally:
             f"the header says from {_triple(mins)} to {_triple(maxs)}"
         )
         metres = np.array([units_m[0], units_m[0], units_m[1]])
-        far = FAR_SHARE * size[:2].max() * units_m[0] + FAR_M
-        if (beyond * metres > far).any():
+        if (beyond * metres > FAR_SHARE * size * metres + FAR_M).any():
             raise InputError(f"damaged: {text}", file=file, remedy=_ANEW)
         return text
 

@@ -204,8 +204,8 @@ def to_wgs84(
         taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
         notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
     stated = np.array([header.mins, header.maxs], np.float64)
-    area = area_of(system.horizontal, stated if extent is None else extent)
     try:
+        area = area_of(system.horizontal, stated if extent is None else extent)
         transformer, remarks = _best_operation(system.horizontal, area)
     except ProjError as error:
         raise InputError(
