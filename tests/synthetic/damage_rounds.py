@@ -34,6 +34,7 @@ from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.gcp_checks import open_view
 from stereotruth.epipolar.image_reader import Source
 from stereotruth.errors import InputError
+from stereotruth.job import in_own_process
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 
@@ -74,7 +75,7 @@ def _digest(*arrays: np.ndarray) -> str:
 def _read_lidar(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     store = folder / "store.zarr"
     shutil.rmtree(store, ignore_errors=True)
-    summary = ingest(file, store, **case.options)
+    summary = in_own_process(lambda: ingest(file, store, **case.options), file)  # as the rule does
     points = PointStore(store)
     found = points.query(*points.bounds[:4])
     value = _digest(found.lon_q, found.lat_q, found.h_q, found.classification, found.return_number)
@@ -88,7 +89,7 @@ def _read_image(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
         pixels = np.concatenate(
             [source.read(0, row, size[0], min(64, size[1] - row)) for row in range(0, size[1], 64)]
         )
-    return _digest(sensor.packed(), np.array(pixels.shape), pixels), []
+    return [_digest(pixels), str(pixels.shape), _digest(sensor.packed())], []
 
 
 def _aligned(images: tuple[Path, Path], gcps: Path, folder: Path) -> tuple[Any, list[str]]:
@@ -175,7 +176,9 @@ class Reader:
             if came == "remarked" and not new:
                 hidden = case.reader in READERS and case.cannot_be_told(data, value, good)
                 came = "cannot be told" if hidden else "other values"
-        seconds, mib = time.monotonic() - begun, (_kib("VmHWM:") - before) // 1024
+        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # the most so far
+        most = max(_kib("VmHWM:"), children) - before
+        seconds, mib = time.monotonic() - begun, max(0, most) // 1024
         return Outcome(case.format, name, number, what, came, says[:600], round(seconds, 2), mib)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from ..synthetic import damage_rounds
 from ..synthetic.damage import BYTES, TEXT, damaged
 from ..synthetic.damage_rounds import REST, Worker, rounds
 from ..synthetic.damaged_cases import synthetic_cases
+from ..synthetic.project import SIZE, row_of
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +92,16 @@ def test_compiled_code_has_a_place_without_a_home_and_with_a_read_only_package(
     assert folder.parent.stat().st_mode & 0o077 == 0
     folder.parent.chmod(0o777)  # as if made by somebody else, who could put code there
     assert Path(stereotruth._compiled_code_folder()).parent != folder.parent
+
+
+@pytest.mark.slow
+def test_a_run_without_utf8_says_all_it_has_to_say(data, project, monkeypatch) -> None:
+    """LC_ALL=C ended right runs in UnicodeEncodeError."""
+    monkeypatch.setenv("LC_ALL", "C")
+    monkeypatch.setenv("PYTHONUTF8", "0")
+    shutil.copytree(data, project.folder / "in")
+    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
+    run = project.snakemake("tiles/Tiny", "report", "evaluate", "--configfile", "tiny.yaml")
+    assert run.status == 0, run.text[-4000:]
+    assert "Look at tiles/Tiny/manifest.csv" in run.text
+    assert "UnicodeEncodeError" not in run.text

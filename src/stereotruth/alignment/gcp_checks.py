@@ -267,6 +267,13 @@ def check_frame(points: ControlPoints, view: View, of: str) -> None:
         )
 
 
+def _where(view: View) -> str:
+    """The view's name, with the files that may be at fault beside the GCPs."""
+    rpc = rpc_file(view.image)
+    beside = "" if rpc == view.image else f" (RPC: {rpc.name})"
+    return f"{view.name} image {view.image.name}{beside}"
+
+
 def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: str) -> None:
     """Refuse a view whose used GCPs cannot carry the model."""
     defect = _defect(model, view.predicted[used])
@@ -275,7 +282,7 @@ def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: s
     out = [points.ids[i] for i in view.index[~used]]
     rest = f" after {_some(out)} were left out" if out else ""
     raise InputError(
-        f"{view.name} image {view.image.name}: {defect}{rest}{of}",
+        f"{_where(view)}: {defect}{rest}{of}",
         file=points.file,
         remedy=_remedy(model, view.predicted[used]),
     )
@@ -289,9 +296,7 @@ def refuse_misfit(
     redundancy = 2 * kept - system.design.shape[2]
     residuals = system.residuals(system.solve(used))[used]
     sigma = float(np.sqrt(np.sum(residuals**2) / redundancy))
-    where = f"{view.name} image {view.image.name}"
-    if (rpc := rpc_file(view.image)) != view.image:
-        where += f" (RPC: {rpc.name})"
+    where = _where(view)
     if n - kept > MAX_LEFT_OUT * n:
         out = [points.ids[i] for i in view.index[~used]]
         raise InputError(
