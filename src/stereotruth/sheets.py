@@ -140,7 +140,7 @@ def read_cities(path: str | Path) -> dict[str, City]:
     for number, cells in rows:
         values: dict[str, Any] = dict(cells)
         for count in ("training", "validation", "testing"):
-            if not re.fullmatch(r"\d+", cells[count]):
+            if not re.fullmatch(r"[0-9]+", cells[count]):
                 raise InputError(
                     f"line {number}: {count} is {cells[count]!r}",
                     file=path,

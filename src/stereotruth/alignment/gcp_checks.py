@@ -30,6 +30,7 @@ MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
 PIXEL_M = (0.01, 1000.0)  # m on the ground
+PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
 DEGREE_M = 111_320.0  # one degree of latitude, for judging pixels only
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
@@ -121,19 +122,28 @@ def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, 
 
 def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
     """Why an RPC cannot be that of an image of this size, or an empty string."""
-    cols, rows = size[0] - 1, size[1] - 1
-    col = np.array([cols / 2, 0, cols, 0, cols, cols / 2 + 1, cols / 2])
-    row = np.array([rows / 2, 0, 0, rows, rows, rows / 2, rows / 2 + 1])
-    lon, lat = sensor.localize(col, row, sensor.rpc.height_off)
-    if not (np.isfinite(lon) & np.isfinite(lat)).all():
+    rpc = sensor.rpc
+    cols, rows = (np.linspace(0, n - 1, 3) for n in size)
+    heights = rpc.height_off + rpc.height_scale * np.array([0.0, -1.0, 1.0])
+    height, row, col = (a.reshape(3, 9) for a in np.meshgrid(heights, rows, cols, indexing="ij"))
+    lon, lat = sensor.localize(col, row, height)
+    if not np.isfinite([lon[0], lat[0]]).all():
         return "lines of sight through its middle and corners do not meet the ground"
-    east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
-    pixels = np.hypot(east, (lat - lat[0]) * DEGREE_M)[5:]
-    if not (PIXEL_M[0] <= pixels.min() and pixels.max() <= PIXEL_M[1]):
-        return f"its pixels would be {pixels[0]:.3g} by {pixels[1]:.3g} m on the ground"
-    west, south, east_, north, low, high = sensor.rpc.ground_box
-    axes = (np.linspace(*ends, 5) for ends in ((west, east_), (south, north), (low, high)))
-    terms = sensor.rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
+    sides = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
+        side = DEGREE_M * np.hypot(there[0] * np.cos(np.radians(lat)), there[1])
+        sides.append(side[np.isfinite(side)])
+        if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
+            return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
+        if sides[-1].max() > PIXEL_RATIO * sides[-1].min():
+            return (
+                f"its pixels would be {sides[-1].min():.3g} m long here and "
+                f"{sides[-1].max():.3g} m there"
+            )
+    west, south, east, north, low, high = rpc.ground_box
+    axes = (np.linspace(*ends, 5) for ends in ((west, east), (south, north), (low, high)))
+    terms = rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
     if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
         return "a denominator vanishes within its own ground box"
     return ""
