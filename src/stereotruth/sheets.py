@@ -61,8 +61,9 @@ class Scene:
     """a row of the cities sheet"""
 
     left_image: Given
-    """backward view (reference): GeoTIFF, or a format that GDAL reads, with RPC metadata in the
-    TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside it"""
+    """backward view (reference): GeoTIFF, or another format that holds its pixels (JPEG 2000, NITF,
+    PNG, HFA, ENVI …), with RPC metadata in the TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside
+    it"""
 
     right_image: Given
     """forward view (target), likewise"""

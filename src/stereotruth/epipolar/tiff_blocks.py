@@ -15,8 +15,11 @@ from typing import BinaryIO
 import numpy as np
 
 OFFSETS, COUNTS = (273, 324), (279, 325)  # of strips, of tiles
-COMPRESSION = 259
-DEFLATE = (8, 32946)
+WIDTH, HEIGHT, BITS, COMPRESSION, SAMPLES, STRIP_ROWS = 256, 257, 258, 259, 277, 278
+PLANAR, TILE_WIDTH, TILE_HEIGHT = 284, 322, 323
+DEFAULTS = {BITS: 1, COMPRESSION: 1, SAMPLES: 1, PLANAR: 1, STRIP_ROWS: (1 << 32) - 1}
+WANTED = {*OFFSETS, *COUNTS, *DEFAULTS, WIDTH, HEIGHT, TILE_WIDTH, TILE_HEIGHT}
+PLAIN, DEFLATE = 1, (8, 32946)
 TYPES = {1: "u1", 3: "u2", 4: "u4", 16: "u8", 13: "u4", 18: "u8"}
 
 
@@ -36,7 +39,7 @@ def _directory(stream: BinaryIO, size: int) -> dict[int, np.ndarray]:
     for at in range(0, len(entries) - entry + 1, entry):
         tag, kind = struct.unpack_from(order + "HH", entries, at)
         (values,) = struct.unpack_from(order + ("Q" if big else "I"), entries, at + 4)
-        if kind not in TYPES or tag not in (*OFFSETS, *COUNTS, COMPRESSION):
+        if kind not in TYPES or tag not in WANTED:
             continue
         dtype = np.dtype(order + TYPES[kind])
         inline = at + (12 if big else 8)
@@ -51,6 +54,21 @@ def _directory(stream: BinaryIO, size: int) -> dict[int, np.ndarray]:
             data = stream.read(length)
         found[tag] = np.frombuffer(data, dtype).astype(np.int64)
     return found
+
+
+def _plain_bytes(tags: dict[int, np.ndarray], blocks: int) -> np.ndarray | None:
+    """Bytes of each block without compression, [blocks]; None if the tags do not say."""
+    one = {tag: int(values[0]) for tag, values in tags.items() if values.size}
+    one = DEFAULTS | one
+    if WIDTH not in one or HEIGHT not in one:
+        return None
+    bits = one[BITS] * (one[SAMPLES] if one[PLANAR] == 1 else 1)
+    if TILE_WIDTH in one and TILE_HEIGHT in one:
+        return np.full(blocks, one[TILE_HEIGHT] * -(-one[TILE_WIDTH] * bits // 8))
+    rows = min(one[STRIP_ROWS], one[HEIGHT])
+    strips = -(-one[HEIGHT] // max(rows, 1))
+    at = np.arange(blocks) % max(strips, 1)
+    return np.minimum(rows, one[HEIGHT] - at * rows) * -(-one[WIDTH] * bits // 8)
 
 
 def _inflates(block: bytes) -> bool:
@@ -81,7 +99,16 @@ def damaged_block(path: Path, workers: int = 1) -> str:
         past = np.flatnonzero((offsets < 0) | (counts < 0) | (offsets + counts > size))
         if past.size:
             return f"block {past[0] + 1} of {offsets.size} reaches past the end of the file"
-        if int(tags.get(COMPRESSION, [1])[0]) not in DEFLATE:
+        halves = np.flatnonzero((offsets == 0) != (counts == 0))  # empty ones have neither
+        if halves.size:
+            return f"block {halves[0] + 1} of {offsets.size} has a place or a size, but not both"
+        compression = int(tags.get(COMPRESSION, [PLAIN])[0])
+        if compression == PLAIN and (wanted := _plain_bytes(tags, offsets.size)) is not None:
+            wrong = np.flatnonzero((counts > 0) & ((counts < wanted) | (counts > 2 * wanted)))
+            if wrong.size:  # some programs pad
+                k = wrong[0]
+                return f"block {k + 1} has {counts[k]} bytes, its pixels take {wanted[k]}"
+        if compression not in DEFLATE:
             return ""
 
         with ThreadPoolExecutor(workers) as pool:

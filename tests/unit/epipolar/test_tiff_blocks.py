@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import struct
+
 import numpy as np
 import pytest
 import rasterio
@@ -61,6 +64,28 @@ def test_what_gdal_passes_over_is_found(tmp_path) -> None:
         assert same or "is damaged" in damaged_block(path)
         silent += not same
     assert silent > 0
+
+
+@pytest.mark.parametrize(
+    ("compress", "tag", "value", "match"),
+    [
+        ("deflate", 279, 0, "a place or a size, but not both"),  # GDAL reads zeros
+        ("none", 279, 60, "has 60 bytes, its pixels take"),
+        ("none", 258, 1, "its pixels take"),
+        ("lzw", 259, 1, "its pixels take"),
+        ("deflate", 259, 1, "its pixels take"),
+    ],
+)
+def test_sizes_that_do_not_go_together(tmp_path, compress, tag, value, match) -> None:
+    path = write(tmp_path / "a.tif", compress=compress, blockysize=200)
+    data = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", data, 4)
+    for k in range(struct.unpack_from("<H", data, start)[0]):
+        at = start + 2 + 12 * k
+        if struct.unpack_from("<H", data, at)[0] == tag:
+            struct.pack_into("<I", data, at + 8, value)
+    path.write_bytes(data)
+    assert re.search(match, damaged_block(path))
 
 
 def test_sparse_files_and_other_formats_pass(tmp_path) -> None:
