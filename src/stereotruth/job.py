@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import errno
 import logging
+import multiprocessing
+import os
+import pickle
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+import traceback
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,7 +33,7 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
-    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, mode="w")
+    terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
     file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     handlers = (terminal, file)
@@ -40,7 +45,9 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     except InputError as error:
         log.error("error: %s", error)
         raise SystemExit(1) from None
-    except Exception as error:
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:  # panics of libraries in Rust are no Exception
         if (full := _disk_full(error)) is None:
             log.exception("unexpected failure")
             raise
@@ -54,6 +61,62 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
         for handler in handlers:
             log.removeHandler(handler)
             handler.close()
+
+
+def in_own_process(work: Callable[[], Any], file: str | Path) -> Any:
+    """What ``work`` returns or raises; done by a fork of this process, which may die of ``file``.
+
+    For decoders that damaged files can crash. The fork dies with this process, however that ends.
+    Raises InputError if it dies by itself.
+    """
+    context = multiprocessing.get_context("fork")
+    receiving, sending = context.Pipe(duplex=False)
+    watched, held = os.pipe()
+    process = context.Process(target=_report, args=(work, sending, watched, held))
+    process.start()
+    sending.close()
+    os.close(watched)
+    try:
+        kind, value = receiving.recv()
+    except EOFError:
+        process.join()
+        raise InputError(
+            f"damaged: the decoder crashed (exit status {process.exitcode})",
+            file=file,
+            remedy="fetch or write the file again; if it is whole, the job may have been killed "
+            "for its memory",
+        ) from None
+    finally:
+        os.close(held)  # ends the fork, should it still be there
+        process.join()
+    if kind == "refused":
+        raise InputError(value[0], file=value[1], remedy=value[2])
+    if kind == "failed":
+        raise value
+    return value
+
+
+def _report(work: Callable[[], Any], sending: Any, watched: int, held: int) -> None:
+    """In the fork: do the work and send what comes of it."""
+    os.close(held)
+
+    def end_with_parent() -> None:
+        os.read(watched, 1)  # nothing is ever written: returns when the parent is no more
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    try:
+        found = "done", work()
+    except InputError as error:
+        found = "refused", (error.problem, error.file, error.remedy)
+    except BaseException as error:
+        error.add_note(traceback.format_exc())  # which does not go through a pipe
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            error = RuntimeError(traceback.format_exc())
+        found = "failed", error
+    sending.send(found)
 
 
 def _disk_full(error: BaseException | None) -> OSError | None:

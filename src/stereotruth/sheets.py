@@ -61,8 +61,9 @@ class Scene:
     """a row of the cities sheet"""
 
     left_image: Given
-    """backward view (reference): GeoTIFF, or a format that GDAL reads, with RPC metadata in the
-    TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside it"""
+    """backward view (reference): GeoTIFF, or another format that holds its pixels (JPEG 2000, NITF,
+    PNG, HFA, ENVI …), with RPC metadata in the TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside
+    it"""
 
     right_image: Given
     """forward view (target), likewise"""
@@ -140,7 +141,7 @@ def read_cities(path: str | Path) -> dict[str, City]:
     for number, cells in rows:
         values: dict[str, Any] = dict(cells)
         for count in ("training", "validation", "testing"):
-            if not re.fullmatch(r"\d+", cells[count]):
+            if not re.fullmatch(r"[0-9]+", cells[count]):
                 raise InputError(
                     f"line {number}: {count} is {cells[count]!r}",
                     file=path,

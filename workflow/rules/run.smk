@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 from stereotruth.products.locks import FileLock
 
@@ -29,11 +30,11 @@ onstart:
 
 def complaints(snakemake_logs):
     """The errors that the failed jobs of a run have logged, one line each."""
-    text = "".join(Path(file).read_text() for file in snakemake_logs)
+    text = "".join(Path(file).read_text("utf-8", "replace") for file in snakemake_logs)
     logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
     found = []
     for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
-        found += re.findall(r"ERROR (.*?: error: .*)", file.read_text())
+        found += re.findall(r"ERROR (.*?: error: .*)", file.read_text("utf-8", "replace"))
     return "\n".join(found)
 
 
@@ -49,9 +50,15 @@ def made():
     return "\n".join(["", *lines]) if lines else "done"
 
 
+def say(text):
+    """Print, with ? for what a terminal without UTF-8 (LC_ALL=C) cannot show."""
+    encoding = sys.stdout.encoding or "ascii"
+    print(text.encode(encoding, "replace").decode(encoding))
+
+
 onsuccess:
-    print(made())
+    say(made())
 
 
 onerror:
-    print(complaints(log))
+    say(complaints(log))

@@ -1,6 +1,6 @@
 """One LiDAR file to a point store."""
 
-from stereotruth.job import job
+from stereotruth.job import in_own_process, job
 from stereotruth.lidar.ingest import ingest
 from stereotruth.products.provenance import describe
 
@@ -11,12 +11,15 @@ if __name__ == "__main__":
         "drop_classes": snakemake.params.drop_classes,
     }
     with job(snakemake.log[0], f"ingest {scene}"):
-        ingest(
+        in_own_process(  # some damaged LAZ files crash the decoder
+            lambda: ingest(
+                snakemake.input.lidar,
+                snakemake.output.store,
+                lidar_crs=parameters["lidar_crs"] or None,
+                geoid=geoid,
+                drop_classes=tuple(parameters["drop_classes"]),
+                scene=scene,
+                provenance=describe(snakemake.input, parameters, snakemake.params.code),
+            ),
             snakemake.input.lidar,
-            snakemake.output.store,
-            lidar_crs=parameters["lidar_crs"] or None,
-            geoid=geoid,
-            drop_classes=tuple(parameters["drop_classes"]),
-            scene=scene,
-            provenance=describe(snakemake.input, parameters, snakemake.params.code),
         )

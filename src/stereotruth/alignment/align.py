@@ -168,7 +168,7 @@ def align(
     points = read_gcps(gcps_csv, scene)
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
-    near = check_ground(points, (footprint(*item) for item in opened), of)
+    near = check_ground(points, [footprint(*item) for item in opened], images, of)
     check_swapped(points, sensors, near, of)
 
     doubts = [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]

@@ -78,6 +78,7 @@ def _draw(alignment: Alignment, path: Path) -> None:
                     textcoords="offset points",
                     fontsize=8,
                     color="0.25" if g.used else "C3",
+                    parse_math=False,  # a $ is no formula
                 )
                 if not g.used:
                     ax.plot(*g.measured, "x", color="C3", markersize=9, mew=2, zorder=4)

@@ -9,18 +9,21 @@ see the point.
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 
 Floats = NDArray[np.float64]
 
 
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
+LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
 
 
@@ -77,9 +80,15 @@ def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
                 f"lines {points[name][0]} and {line} both have the id {name!r}",
                 "give every point an id of its own",
             )
+        if len(name) > LONGEST_ID or not name.isprintable():
+            raise fail(
+                f"line {line}: the id {name[:20]!a} … of {len(name)} characters is no name",
+                f"give ids of at most {LONGEST_ID} characters that can be printed",
+            )
         points[name] = line, _values(name, line, cells, fail)
     if not points:
         raise fail("there are no points in the file", "add one line per point under the header")
+    _refuse_copies(points, fail)
     ids = sorted(points)
     values = np.array([points[name][1] for name in ids])
     return ControlPoints(
@@ -94,6 +103,22 @@ def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
     )
 
 
+def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
+    """A point under two ids would count twice: the same ground and the same place in a view."""
+    seen: dict[tuple, str] = {}
+    for name, (line, values) in points.items():
+        for view in (3, 5):
+            if np.isnan(values[view]):
+                continue
+            first = seen.setdefault((view, *values[:3], *values[view : view + 2]), name)
+            if first != name:
+                raise fail(
+                    f"lines {points[first][0]} and {line} are one point under two ids, {first} "
+                    f"and {name}",
+                    "keep one of the two lines",
+                )
+
+
 def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
     """(line number, stripped cells by column) of each line that holds anything."""
     try:
@@ -106,7 +131,7 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
     rows = []
     reader = csv.reader(text.splitlines())
     expected = f"the header is {','.join(COLUMNS)}"
-    for cells in reader:
+    for cells in _readable(reader, fail):
         cells = [cell.strip() for cell in cells]
         if not any(cells):
             continue
@@ -120,7 +145,7 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
             unknown = [c for c in header if c not in COLUMNS]
             if missing or unknown or len(header) != len(set(header)):
                 wrong = [f"column {c!r} is missing" for c in missing]
-                wrong += [f"column {c!r} is unknown" for c in unknown]
+                wrong += [f"column {c[:40]!r} is unknown" for c in unknown[:8]]
                 raise fail("; ".join(wrong) or "a column occurs twice", expected)
             continue
         if len(cells) != len(header):
@@ -134,6 +159,15 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
     return rows
 
 
+def _readable(reader, fail) -> Iterator[list[str]]:
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise fail(
+            f"line {reader.line_num + 1} cannot be read ({error})", "save it as CSV in UTF-8"
+        ) from None
+
+
 def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:
     """The seven numbers of a point, checked; NaN for empty image coordinates."""
     values = []
@@ -143,11 +177,11 @@ def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:
             values.append(np.nan)
             continue
         try:
-            number = float(text)
+            number = decimal_number(text)
         except ValueError:
             number = np.nan
         if not np.isfinite(number):
-            what = "is empty" if not text else f"{text!r} is no number"
+            what = "is empty" if not text else f"{text[:40]!r} is no number"
             raise fail(f"line {line}, point {name}: {column} {what}", "write a decimal number")
         values.append(number)
     lon, lat, height, *image = values

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from ..epipolar.rpc import SensorModel
-from ..epipolar.rpc_files import read_rpc
+from ..epipolar.rpc_files import read_rpc, rpc_file
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
 from .control_points import ControlPoints
@@ -29,6 +29,9 @@ UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder am
 MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
+PIXEL_M = (0.01, 1000.0)  # m on the ground
+PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
+DEGREE_M = 111_320.0  # one degree of latitude, for judging pixels only
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
@@ -93,17 +96,57 @@ def _remedy(model: str, points: Floats) -> str:
 
 
 def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
-    """The RPC of an image and its size (cols, rows)."""
+    """The RPC of an image and its size (cols, rows).
+
+    Raises InputError: unreadable, or an RPC that does not see the ground by the image's pixels.
+    """
     sensor = SensorModel(read_rpc(image))
     try:
         with open_raster(image) as dataset:
-            return sensor, (dataset.width, dataset.height)
+            size = dataset.width, dataset.height
     except RasterioError as error:
         raise InputError(
             f"cannot be opened as the {name} image{of} ({error})",
             file=image,
             remedy="check the file",
         ) from None
+    if defect := _blindness(sensor, size):
+        raise InputError(
+            f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
+            file=rpc_file(image),
+            remedy="check that RPC and image belong together, and get the RPC again from the "
+            "image's supplier",
+        )
+    return sensor, size
+
+
+def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
+    """Why an RPC cannot be that of an image of this size, or an empty string."""
+    rpc = sensor.rpc
+    cols, rows = (np.linspace(0, n - 1, 3) for n in size)
+    heights = rpc.height_off + rpc.height_scale * np.array([0.0, -1.0, 1.0])
+    height, row, col = (a.reshape(3, 9) for a in np.meshgrid(heights, rows, cols, indexing="ij"))
+    lon, lat = sensor.localize(col, row, height)
+    if not np.isfinite([lon[0], lat[0]]).all():
+        return "lines of sight through its middle and corners do not meet the ground"
+    sides = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
+        side = DEGREE_M * np.hypot(there[0] * np.cos(np.radians(lat)), there[1])
+        sides.append(side[np.isfinite(side)])
+        if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
+            return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
+        if sides[-1].max() > PIXEL_RATIO * sides[-1].min():
+            return (
+                f"its pixels would be {sides[-1].min():.3g} m long here and "
+                f"{sides[-1].max():.3g} m there"
+            )
+    west, south, east, north, low, high = rpc.ground_box
+    axes = (np.linspace(*ends, 5) for ends in ((west, east), (south, north), (low, high)))
+    terms = rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
+    if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
+        return "a denominator vanishes within its own ground box"
+    return ""
 
 
 def footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
@@ -127,10 +170,28 @@ def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
     return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
 
 
-def check_ground(points: ControlPoints, boxes: Iterable[Floats], of: str) -> Bools:
-    """bool[n]: near either image's footprint. Refuses the file if most points are elsewhere."""
-    boxes = list(boxes)
-    near = np.any([_in_box(box, points.lon, points.lat) for box in boxes], axis=0)
+def check_ground(
+    points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path], of: str
+) -> Bools:
+    """bool[n]: near either image's footprint (``boxes``, left and right).
+
+    Refuses the file if most points are elsewhere, an RPC if it is alone with its ground.
+    """
+    inside = [_in_box(box, points.lon, points.lat) for box in boxes]
+    near = np.any(inside, axis=0)
+    measured = points.in_left, points.in_right
+    shares = [
+        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, measured)
+    ]
+    if min(shares) == 0.0 and max(shares) > 0.5:
+        wrong = int(np.argmin(shares))
+        box = boxes[wrong]
+        raise InputError(
+            f"this RPC leads to ground about lon {(box[0] + box[2]) / 2:.4f}, lat "
+            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere{of}",
+            file=rpc_file(images[wrong]),
+            remedy="check that RPC and image belong together, and the image to this scene",
+        )
     if 2 * near.sum() > len(near):
         return near
     swapped = np.any([_in_box(box, points.lat, points.lon) for box in boxes], axis=0)
@@ -216,6 +277,13 @@ def check_frame(points: ControlPoints, view: View, of: str) -> None:
         )
 
 
+def _where(view: View) -> str:
+    """The view's name, with the files that may be at fault beside the GCPs."""
+    rpc = rpc_file(view.image)
+    beside = "" if rpc == view.image else f" (RPC: {rpc.name})"
+    return f"{view.name} image {view.image.name}{beside}"
+
+
 def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: str) -> None:
     """Refuse a view whose used GCPs cannot carry the model."""
     defect = _defect(model, view.predicted[used])
@@ -224,7 +292,7 @@ def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: s
     out = [points.ids[i] for i in view.index[~used]]
     rest = f" after {_some(out)} were left out" if out else ""
     raise InputError(
-        f"{view.name} image {view.image.name}: {defect}{rest}{of}",
+        f"{_where(view)}: {defect}{rest}{of}",
         file=points.file,
         remedy=_remedy(model, view.predicted[used]),
     )
@@ -238,13 +306,13 @@ def refuse_misfit(
     redundancy = 2 * kept - system.design.shape[2]
     residuals = system.residuals(system.solve(used))[used]
     sigma = float(np.sqrt(np.sum(residuals**2) / redundancy))
-    where = f"{view.name} image {view.image.name}"
+    where = _where(view)
     if n - kept > MAX_LEFT_OUT * n:
         out = [points.ids[i] for i in view.index[~used]]
         raise InputError(
             f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
             file=points.file,
-            remedy="check these GCPs, and that the file belongs to these images",
+            remedy="check these GCPs, and that the file belongs to these images and their RPCs",
         )
     if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
         delta = system.delta

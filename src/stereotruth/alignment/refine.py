@@ -28,7 +28,7 @@ from scipy.stats import chi2
 from ..epipolar.image_reader import Source, open_pair
 from ..error_statistics import median_and_nmad
 from ..errors import InputError
-from ..lidar.point_store import PointStore
+from ..lidar.point_store import PointStore, open_stores
 from .adjustment import (
     SYSTEMATIC,
     Estimate,
@@ -256,7 +256,7 @@ def refine(
     """
     of = f" (scene {alignment.scene})" if alignment.scene else ""
     with open_pair(left_image, right_image) as (left, right):
-        stores = [PointStore(path) for path in sorted(Path(p) for p in point_stores)]
+        stores = open_stores(sorted(Path(p) for p in point_stores))
         prior = prior_of(alignment)
         result = _search(alignment, (left, right), stores, prior)
     record_of = dict(provenance or alignment.provenance)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
-from ..lidar.point_store import PointStore
+from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
 from .hidden_pixels import FILL_RADII, Rays
 from .point_windows import PointWindows
@@ -58,7 +58,7 @@ class SceneInputs:
     @cached_property
     def stores(self) -> tuple[PointStore, ...]:
         """The points."""
-        return tuple(PointStore(path) for path in self.point_stores)
+        return open_stores(self.point_stores)
 
     @cached_property
     def scale(self) -> Scale:

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
+from .tiff_blocks import damaged_block
 
 log = logging.getLogger("stereotruth")
 
@@ -23,48 +25,97 @@ log = logging.getLogger("stereotruth")
 CACHE_MB = 256  # of decoded source; 1024 rows of a scene 34 000 px wide take 70
 
 
+MAX_SIDE = 1_000_000  # px; no sensor's image is as long
+MAX_BLOCK_BYTES = 1 << 30  # of a block of the file, which is decoded as a whole
+OUTLIER = 10.0  # of the largest value above all but a thousandth of the others: a hot pixel
+BELOW = 0.1  # of the largest value below zero: a fill value; noise of reflectances is above
+
+
 class Source:
     """One band of an image file, read by windows from any thread as float32 with NaN for nodata.
 
-    Nodata is the file's nodata value, or exactly 0 if it names none. Integer images keep their
-    digital numbers. Others keep theirs if their maximum lies in [256, 65535], else they are
-    multiplied by ``gain`` = 10000 / maximum (of a decimated reading).
+    Nodata is the file's nodata value, or exactly 0 if it names none; what a mask or an alpha band
+    hides; and, as no sensor counts below zero, negative values (of real numbers those below
+    :data:`BELOW` of the largest value), since fill values are often not declared. Integer images
+    keep their digital numbers. Others, and integers of more than 16 bits, keep theirs if their
+    maximum lies in [256, 65535] (of integers: below), else they are multiplied by ``gain`` = 10000
+    / maximum. The maximum is that of a decimated reading; hot pixels do not count.
 
-    Raises InputError if the file cannot be read or is complex-valued.
+    Raises InputError if the file cannot be read, is complex-valued or larger than any image.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._local = threading.local()
         self._opened: list[rasterio.DatasetReader] = []
+        self._told = False
         dataset = self._dataset()
         self.size = (dataset.width, dataset.height)
+        self._refuse_shape(dataset)
         dtype = np.dtype(dataset.dtypes[0])
-        if dtype.kind == "c":
-            raise InputError(
-                "complex image", file=path, remedy="give the amplitude as a real-valued image"
-            )
         self.nodata = 0.0 if dataset.nodata is None else float(dataset.nodata)
-        if dataset.count > 1:
+        alpha = [i for i, c in enumerate(dataset.colorinterp, 1) if c == ColorInterp.alpha]
+        self._alpha = alpha[0] if alpha and alpha[0] != 1 else None
+        self._masked = self._alpha is None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+        if dataset.count > (1 if self._alpha is None else 2):
             log.warning(
                 "%s has %d bands; band 1 (%s) is used",
                 self.path.name,
                 dataset.count,
                 dataset.descriptions[0] or dataset.colorinterp[0].name,
             )
-        self.gain = 1.0
-        if dtype.kind == "f":
-            self.gain = self._float_gain(dataset)
+        self.gain, self._lowest = 1.0, -np.inf
+        if dtype.kind == "f" or dtype.itemsize > 2:
+            self._scale(dataset, dtype.kind == "f")
+        elif dtype.kind == "i":
+            self._lowest = 0.0
 
-    def _float_gain(self, dataset: rasterio.DatasetReader) -> float:
+    def _refuse_shape(self, dataset: rasterio.DatasetReader) -> None:
+        if dataset.count == 0 or max(self.size) > MAX_SIDE:
+            raise InputError(
+                f"{dataset.count} bands of {self.size[0]} x {self.size[1]} pixels are no image of "
+                "a satellite",
+                file=self.path,
+                remedy="give the image itself; if that is it, it is damaged: get it again",
+            )
+        if dataset.dtypes[0].startswith("complex"):
+            raise InputError(
+                "complex image", file=self.path, remedy="give the amplitude as a real-valued image"
+            )
+        rows, cols = dataset.block_shapes[0]
+        if rows * cols * np.dtype(dataset.dtypes[0]).itemsize > MAX_BLOCK_BYTES:
+            raise InputError(
+                f"its blocks of {cols} x {rows} pixels can only be read as a whole",
+                file=self.path,
+                remedy="write it in tiles (gdal_translate -co TILED=YES); if it has them, it is "
+                "damaged: get it again",
+            )
+
+    def _scale(self, dataset: rasterio.DatasetReader, real: bool) -> None:
+        """Set the gain, and below what values are fill values."""
         shape = tuple(min(n, 2048) for n in dataset.shape)
-        sample = dataset.read(1, out_shape=shape).astype(np.float64)
-        sample = sample[np.isfinite(sample) & (sample != self.nodata)]
+        with self._readable("the image"):
+            sample = dataset.read(1, out_shape=shape).astype(np.float64)
+        sample = sample[np.isfinite(sample) & (sample != self.nodata) & (sample > 0)]
         top = float(sample.max()) if sample.size else 0.0
-        if 256.0 <= top <= 65535.0 or top <= 0.0:
-            return 1.0
-        log.warning("%s: float values up to %g are scaled to 10000", self.path.name, top)
-        return 10000.0 / top
+        if top > OUTLIER * (most := float(np.percentile(sample, 99.9)) if sample.size else 0.0):
+            log.warning(
+                "%s: few values reach %g, all others %g: the few are taken as hot pixels",
+                self.path.name,
+                top,
+                most,
+            )
+            top = most
+        self._lowest = -BELOW * top if real else 0.0
+        if top <= 0.0 or (256.0 if real else 0.0) <= top <= 65535.0:
+            return
+        log.warning(
+            "%s: %s values up to %g are scaled to 10000",
+            self.path.name,
+            "float" if real else "integer",
+            top,
+        )
+        self.gain = 10000.0 / top
 
     def _dataset(self) -> rasterio.DatasetReader:
         if not hasattr(self._local, "dataset"):
@@ -80,19 +131,49 @@ class Source:
             self._local.dataset = dataset
         return self._local.dataset
 
-    def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
-        """Window [rows, cols] from (col, row) on; must lie in the image."""
+    @contextmanager
+    def _readable(self, what: str) -> Iterator[None]:
         try:
-            raw = self._dataset().read(1, window=Window(col, row, cols, rows))
+            yield
         except RasterioError as error:
             raise InputError(
-                f"rows {row} to {row + rows} cannot be read ({error})",
+                f"{what} cannot be read ({error})",
                 file=self.path,
                 remedy="the file is damaged or cut short: get it again",
             ) from error
+
+    def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
+        """Window [rows, cols] from (col, row) on; must lie in the image."""
+        dataset, window = self._dataset(), Window(col, row, cols, rows)
+        with self._readable(f"rows {row} to {row + rows}"):
+            raw = dataset.read(1, window=window)
+            seen = None
+            if self._alpha is not None:
+                seen = dataset.read(self._alpha, window=window)
+            elif self._masked:
+                seen = dataset.read_masks(1, window=window)
         values = raw.astype(np.float32)
         values[raw == self.nodata] = np.nan
+        if seen is not None:
+            values[seen == 0] = np.nan
+        if self._lowest > -np.inf and (below := values < self._lowest).any():
+            if not self._told:
+                self._told = True
+                log.warning(
+                    "%s: values below %g (%g) are taken as nodata; declare its nodata value",
+                    self.path.name,
+                    self._lowest,
+                    float(values[below][0]),
+                )
+            values[below] = np.nan
         return values if self.gain == 1.0 else values * np.float32(self.gain)
+
+    def check_blocks(self, workers: int = 1) -> None:
+        """Refuse a TIFF of which GDAL would read damaged blocks in silence; reads all of it."""
+        if problem := damaged_block(self.path, workers):
+            raise InputError(
+                problem, file=self.path, remedy="the file is damaged or cut short: get it again"
+            )
 
     def close(self) -> None:
         """Close the handles of all threads."""

@@ -202,6 +202,7 @@ def rectify(
             }
             if view == "left":
                 attrs |= left_attrs or {}
+            source.check_blocks(workers)
             grid = stack.enter_context(
                 making(
                     store,

@@ -33,6 +33,23 @@ SCALARS = (
     "long_scale",
     "height_scale",
 )
+# The largest size that a sensor's offsets (px, degrees, m) and coefficients can have, with a wide
+# margin: an image of 10 million px, of the whole Earth. Old cropping tools leave scales alone, so
+# that normalised image coordinates, and with them numerators, may reach some hundreds.
+LIMITS = {
+    "line_off": 1e7,
+    "samp_off": 1e7,
+    "lat_off": 90.0,
+    "long_off": 360.0,
+    "height_off": 12e3,
+    "line_scale": 1e7,
+    "samp_scale": 1e7,
+    "lat_scale": 90.0,
+    "long_scale": 360.0,
+    "height_scale": 30e3,
+    "coeff": 1e6,
+}
+SMALLEST_SCALE = 1e-9
 VECTORS = ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff")
 
 
@@ -183,8 +200,8 @@ def _batch(kernel: Any, packed: Floats, *coordinates: ArrayLike) -> tuple[Floats
 class RPC:
     """RPC00B: offsets and scales in px, degrees and m; coefficients float64[20] in RPC00B order.
 
-    Raises ValueError, naming the field, if one is not finite, a scale is zero or a denominator
-    vanishes.
+    Raises ValueError, naming the field, if one is not finite or beyond :data:`LIMITS`, a scale is
+    zero or a denominator vanishes.
     """
 
     line_off: float
@@ -207,17 +224,19 @@ class RPC:
             value = float(getattr(self, name))
             if not np.isfinite(value):
                 raise ValueError(f"{name} is not finite")
-            if name.endswith("_scale") and value == 0.0:
+            if name.endswith("_scale") and abs(value) < SMALLEST_SCALE:
                 raise ValueError(f"{name} is zero")
+            if abs(value) > LIMITS[name]:
+                raise ValueError(f"{name} is {value:g}, no sensor's is beyond {LIMITS[name]:g}")
             object.__setattr__(self, name, value)
-        if abs(self.lat_off) > 90 or abs(self.long_off) > 360:
-            raise ValueError(f"lat_off {self.lat_off}, long_off {self.long_off} are no degrees")
         for name in VECTORS:
             values = np.array(getattr(self, name), dtype=np.float64).reshape(-1)
             if values.size != 20:
                 raise ValueError(f"{name} has {values.size} coefficients instead of 20")
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} holds a coefficient that is not finite")
+            if np.abs(values).max() > LIMITS["coeff"]:
+                raise ValueError(f"{name} holds {values[np.abs(values).argmax()]:g}")
             if "_den_" in name and not values.any():
                 raise ValueError(f"{name} is zero throughout")
             values.setflags(write=False)

@@ -11,6 +11,7 @@ from rasterio.errors import RasterioError
 
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
+from .decimal_numbers import decimal_number
 from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")
@@ -34,41 +35,65 @@ _RPB_NAMES = {
 }
 
 
+MAX_BYTES = 1_000_000  # of an RPC file; they have some 8000
+
+
 def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.replace(",", " ").split()]
+    return [decimal_number(word) for word in text.replace(",", " ").split()]
+
+
+def _number(text: str) -> float:
+    """The number that a value begins with; its unit may follow, another number must not."""
+    number, *rest = text.split()
+    if any(word[0] in "+-.0123456789" for word in rest):
+        raise ValueError(f"{text[:40]!r} is more than one number")
+    return decimal_number(number)
+
+
+def _put(found: dict[str, Any], name: str, value: Any) -> None:
+    if name in found and found[name] != value:
+        raise ValueError(f"{name} is there twice, with different values")
+    found[name] = value
 
 
 def _parse_rpc_text(text: str) -> dict[str, Any]:
     """Fields of a ``_RPC.TXT``: ``LINE_OFF: 123.0 pixels``, ``LINE_NUM_COEFF_1: 1.0E-3``."""
     found: dict[str, Any] = {}
-    numbered: dict[str, dict[int, float]] = {}
-    for key, value in re.findall(r"^\s*([A-Za-z_]+\w*)\s*[:=]\s*(.*?)\s*$", text, re.MULTILINE):
-        name = key.lower()
-        if name in SCALARS:
-            found[name] = _numbers(value.split()[0])[0] if value else float("nan")
-        elif name in VECTORS:
-            found[name] = _numbers(value)
-        elif match := re.fullmatch(r"(\w+_coeff)_(\d+)", name):
-            numbered.setdefault(match[1], {})[int(match[2])] = _numbers(value.split()[0])[0]
-    for name, values in numbered.items():
-        missing = sorted(set(range(1, 21)) - set(values))
-        if missing:
-            raise ValueError(f"{name}_{missing[0]} missing")
-        found[name] = [values[i] for i in range(1, 21)]
+    for line in text.splitlines():
+        key, sign, value = re.match(
+            r"\s*+([A-Za-z_]\w*+)?\s*+([:=]?)(.*)", line, re.DOTALL
+        ).groups()
+        name, value = (key or "").lower(), value.strip()
+        if sign and name in SCALARS:
+            _put(found, name, _number(value) if value else float("nan"))
+        elif sign and name in VECTORS:
+            _put(found, name, _numbers(value))
+        elif sign and re.fullmatch(r"\w+_coeff_[0-9]+", name):
+            _put(found, name, _number(value) if value else float("nan"))
+    for name in VECTORS:
+        if name not in found:
+            missing = [i for i in range(1, 21) if f"{name}_{i}" not in found]
+            if missing:
+                raise ValueError(f"{name}_{missing[0]} missing")
+            found[name] = [found[f"{name}_{i}"] for i in range(1, 21)]
     return found
+
+
+# Possessive (++): a run of letters or blanks is looked at once, however long it is.
+_RPB_ENTRY = re.compile(r"\b(\w++)\s*+=\s*+(?:\(([^()]*+)\)|\"?([^;\n\"(]*+))")
 
 
 def _parse_rpb(text: str) -> dict[str, Any]:
     """Fields of an ``.RPB`` (DigitalGlobe, GF-7): ``lineOffset = 1;``, ``lineNumCoef = (…);``."""
     found: dict[str, Any] = {}
-    for key, group, value in re.findall(r"(\w+)\s*=\s*(?:\(([^)]*)\)|\"?([^;\n\"(]*))", text):
+    for key, group, value in _RPB_ENTRY.findall(text):
         if key.lower() == "specid" and value.strip().upper() == "RPC00A":
             raise ValueError("SpecId is RPC00A, whose terms have another order than RPC00B's")
         name = _RPB_NAMES.get(key.lower())
         if name in VECTORS:
-            found[name] = _numbers(group)
+            _put(found, name, _numbers(group))
         elif name:
-            found[name] = _numbers(value.strip())[0]
+            _put(found, name, _number(value))
     return found
 
 
@@ -79,6 +104,17 @@ def _sidecar(image: Path) -> Path | None:
         if path := names.get((image.stem + ending).lower()):
             return path
     return None
+
+
+def rpc_file(image: str | Path) -> Path:
+    """The file that :func:`read_rpc` takes the RPC of an image from: beside it, or itself."""
+    return _sidecar(Path(image)) or Path(image)
+
+
+def _text_of(file: Path) -> str:
+    if file.stat().st_size > MAX_BYTES:
+        raise ValueError(f"{file.stat().st_size} bytes are more than any RPC has")
+    return file.read_text(encoding="utf-8", errors="replace")
 
 
 def read_rpc(image: str | Path) -> RPC:
@@ -92,14 +128,12 @@ def read_rpc(image: str | Path) -> RPC:
     image = Path(image)
     if not image.is_file():
         raise InputError("no such image", file=image, remedy="correct the path in the scene sheet")
-    source = _sidecar(image)
+    source = rpc_file(image)
     try:
-        if source is not None:
-            text = source.read_text(encoding="utf-8", errors="replace")
+        if source != image:
             parse = _parse_rpb if source.suffix.lower() == ".rpb" else _parse_rpc_text
-            rpc = RPC.from_dict(parse(text))
+            rpc = RPC.from_dict(parse(_text_of(source)))
         else:
-            source = image
             with open_raster(image) as dataset:
                 tags = {key.lower(): value for key, value in dataset.tags(ns="RPC").items()}
             if not tags:

@@ -13,7 +13,7 @@ import numpy as np
 import pyproj
 import rasterio
 from pyproj import CRS
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 from rasterio.io import MemoryFile
 
 from ..errors import InputError
@@ -199,6 +199,24 @@ def _wkt_text(data: bytes) -> str:
     return data.split(b"\0")[0].decode("utf-8", errors="replace").strip()
 
 
+def _held_against_code(meaning: LidarCRS, x: float, y: float) -> LidarCRS:
+    """With a note if a system is another than that of the EPSG code which it names for itself."""
+    identity = _source(meaning.horizontal).to_json_dict().get("id", {})
+    if identity.get("authority") != "EPSG":
+        return meaning
+    try:
+        registered = CRS.from_epsg(identity["code"])
+    except CRSError:
+        return meaning  # newer than PROJ's register
+    if _same_horizontal(meaning.horizontal, registered.to_2d(), x, y):
+        return meaning
+    note = (
+        f"its WKT names EPSG:{identity['code']}, but describes another system, which is used: "
+        "check the file's coordinate system"
+    )
+    return replace(meaning, notes=(*meaning.notes, note))
+
+
 def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     """What the header of a LAS file says about its coordinates, and why not, if nothing usable.
 
@@ -215,7 +233,7 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def attempt(what: str, read) -> None:
         try:
             meaning = read()
-        except (CRSError, ValueError, rasterio.errors.RasterioError) as error:
+        except (ProjError, ValueError, rasterio.errors.RasterioError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
             if meaning is not None:
@@ -223,7 +241,8 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
 
     def wkt() -> None:
         if text := _wkt_text(records.get(2112, b"")):
-            attempt("WKT", lambda: interpret(CRS.from_wkt(text)))
+            x, y = float(header.mins[0]), float(header.mins[1])
+            attempt("WKT", lambda: _held_against_code(interpret(CRS.from_wkt(text)), x, y))
 
     def geokeys() -> None:
         data = records.get(34735, b"")
@@ -240,7 +259,12 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
         read()
     if not found:
         return None, problems
-    return max(found, key=lambda meaning: meaning.has_vertical), problems  # max keeps the first
+    best = max(found, key=lambda meaning: meaning.has_vertical)  # max keeps the first
+    x, y = float(header.mins[0]), float(header.mins[1])
+    if not _same_horizontal(found[0].horizontal, found[-1].horizontal, x, y):
+        note = f"its WKT and its GeoTIFF keys describe different systems: '{best.name}' is used"
+        best = replace(best, notes=(*best.notes, note))
+    return best, problems
 
 
 def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
@@ -256,7 +280,11 @@ def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
         geographic = crs.geodetic_crs
         if geographic is None:
             return False
-        lon, lat = pyproj.Transformer.from_crs(crs, geographic, always_xy=True).transform(x, y)
+        try:
+            degrees = pyproj.Transformer.from_crs(crs, geographic, always_xy=True)
+        except ProjError:  # of a damaged system
+            return False
+        lon, lat = degrees.transform(x, y)
         places.append((lon, lat, geographic.ellipsoid.semi_major_metre))
     difference = np.abs(np.subtract(*places))
     same_datum = np.isfinite(difference).all() and difference[2] < 0.01

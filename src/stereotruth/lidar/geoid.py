@@ -12,6 +12,9 @@ from pyproj import CRS
 from rasterio.windows import Window
 
 from ..errors import InputError
+from ..products.ungeoreferenced import open_raster
+
+FORMATS = ("GTX", "GTiff")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -86,7 +89,7 @@ class GeoidGrid:
                 "no such geoid grid", file=self.path, remedy="give the path of a GTX or GeoTIFF"
             )
         try:
-            with rasterio.open(self.path) as grid:
+            with open_raster(self.path, formats=FORMATS) as grid:
                 transform, crs, driver = grid.transform, grid.crs, grid.driver
                 self.height, self.width = grid.height, grid.width
         except rasterio.errors.RasterioError as error:
@@ -125,7 +128,7 @@ class GeoidGrid:
             if rows is not None:  # keep what is there: chunks of one file overlap
                 first = min(first, self._first_row)
                 last = max(last, self._first_row + len(rows) - 1)
-            with rasterio.open(self.path) as grid:
+            with open_raster(self.path, formats=FORMATS) as grid:
                 window = Window(0, first, self.width, last - first + 1)
                 masked = grid.read(1, window=window, masked=True, out_dtype="float64")
                 rows = masked.filled(np.nan) * grid.scales[0] + grid.offsets[0]

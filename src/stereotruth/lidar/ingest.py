@@ -29,7 +29,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
@@ -44,7 +44,7 @@ from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 from .settings import Settings
-from .to_wgs84 import ToWGS84, check_area, to_wgs84
+from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -150,31 +150,34 @@ def ingest(
     """
     file = Path(lidar_file)
     header = read_header(file)
-    transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
+
+    def transform_of(extent: Floats | None) -> ToWGS84:
+        return to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, extent=extent)
+
+    transform = transform_of(None)
     _refuse_coarse(header, transform, file)
-    notes = list(transform.notes)
-    if remark := surplus_of(header, file):
-        notes.append(remark)
-    tally = PointTally()
     with (
         building(store) as unfinished,
         TemporaryFile(dir=unfinished.parent) as disk,
     ):
         group = zarr.open_group(unfinished, mode="w", zarr_format=3)
-        room = max(min(SCRATCH_POINTS, header.point_count), chunk_points)
-        runs = SortedRuns(np.empty((room, 4), np.int32), disk)
-        chunks = read_chunks(file, header, chunk_points)
-        if workers > 1:
-            chunks = read_ahead(chunks)
-        total = -(-header.point_count // chunk_points)
-        for points in progress(chunks, total, f"{file.name}: chunks of points read"):
-            xyz, attributes = tally.take(points, header, drop_classes)
-            tally.compare_bounds(header, file)
-            lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
-            tally.look(lattice)
-            runs.add(lattice, attributes)
-        if remark := tally.compare_bounds(header, file):
+        reading = (drop_classes, chunk_points, workers, disk)
+        tally, runs = _read(file, header, transform, *reading)
+        own = tally.extent(header)
+        if transform.area != area_of(transform.system.horizontal, own):
+            operation, transform = transform.operation, transform_of(own)
+            if transform.operation != operation:  # the header's box led elsewhere
+                tally, runs = _read(file, header, transform, *reading)
+        notes = list(transform.notes)
+        if remark := surplus_of(header, file):
             notes.append(remark)
+        units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
+        for remark in (
+            tally.compare_bounds(header, units_m, file),
+            tally.compare_returns(header, file),
+        ):
+            if remark:
+                notes.append(remark)
         if runs.written == 0:
             raise InputError(
                 f"no point is left of {tally.read}: {_listed(tally.dropped(drop_classes))}",
@@ -224,7 +227,37 @@ def ingest(
         _listed(tally.dropped(drop_classes)),
         *bounds[4:],
     )
+    log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
     return summary
+
+
+def _read(
+    file: Path,
+    header: laspy.LasHeader,
+    transform: ToWGS84,
+    drop_classes: Sequence[int],
+    chunk_points: int,
+    workers: int,
+    disk: BinaryIO,
+) -> tuple[PointTally, SortedRuns]:
+    """All points of a file, in runs sorted by cell; ``disk`` is scratch for them."""
+    disk.seek(0)
+    disk.truncate()
+    tally = PointTally()
+    room = max(min(SCRATCH_POINTS, header.point_count), chunk_points)
+    runs = SortedRuns(np.empty((room, 4), np.int32), disk)
+    units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
+    chunks = read_chunks(file, header, chunk_points)
+    if workers > 1:
+        chunks = read_ahead(chunks)
+    total = -(-header.point_count // chunk_points)
+    for points in progress(chunks, total, f"{file.name}: chunks of points read"):
+        xyz, attributes = tally.take(points, header, drop_classes)
+        tally.compare_bounds(header, units_m, file)
+        lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
+        tally.look(lattice)
+        runs.add(lattice, attributes)
+    return tally, runs
 
 
 def _listed(dropped: Mapping[str, int]) -> str:

@@ -2,105 +2,69 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import laspy
-import lazrs
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .las_layout import check_layout, wrong_count
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 
+FAR_SHARE, FAR_M = 0.1, 10.0  # of points outside of the header's bounds: see compare_bounds
+_ANEW = "fetch the file again, or have its header written anew if that is what is wrong"
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
 
-_UNREADABLE = (
-    laspy.errors.LaspyException,
-    lazrs.LazrsError,
-    struct.error,
-    EOFError,
-    IndexError,
-    KeyError,
-    OSError,
-    ValueError,
-)
 
+@contextmanager
+def _decoding(refusal: Callable[[BaseException], InputError]) -> Iterator[None]:
+    """Whatever libraries raise on damaged bytes becomes a refusal.
 
-def _wrong_count(file: Path, announced: int, held: str, error: object = "") -> InputError:
-    return InputError(
-        f"truncated or damaged: the header announces {announced} points, {held}"
-        + (f" ({error})" if error else ""),
-        file=file,
-        remedy="fetch or write the file again",
-    )
-
-
-def _points_in_chunk_table(stream: BinaryIO, header: laspy.LasHeader) -> tuple[int, int]:
-    """Least and most number of points that the chunk table of a LAZ file accounts for."""
-    vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
-    stream.seek(header.offset_to_point_data)
-    table = lazrs.read_chunk_table(stream, vlr) or []
-    most = sum(points for points, _ in table)
-    if vlr.uses_variable_size_chunks() or not table:
-        return most, most
-    return most - table[-1][0] + 1, most  # only the last chunk of a fixed size may be shorter
+    Panics of lazrs too, which are no Exception; want of memory not.
+    """
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise refusal(error) from error
 
 
 def read_header(file: str | Path) -> laspy.LasHeader:
-    """Header of a LAS or LAZ file whose number of points agrees with what the file holds.
+    """Header of a LAS or LAZ file whose counts agree with what the file holds.
 
     Raises InputError: missing, no LAS, empty, truncated (both counts are named).
     """
     file = Path(file)
     if not file.is_file():
         raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
-    try:
-        with file.open("rb") as stream:
-            header = laspy.LasHeader.read_from(stream, read_evlrs=False)
-    except _UNREADABLE as error:
-        raise InputError(
-            f"no readable LAS or LAZ file ({error})", file=file, remedy="check or replace the file"
-        ) from error
-    announced = header.point_count
-    room = max(0, file.stat().st_size - header.offset_to_point_data)
-    with file.open("rb") as stream:
-        if header.are_points_compressed:
-            try:
-                least, most = _points_in_chunk_table(stream, header) if announced else (0, 0)
-            except _UNREADABLE as error:
-                held = "0 can be read, as its chunk table is missing"
-                raise _wrong_count(file, announced, held, error) from error
-            if not least <= announced <= most:
-                raise _wrong_count(file, announced, f"its chunks hold {most}")
-        elif room // header.point_format.size < announced:
-            raise _wrong_count(
-                file, announced, f"the file holds {room // header.point_format.size}"
-            )
-        if announced == 0:
-            raise InputError(
-                "the header announces 0 points"
-                + (f", {room} bytes follow it: it was never completed" if room > 100 else ""),
+    check_layout(file)
+    with (
+        _decoding(
+            lambda error: InputError(
+                f"no readable LAS or LAZ file ({error})",
                 file=file,
-                remedy="remove the file, or write it again",
+                remedy="check or replace the file",
             )
-        try:
-            header.read_evlrs(stream)
-        except _UNREADABLE as error:
-            raise InputError(
-                f"its extended variable length records cannot be read ({error})",
-                file=file,
-                remedy="fetch or write the file again",
-            ) from error
+        ),
+        file.open("rb") as stream,
+    ):
+        header = laspy.LasHeader.read_from(stream, read_evlrs=True)
+    by_return = sum(map(int, header.number_of_points_by_return))
+    if by_return > header.point_count:
+        raise wrong_count(file, header.point_count, f"its counts by return add up to {by_return}")
     return header
 
 
@@ -135,14 +99,12 @@ def read_chunks(
     ) as reader:
         while done < header.point_count:
             wanted = min(size, header.point_count - done)
-            try:
+            held = f"decoding failed after {done}"
+            with _decoding(lambda e, held=held: wrong_count(file, header.point_count, held, e)):
                 points = reader.read_points(wanted)
-            except _UNREADABLE as error:
-                held = f"decoding failed after {done}"
-                raise _wrong_count(file, header.point_count, held, error) from error
             done += len(points)
             if len(points) < wanted:
-                raise _wrong_count(file, header.point_count, f"{done} were read")
+                raise wrong_count(file, header.point_count, f"{done} were read")
             yield points
 
 
@@ -164,6 +126,7 @@ class PointTally:
     """What is counted and checked along the way; nothing in it depends on the chunks."""
 
     counts: Integers = field(default_factory=lambda: np.zeros((2, 257), np.int64))  # see _unpack
+    by_return: Integers = field(default_factory=lambda: np.zeros(16, np.int64))  # of all points
     file_limits: Integers = field(default_factory=_no_limits)  # [2, 3], stored integers
     lattice_limits: Integers = field(default_factory=_no_limits)  # [2, 3], kept points
     sample: list[np.ndarray] = field(default_factory=list)
@@ -188,6 +151,7 @@ class PointTally:
             xyz,
             attributes,
             self.counts,
+            self.by_return,
             self.file_limits,
         )
         return xyz[:, :kept], attributes[:kept]
@@ -197,22 +161,29 @@ class PointTally:
         """Points read, dropped ones included."""
         return int(self.counts.sum())
 
+    def extent(self, header: laspy.LasHeader) -> Floats:
+        """Lowest and highest x, y, z of all points, [2, 3]."""
+        return self.file_limits * np.asarray(header.scales) + np.asarray(header.offsets)
+
     def dropped(self, drop_classes: Sequence[int]) -> dict[str, int]:
         """Dropped points by reason; each counts under its first."""
         by_class = {f"class {c}": int(self.counts[1, c]) for c in drop_classes if 0 <= c < 256}
         return {"withheld": int(self.counts[1, 256])} | by_class
 
-    def compare_bounds(self, header: laspy.LasHeader, file: Path) -> str | None:
+    def compare_bounds(
+        self, header: laspy.LasHeader, units_m: tuple[float, float], file: Path
+    ) -> str | None:
         """Refuse points far outside of the header's bounds: a damaged LAZ decodes into noise.
 
-        Returns a remark where they lie outside at all.
+        ``units_m``: metres per unit of the plane and of the heights. Far is :data:`FAR_SHARE` of
+        the side and :data:`FAR_M` more. Returns a remark where they lie outside at all.
         """
-        scale, offset = np.asarray(header.scales), np.asarray(header.offsets)
+        scale = np.asarray(header.scales)
         mins, maxs = np.asarray(header.mins), np.asarray(header.maxs)
         size = maxs - mins
         if not (np.isfinite(size).all() and size.max() > 0):
             return None  # never filled in
-        low, high = self.file_limits * scale + offset
+        low, high = self.extent(header)
         beyond = np.maximum(mins - low, high - maxs)
         if (beyond <= 2 * scale).all():
             return None
@@ -220,9 +191,26 @@ class PointTally:
             f"points reach from {_triple(low)} to {_triple(high)}, "
             f"the header says from {_triple(mins)} to {_triple(maxs)}"
         )
-        if (beyond[:2] > size[:2].max() + 1000).any():
-            raise InputError(f"damaged: {text}", file=file, remedy="fetch or write the file again")
+        metres = np.array([units_m[0], units_m[0], units_m[1]])
+        if (beyond * metres > FAR_SHARE * size * metres + FAR_M).any():
+            raise InputError(f"damaged: {text}", file=file, remedy=_ANEW)
         return text
+
+    def compare_returns(self, header: laspy.LasHeader, file: Path) -> str | None:
+        """Refuse a file whose points are of other returns than its header counts.
+
+        They tell of points that are lost, invented or decoded into noise. Returns a remark where
+        the header has all points under the first return, as careless software writes it.
+        """
+        stated = np.asarray(header.number_of_points_by_return, np.int64)
+        stated = stated if header.version.minor >= 4 else stated[:5]
+        read = self.by_return[1 : 1 + stated.size]
+        if not stated.any() or (stated == read).all():
+            return None
+        text = f"the header counts {_counts(stated)} points by return, {_counts(read)} were read"
+        if stated[0] == header.point_count:
+            return text
+        raise InputError(f"truncated or damaged: {text}", file=file, remedy=_ANEW)
 
     def look(self, lattice: Integers) -> None:
         """Keep the first points for :meth:`refuse_quantised`."""
@@ -262,6 +250,7 @@ def _unpack(
     xyz: Floats,
     attributes: NDArray[np.uint32],
     counts: Integers,
+    by_return: Integers,
     limits: Integers,
 ) -> int:
     """Fill ``xyz`` [3, n] and ``attributes`` [n] with the points to keep; returns their number.
@@ -269,8 +258,8 @@ def _unpack(
     ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
     in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
     class. Attributes are class + 256 return number + 65536 number of returns. ``counts`` [2, 257]:
-    of kept and of dropped points by class, the last of withheld ones. ``limits`` [2, 3]: lowest
-    and highest stored coordinates of all points.
+    of kept and of dropped points by class, the last of withheld ones; ``by_return`` [16]: of all
+    points by return number. ``limits`` [2, 3]: lowest and highest stored coordinates of all.
     """
     kept = 0
     low_x, low_y, low_z = limits[0]
@@ -286,6 +275,7 @@ def _unpack(
         else:
             kind, withheld = flags & 31, flags >> 7
             returns = (returns & 7) << 8 | (returns >> 3 & 7) << 16
+        by_return[returns >> 8 & 15] += 1
         drop = withheld | np.int64(unwanted[kind])
         counts[drop, 256 if withheld == 1 else kind] += 1
         xyz[0, kept] = x * scale[0] + offset[0]
@@ -296,6 +286,10 @@ def _unpack(
     limits[0] = low_x, low_y, low_z
     limits[1] = high_x, high_y, high_z
     return kept
+
+
+def _counts(values: Integers) -> str:
+    return ", ".join(map(str, np.trim_zeros(values, "b").tolist()))
 
 
 def _triple(values: np.ndarray) -> str:

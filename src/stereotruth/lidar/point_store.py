@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -189,6 +190,37 @@ class PointStore:
         corner = np.stack([self.cell_col[first:end], self.cell_row[first:end]]) << CELL_BITS
         kept = _select(*stored, start, corner, np.array(box), *lattice, attributes)
         return Points(*lattice[:, :kept], *attributes[:, :kept])
+
+
+def _datum_and_operation(store: PointStore) -> tuple[str, str]:
+    """The datum that a store's file was in, and what brought it to WGS 84, projections apart."""
+    crs = store.attrs.get("crs", {})
+    datum = re.search(r'(?:DATUM|ENSEMBLE)\["([^"]+)"', crs.get("wkt", ""))
+    steps = crs.get("operation", "").split(" + ")
+    steps = [step for step in steps if not step.startswith(("Inverse of ", "axis order change"))]
+    return datum[1] if datum else "", " + ".join(steps)
+
+
+def open_stores(paths: Iterable[str | Path]) -> tuple[PointStore, ...]:
+    """The point stores of one scene, in the order given.
+
+    Raises InputError, besides what PointStore raises, if two files of one datum were brought to
+    WGS 84 by different transformations: a step of up to metres would run through the scene.
+    """
+    stores = tuple(PointStore(path) for path in paths)
+    first: dict[str, tuple[str, PointStore]] = {}
+    for store in stores:
+        datum, operation = _datum_and_operation(store)
+        other, there = first.setdefault(datum, (operation, store))
+        if other != operation:
+            raise InputError(
+                f"it was brought from {datum} to WGS 84 by '{operation}', but {there.path.name} of "
+                f"the same scene by '{other}'",
+                file=store.path,
+                remedy="make two scenes of the area, or transform the LiDAR files to a system on "
+                "WGS 84 with one transformation for all",
+            )
+    return stores
 
 
 def query_points(

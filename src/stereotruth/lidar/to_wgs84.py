@@ -15,12 +15,15 @@ Rules
 - Map projections are undone by polynomials that are checked against PROJ at run time, see
   :mod:`stereotruth.lidar.projection_polynomials`; a coordinate may come out one step of 1e-9
   degree beside PROJ's.
+- Which datum transformation is best depends on the place: on the whole degrees of longitude and
+  latitude that the points' own extent touches, whatever box the header states.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
   but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -47,7 +50,8 @@ class ToWGS84:
     """Maps coordinates of one LiDAR file to WGS 84; made by :func:`to_wgs84`.
 
     ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
-    ``heights`` what was done with the heights, ``notes`` are remarks for the user.
+    ``heights`` what was done with the heights, ``notes`` are remarks for the user. ``area``: box of
+    longitude and latitude that the operation was chosen for.
     """
 
     system: LidarCRS
@@ -55,6 +59,7 @@ class ToWGS84:
     accuracy_m: float | None
     heights: str
     notes: tuple[str, ...]
+    area: tuple[float, float, float, float] | None
     _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
@@ -103,6 +108,8 @@ def _best_operation(
             always_xy=True,
             area_of_interest=None if area is None else AreaOfInterest(*area),
         )
+    if not group.transformers and area is not None:  # a box that the system does not know
+        return _best_operation(source, None)
     if not group.transformers:
         raise ProjError("PROJ knows no transformation to WGS 84 that needs no grid")
     best = group.transformers[0]
@@ -124,18 +131,25 @@ def _best_operation(
     return best, notes
 
 
-def _area(horizontal: CRS, header: laspy.LasHeader) -> tuple[float, float, float, float] | None:
-    """Longitude and latitude box of the header's bounds, padded; None where it makes no sense."""
+def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, float] | None:
+    """Whole degrees around an extent [2, 2 or more] in a system; None where it makes no sense.
+
+    Whole ones, so that files of one scene have the same.
+    """
     geographic = _source(horizontal).geodetic_crs
     if geographic is None:
         return None
-    x = np.array([header.mins[0], header.maxs[0]])[[0, 0, 1, 1]]
-    y = np.array([header.mins[1], header.maxs[1]])[[0, 1, 0, 1]]
+    x, y = extent[:, 0][[0, 0, 1, 1]], extent[:, 1][[0, 1, 0, 1]]
     degrees = pyproj.Transformer.from_crs(_source(horizontal), geographic.to_2d(), always_xy=True)
     lon, lat = degrees.transform(x, y)
-    box = (lon.min() - 0.01, lat.min() - 0.01, lon.max() + 0.01, lat.max() + 0.01)
-    sensible = np.isfinite(box).all() and np.abs(lon).max() < 179.9 and np.abs(lat).max() < 89.9
-    return tuple(map(float, box)) if sensible else None
+    if not (np.abs(lon).max() < 179 and np.abs(lat).max() < 89):  # no inf, no NaN either
+        return None
+    return (
+        math.floor(lon.min()),
+        math.floor(lat.min()),
+        math.floor(lon.max()) + 1,
+        math.floor(lat.max()) + 1,
+    )
 
 
 def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: str | Path) -> None:
@@ -155,11 +169,13 @@ def to_wgs84(
     *,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
+    extent: np.ndarray | None = None,
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
     ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``geoid``: path of a grid for orthometric
-    heights.
+    heights; ``extent``: lowest and highest coordinates of the points [2, 3], those that the header
+    states if it is not given.
     Raises InputError: no or unusable coordinate system, orthometric heights without a geoid.
     """
     system, notes = resolve(header, lidar_crs or None, file)
@@ -187,8 +203,10 @@ def to_wgs84(
     if not system.has_vertical:
         taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
         notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
+    stated = np.array([header.mins, header.maxs], np.float64)
     try:
-        transformer, remarks = _best_operation(system.horizontal, _area(system.horizontal, header))
+        area = area_of(system.horizontal, stated if extent is None else extent)
+        transformer, remarks = _best_operation(system.horizontal, area)
     except ProjError as error:
         raise InputError(
             f"'{system.name}' cannot be transformed to WGS 84: {error}",
@@ -211,6 +229,7 @@ def to_wgs84(
         accuracy_m=float(transformer.accuracy) if transformer.accuracy >= 0 else None,
         heights=heights,
         notes=tuple(notes + remarks),
+        area=area,
         _transform=transform,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,

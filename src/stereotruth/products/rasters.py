@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +91,11 @@ def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float
     return values
 
 
-def _opened(path: str | Path) -> rasterio.DatasetReader:
+@contextmanager
+def _opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
     try:
-        return open_raster(path)
+        with open_raster(path) as dataset:
+            yield dataset
     except RasterioIOError as error:
         raise InputError(
             f"no image that can be read ({error})", file=path, remedy="copy the file anew"

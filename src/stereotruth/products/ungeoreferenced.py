@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -11,10 +13,26 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 _LOCK = Lock()  # what `catch_warnings` changes, all threads share
+# Formats that hold their pixels. A list, because GDAL knows others (VRT, WMS, STAC …) that fetch
+# them from anywhere, whatever the ending of the file's name.
+FORMATS = (
+    *("GTiff", "JP2OpenJPEG", "JP2ECW", "JP2KAK", "JP2MrSID", "NITF", "PNG", "JPEG"),
+    *("HFA", "ENVI", "EHdr", "PCIDSK"),
+)
+# Files beside an image (overviews, masks) are opened by GDAL itself: none of them from a network.
+os.environ.setdefault("CPL_VSIL_CURL_ALLOWED_FILENAME", "none")
 
 
-def open_raster(path: str | Path, mode: str = "r", **options: Any) -> Any:
-    """``rasterio.open`` without its warning that a file has no georeference; for any thread."""
+def open_raster(
+    path: str | Path, mode: str = "r", *, formats: Sequence[str] = FORMATS, **options: Any
+) -> Any:
+    """``rasterio.open`` without its warning that a file has no georeference; for any thread.
+
+    Files to be read have to be of one of the ``formats`` (names of GDAL's drivers).
+    """
     with _LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(path, mode, **options)
+        if mode != "r":
+            return rasterio.open(path, mode, **options)
+        with rasterio.Env():  # rasterio.open takes one format only
+            return rasterio.DatasetReader(os.fspath(path), driver=list(formats), **options)

@@ -46,6 +46,41 @@ def test_malformed_files_are_refused(tmp_path, content, message):
         read_gcps(file, "Test-1")
 
 
+ROW = "115.1,30.2,50,1.5,2.5,3.5,4.5"
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["A,1_15.1,30.2,50,1,2,3,4"], "line 2, point A: lon '1_15.1' is no number"),
+        (["A,１１５,30.2,50,1,2,3,4"], "point A: lon '１１５' is no number"),
+        (["A,115.1,30.2,50,nan,2,3,4"], "left_col 'nan' is no number"),
+        (["x" * 100_000 + "," + ROW], "line 2: the id 'x+' … of 100000 characters is no name"),
+        (["x" * 200_000 + "," + ROW], "cannot be read .*field"),
+        (["A\x1b[31m," + ROW], "of 6 characters is no name"),
+        (["A," + ROW, "B," + ROW], "lines 2 and 3 are one point under two ids, A and B"),
+        (
+            ["A," + ROW, "B,115.1,30.2,50.0,1.50,2.5,,"],
+            "lines 2 and 3 are one point under two ids, A and B",
+        ),
+    ],
+)
+def test_rows_that_are_not_what_they_seem_are_refused(tmp_path, rows, message):
+    file = tmp_path / "gcps.csv"
+    file.write_text("\n".join([",".join(COLUMNS), *rows]), encoding="utf-8")
+    with pytest.raises(InputError, match=message) as error:
+        read_gcps(file)
+    assert len(str(error.value)) < 1000
+
+
+def test_a_point_measured_twice_is_two_points(tmp_path):
+    """The same ground at other places of the images: each measurement counts."""
+    file = tmp_path / "gcps.csv"
+    rows = ["A," + ROW, "B,115.1,30.2,50,1.6,2.4,3.6,4.4", r"$\frac$,115.2,30.2,50,1,2,,"]
+    file.write_text("\n".join([",".join(COLUMNS), *rows]))
+    assert read_gcps(file).ids == (r"$\frac$", "A", "B")
+
+
 def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_gcps(tmp_path / "none.csv")

@@ -52,3 +52,44 @@ def test_large_shift_and_tilt_are_doubted(images, tmp_path):
     result = run(images, tmp_path, make_gcps(true=true))
     assert any("off by" in text for text in result.warnings)
     assert any("scale or angle" in text for text in result.warnings)
+
+
+def other_rpc(tmp_path, changes, **fields):
+    """A pair whose left RPC is changed, in a file beside the image."""
+    values = {k: np.array(v) for k, v in (RPCS["left"].to_dict() | fields).items()}
+    for name, i, value in changes:
+        values[name][i] = value
+    pair = [write_image(tmp_path / f"{v}.tif", RPCS[v], SIZES[v]) for v in ("left", "right")]
+    lines = []
+    for name, value in values.items():
+        many = value.ndim > 0
+        lines += (
+            [f"{name.upper()}_{i}: {float(v)!r}" for i, v in enumerate(value, 1)]
+            if many
+            else [f"{name.upper()}: {float(value)!r}"]
+        )
+    (tmp_path / "left_RPC.TXT").write_text("\n".join(lines))
+    return pair
+
+
+@pytest.mark.parametrize(
+    ("changes", "fields", "message"),
+    [
+        ([], {"long_off": 15.0}, "left_RPC.TXT: this RPC leads to ground about lon 15.0"),
+        ([("samp_num_coeff", 1, 0.0)], {}, "do not meet the ground|pixels would be"),
+        ([("samp_num_coeff", 13, -1.0)], {}, "m long here and"),
+        ([("line_den_coeff", 1, 3.0)], {}, "denominator vanishes|m long here"),
+        ([], {"lat_scale": 2e-5}, "m long"),
+        ([("samp_num_coeff", 0, 0.05), ("samp_num_coeff", 4, 0.1)], {}, r"RPC: left_RPC.TXT"),
+    ],
+)
+def test_a_wrong_rpc_is_named_not_the_control_points(tmp_path, changes, fields, message):
+    pair = other_rpc(tmp_path, changes, **fields)
+    with pytest.raises(InputError, match=message) as error:
+        align(*pair, write_gcps(tmp_path / "gcps.csv", make_gcps()), provenance={})
+    assert "left_RPC.TXT" in str(error.value)
+
+
+def test_the_rpc_as_it_is_passes(tmp_path):
+    pair = other_rpc(tmp_path, [])
+    align(*pair, write_gcps(tmp_path / "gcps.csv", make_gcps()), provenance={})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,37 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from stereotruth.epipolar.image_reader import Source
+from stereotruth.errors import InputError
+
+from ...synthetic.images import pattern
+
+X, Y = np.meshgrid(np.arange(96.0), np.arange(80.0))
+GREY = pattern(X / 2, Y / 2).round()
+
+
+def write(path: Path, *bands: np.ndarray, mask: np.ndarray | None = None, **options) -> Path:
+    rows, cols = bands[0].shape
+    shape = {"width": cols, "height": rows, "count": len(bands), "dtype": bands[0].dtype}
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=options.pop("internal", True)),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="GTiff", **shape, **options) as dataset:
+            for k, band in enumerate(bands, 1):
+                dataset.write(band, k)
+            if mask is not None:
+                dataset.write_mask(mask)
+    return path
+
+
+def pixels(path: Path) -> tuple[np.ndarray, float]:
+    with Source(path) as source:
+        return source.read(0, 0, *source.size), source.gain
+
+
+def holes(path: Path) -> np.ndarray:
+    return np.isnan(pixels(path)[0])
 
 
 def test_several_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -25,3 +57,112 @@ def test_several_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None
         assert source.size == (9, 8)
         assert source.read(2, 1, 4, 3).shape == (3, 4)
     assert "rgb.tif has 3 bands; band 1 (red) is used" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("dtype", "fill"),
+    [("int16", -9999), ("int16", -32768), ("int32", -9999), ("float32", -9999), ("float64", -1e38)],
+)
+def test_undeclared_fill_values_have_no_value(tmp_path, dtype, fill, caplog) -> None:
+    """They were valid pixels of 1."""
+    values = GREY.astype(dtype)
+    values[10:20, 30:50] = fill
+    path = write(tmp_path / "a.tif", values)
+    with caplog.at_level(logging.WARNING, "stereotruth"):
+        got, gain = pixels(path)
+    np.testing.assert_array_equal(np.isnan(got), values == fill)
+    np.testing.assert_array_equal(got[~np.isnan(got)], GREY[values != fill].astype(np.float32))
+    assert gain == 1
+    assert caplog.text.count("taken as nodata; declare its nodata value") == 1
+
+
+def test_noise_of_reflectances_stays(tmp_path) -> None:
+    values = (GREY / 2000).astype(np.float32)
+    values[5, 5] = -0.001
+    got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert np.isfinite(got).all()
+    assert gain == pytest.approx(10000 / values.max())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1 / 4096])
+def test_a_hot_pixel_does_not_flatten_the_image(tmp_path, scale, caplog) -> None:
+    values = (GREY * scale).astype(np.float32)
+    values[40, 40] = 3e30
+    with caplog.at_level(logging.WARNING, "stereotruth"):
+        got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert 1000 < np.delete(got.ravel(), 40 * 96 + 40).max() < 15000
+    assert got[values < 1e30] == pytest.approx(values[values < 1e30] * gain, rel=1e-6)
+    assert "hot pixels" in caplog.text
+
+
+@pytest.mark.parametrize("dtype", ["uint32", "int32"])
+def test_wide_integers_do_not_saturate(tmp_path, dtype) -> None:
+    values = (GREY * 1000).astype(dtype)
+    got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert gain == pytest.approx(10000 / values.max())
+    np.testing.assert_allclose(got, values * gain, rtol=1e-6)
+    assert pixels(write(tmp_path / "b.tif", GREY.astype(dtype)))[1] == 1  # as they are
+
+
+@pytest.mark.parametrize("internal", [True, False])
+def test_what_a_mask_hides_has_no_value(tmp_path, internal) -> None:
+    mask = np.full(GREY.shape, 255, np.uint8)
+    mask[3:9, 4:8] = 0
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask, internal=internal)
+    np.testing.assert_array_equal(holes(path), mask == 0)
+
+
+@pytest.mark.parametrize("nodata", [None, 5])
+def test_what_is_transparent_has_no_value(tmp_path, nodata) -> None:
+    values, alpha = GREY.astype(np.uint16), np.full(GREY.shape, 65535, np.uint16)
+    alpha[3:9, 4:8] = 0
+    values[30, 30] = 5
+    path = write(tmp_path / "a.tif", values, alpha, alpha="yes", nodata=nodata)
+    expected = alpha == 0
+    expected[30, 30] = nodata is not None
+    np.testing.assert_array_equal(holes(path), expected)
+
+
+@pytest.mark.parametrize("dtype", ["complex64", "complex_int16"])
+def test_complex_images_are_refused(tmp_path, dtype) -> None:
+    path = tmp_path / "a.tif"
+    with pytest.warns(NotGeoreferencedWarning):
+        rasterio.open(path, "w", driver="GTiff", width=9, height=8, count=1, dtype=dtype).close()
+    with pytest.raises(InputError, match=r"a.tif: complex image"):
+        Source(path)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint32", "uint16"])
+@pytest.mark.parametrize("options", [{}, {"compress": "deflate"}])
+def test_truncated_images_are_refused(tmp_path, dtype, options) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(dtype), **options)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(InputError, match=r"a.tif: .*Remedy"), Source(path) as source:
+        source.check_blocks()
+        source.read(0, 0, *source.size)
+
+
+def test_a_file_that_fetches_its_pixels_is_no_image(tmp_path) -> None:
+    """Whatever its name: GDAL would make requests, and read any file."""
+    write(tmp_path / "b.tif", GREY.astype(np.uint16))
+    (tmp_path / "a.tif").write_text(
+        '<VRTDataset rasterXSize="96" rasterYSize="80"><VRTRasterBand dataType="UInt16" band="1">'
+        '<SimpleSource><SourceFilename relativeToVRT="1">b.tif</SourceFilename><SourceBand>1'
+        "</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with pytest.warns(NotGeoreferencedWarning), rasterio.open(tmp_path / "a.tif") as dataset:
+        assert dataset.driver == "VRT"
+    with pytest.raises(InputError, match=r"a.tif: not a raster that GDAL can read"):
+        Source(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("shape", [(1, 1_000_001), (40_000, 40_000)])
+def test_sizes_of_damaged_headers_are_refused(tmp_path, shape) -> None:
+    path = tmp_path / "a.tif"
+    size = {"height": shape[0], "width": shape[1], "blockysize": shape[0], "compress": "lzw"}
+    with pytest.warns(NotGeoreferencedWarning):
+        rasterio.open(
+            path, "w", driver="GTiff", count=1, dtype="uint16", sparse_ok=True, **size
+        ).close()
+    with pytest.raises(InputError, match=r"no image of a satellite|can only be read as a whole"):
+        Source(path)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stereotruth.epipolar.rpc import RPC
-from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.epipolar.rpc_files import read_rpc, rpc_file
 from stereotruth.errors import InputError
 
 from ...synthetic.cameras import ground_points, make_rpc
@@ -105,6 +106,14 @@ def spoiled(name: str, old: str, new: str):
         spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
         spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
         spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
+        spoiled("underscore", "LINE_SCALE: ", "LINE_SCALE: 1_000\nX: "),
+        spoiled("full-width", "LINE_SCALE: ", "LINE_SCALE: １４０００\nX: "),
+        spoiled("two-numbers", "LINE_SCALE: ", "LINE_SCALE: 14 "),
+        spoiled("twice", "LINE_SCALE: ", "LINE_SCALE: 14001.0 pixels\nLINE_SCALE: "),
+        spoiled("no-sensor", "HEIGHT_SCALE: ", "HEIGHT_SCALE: -1e30\nX: "),
+        spoiled("no-image", "LINE_OFF: ", "LINE_OFF: 3e7\nX: "),
+        spoiled("huge-term", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: 1e30\nX: "),
+        spoiled("long", "LINE_OFF: ", "X: " + "y" * 2_000_000 + "\nLINE_OFF: "),
     ],
 )
 def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
@@ -128,6 +137,27 @@ def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
     (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
     with pytest.raises(InputError, match=r"a.rpb: malformed RPC .*Remedy"):
         read_rpc(image)
+
+
+@pytest.mark.parametrize("filling", ["\n", " ", "a", "a=(", "=", "(", "\t\n"])
+@pytest.mark.parametrize(("name", "writer"), [("a_RPC.TXT", rpc_text), ("a.rpb", rpb_text)])
+def test_long_files_take_no_longer_than_their_length(tmp_path, name, writer, filling) -> None:
+    """200 000 blank lines took a pattern hours. Whatever comes of it, it comes."""
+    image = write_image(tmp_path / "a.tif", None)
+    rpc = make_rpc(17)
+    (tmp_path / name).write_text(filling * (400_000 // len(filling)) + "\n" + writer(rpc))
+    if filling.isspace():
+        assert_same(read_rpc(image), rpc)
+        return
+    with contextlib.suppress(InputError):
+        read_rpc(image)
+
+
+def test_where_an_rpc_comes_from(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", make_rpc(13))
+    assert rpc_file(image) == image
+    (tmp_path / "A_rpc.txt").write_text(rpc_text(make_rpc(14)))
+    assert rpc_file(image) == tmp_path / "A_rpc.txt"
 
 
 def test_images_without_rpc_are_refused(tmp_path: Path) -> None:

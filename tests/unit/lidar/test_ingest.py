@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 
 import laspy
@@ -13,6 +14,7 @@ from stereotruth.errors import InputError
 from stereotruth.lidar import cell_sort, lattice, point_store
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.to_wgs84 import to_wgs84
 
 from ...synthetic.las import SOUTH, WEST, everything, refused, write_las
 from ...synthetic.real_data import SHARED
@@ -97,6 +99,25 @@ def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch
         assert not list(store.rglob("*scratch*"))
     assert len(digests) == 1
     assert PointStore(tmp_path / "0.zarr").count == 20_000
+
+
+def test_the_datum_operation_follows_from_the_points(tmp_path, caplog) -> None:
+    """Not from the header's box: one 500 km too large moved every point by up to 1.1 m."""
+    x, y = pyproj.Transformer.from_crs(4326, 23030, always_xy=True).transform(-2.7, 40.3)
+    xyz = np.array([x, y, 600]) + np.random.default_rng(0).uniform(0, 300, (900, 3))
+    write_las(tmp_path / "a.laz", xyz=xyz, system=pyproj.CRS("EPSG:23030"))
+    with caplog.at_level(logging.INFO, "stereotruth"):
+        good = ingest(tmp_path / "a.laz", tmp_path / "good.zarr")
+    assert f"a.laz: brought to WGS 84 by '{good['crs']['operation']}'" in caplog.text
+    data = bytearray((tmp_path / "a.laz").read_bytes())
+    for k, sign in enumerate((1, -1, 1, -1)):
+        at = 179 + 8 * k
+        struct.pack_into("<d", data, at, struct.unpack_from("<d", data, at)[0] + sign * 5e5)
+    (tmp_path / "a.laz").write_bytes(data)
+    header = laspy.open(tmp_path / "a.laz").header
+    assert to_wgs84(header, "a.laz").operation != good["crs"]["operation"]
+    assert ingest(tmp_path / "a.laz", tmp_path / "bad.zarr") == good
+    assert tree_digest(tmp_path / "bad.zarr") == tree_digest(tmp_path / "good.zarr")
 
 
 def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:

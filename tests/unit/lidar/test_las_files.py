@@ -6,6 +6,7 @@ import struct
 
 import laspy
 import numpy as np
+import pyproj
 import pytest
 
 from stereotruth.lidar.ingest import ingest
@@ -74,12 +75,60 @@ def test_missing_and_empty_files(tmp_path) -> None:
 
 
 def test_stale_header_is_remarked(tmp_path) -> None:
+    """Where no counts by return contradict it."""
     file = tmp_path / "a.las"
     write_las(file, 100, pdrf=1, version="1.2")
     assert not ingest(file, tmp_path / "a.zarr")["notes"]
     data = bytearray(file.read_bytes())
     struct.pack_into("<I", data, 107, 80)
     file.write_bytes(data)
+    refused(file, "announces 80 points, its counts by return add up to 100")
+    struct.pack_into("<5I", data, 111, 0, 0, 0, 0, 0)
+    file.write_bytes(data)
     result = ingest(file, tmp_path / "a.zarr")
     assert result["points"]["kept"] == 80
     assert "announces 80 points, which are read; 100 would fit" in result["notes"][0]
+
+
+def test_counts_by_return_are_held_against_the_points(tmp_path) -> None:
+    file = tmp_path / "a.las"
+    write_las(file, 100, pdrf=1, version="1.2", return_number=np.repeat([1, 2], 50))
+    data = bytearray(file.read_bytes())
+    struct.pack_into("<2I", data, 111, 49, 51)
+    file.write_bytes(data)
+    refused(file, "counts 49, 51 points by return, 50, 50 were read")
+    struct.pack_into("<2I", data, 111, 100, 0)  # software that knows no returns
+    file.write_bytes(data)
+    assert "counts 100 points by return" in ingest(file, tmp_path / "a.zarr")["notes"][0]
+
+
+@pytest.mark.parametrize(
+    ("system", "scale", "unit"),
+    [(pyproj.CRS("EPSG:4979"), 1e-7, 1 / 111_320), (pyproj.CRS("EPSG:32650"), 0.001, 1.0)],
+)
+def test_points_outside_of_the_stated_bounds(tmp_path, system, scale, unit) -> None:
+    """A remark for a little, a refusal for more than a tenth of the side; in metres, or degrees."""
+    file = tmp_path / "a.las"
+    base = np.array([114.3, 30.6, 50]) if system.is_geographic else np.array([5e5, 33e5, 50])
+    xyz = base + np.random.default_rng(0).uniform(0, 1, (500, 3)) * [700 * unit, 700 * unit, 9]
+    write_las(file, xyz=xyz, system=system, scale=scale)
+    data = bytearray(file.read_bytes())
+    east = struct.unpack_from("<d", data, 179)[0]
+    struct.pack_into("<d", data, 179, east - 20 * unit)
+    file.write_bytes(data)
+    assert "points reach from" in ingest(file, tmp_path / "a.zarr")["notes"][-1]
+    struct.pack_into("<d", data, 179, east - 200 * unit)
+    file.write_bytes(data)
+    refused(file, "damaged: points reach from")
+
+
+def test_a_panic_of_the_decoder_is_a_refusal(tmp_path, monkeypatch) -> None:
+    """What lazrs raises then is no Exception."""
+    panic = type("PanicException", (BaseException,), {})
+
+    def read_points(self, n):
+        raise panic("index out of bounds")
+
+    write_las(tmp_path / "a.laz", 300)
+    monkeypatch.setattr(laspy.LasReader, "read_points", read_points)
+    refused(tmp_path / "a.laz", "decoding failed after 0 .index out of bounds")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pyproj
 import pytest
 import zarr
 
 from stereotruth.errors import InputError
 from stereotruth.lidar import lattice
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import PointStore, query_points
+from stereotruth.lidar.point_store import PointStore, open_stores, query_points
 
 from ...synthetic.las import everything, write_las
 
@@ -110,3 +111,20 @@ def test_only_finished_point_stores_open(tmp_path) -> None:
     group.attrs["complete"] = True
     with pytest.raises(InputError, match="no point store"):
         PointStore(tmp_path / "other.zarr")
+
+
+def test_files_of_a_scene_share_one_way_to_wgs84(tmp_path) -> None:
+    """Projections may differ, what is done about the datum not."""
+    spain = pyproj.Transformer.from_crs(4326, 23030, always_xy=True)
+    for name, place in (("spain", (-2.7, 40.3)), ("sea", (-2.7, 53.3)), ("other", (-2.6, 40.4))):
+        xyz = np.array([*spain.transform(*place), 60]) + np.random.default_rng(0).uniform(
+            0, 300, (200, 3)
+        )
+        write_las(tmp_path / f"{name}.las", xyz=xyz, system=pyproj.CRS("EPSG:23030"))
+        ingest(tmp_path / f"{name}.las", tmp_path / f"{name}.zarr")
+    write_las(tmp_path / "utm.las", 200)
+    ingest(tmp_path / "utm.las", tmp_path / "utm.zarr")
+    paths = [tmp_path / f"{name}.zarr" for name in ("spain", "other", "utm", "sea")]
+    assert [store.path for store in open_stores(paths[:3])] == paths[:3]
+    with pytest.raises(InputError, match=r"sea.zarr: .*ED50 to WGS 84.*spain.zarr.*Remedy"):
+        open_stores(paths)

@@ -29,6 +29,14 @@ def test_images_are_grey_or_colour(tmp_path):
         read_image(tmp_path / "e.tif")
 
 
+def test_images_that_are_cut_short_are_refused(tmp_path):
+    path = write(tmp_path / "a.tif", np.random.default_rng(0).random((300, 300)), compress="lzw")
+    path.write_bytes(path.read_bytes()[:400_000])
+    for read in (read_image, read_disparity):
+        with pytest.raises(InputError, match=r"a.tif: no image that can be read"):
+            read(path)
+
+
 @pytest.mark.parametrize("bits", [16, 32])  # the published files have 16
 def test_labels_are_nan_where_there_are_none(tmp_path, bits):
     values = np.array([[1.5, -999], [np.inf, -7]], np.float32)

@@ -1,0 +1,107 @@
+"""Damage in TIFFs that GDAL passes over."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from stereotruth.epipolar.tiff_blocks import damaged_block
+from stereotruth.products.ungeoreferenced import open_raster
+
+GREY = np.random.default_rng(0).integers(0, 900, (200, 300)).astype(np.uint16)
+
+
+def write(path, **options):
+    shape = {"width": 300, "height": 200, "count": 1, "dtype": "uint16"}
+    with (
+        pytest.warns(NotGeoreferencedWarning),
+        rasterio.open(path, "w", driver="GTiff", **shape, **options) as dataset,
+    ):
+        dataset.write(GREY, 1)
+    return path
+
+
+@pytest.mark.parametrize("bigtiff", ["YES", "NO"])
+@pytest.mark.parametrize("endianness", ["LITTLE", "BIG"])
+@pytest.mark.parametrize("options", [{}, {"tiled": True, "blockxsize": 64, "blockysize": 64}])
+@pytest.mark.parametrize("compress", ["none", "deflate", "lzw"])
+def test_places_and_checksums(tmp_path, bigtiff, endianness, options, compress) -> None:
+    path = write(
+        tmp_path / "a.tif", bigtiff=bigtiff, endianness=endianness, compress=compress, **options
+    )
+    assert damaged_block(path) == ""
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    assert "past the end" in damaged_block(path) or "directory" in damaged_block(path)
+    damaged = bytearray(data)
+    damaged[len(data) - 2000] ^= 4
+    path.write_bytes(damaged)
+    assert bool(damaged_block(path, workers=2)) == (compress == "deflate")
+
+
+def test_what_gdal_passes_over_is_found(tmp_path) -> None:
+    """It reads some damaged blocks of float32 without a word, and gives other values."""
+    grey = GREY.astype(np.float32)
+    path = tmp_path / "a.tif"
+    shape = {"width": 300, "height": 200, "count": 1, "dtype": "float32"}
+    with open_raster(path, "w", driver="GTiff", **shape, compress="deflate", predictor=3) as target:
+        target.write(grey, 1)
+    good, silent = path.read_bytes(), 0
+    for at in range(1000, 61_000, 1500):
+        data = bytearray(good)
+        data[at] ^= 16
+        path.write_bytes(data)
+        try:
+            with open_raster(path) as dataset:
+                same = np.array_equal(dataset.read(1), grey)
+        except RasterioError:
+            continue
+        assert same or "is damaged" in damaged_block(path)
+        silent += not same
+    assert silent > 0
+
+
+@pytest.mark.parametrize(
+    ("compress", "tag", "value", "match"),
+    [
+        ("deflate", 279, 0, "a place or a size, but not both"),  # GDAL reads zeros
+        ("none", 279, 60, "has 60 bytes, its pixels take"),
+        ("none", 258, 1, "its pixels take"),
+        ("lzw", 259, 1, "its pixels take"),
+        ("deflate", 259, 1, "its pixels take"),
+    ],
+)
+def test_sizes_that_do_not_go_together(tmp_path, compress, tag, value, match) -> None:
+    path = write(tmp_path / "a.tif", compress=compress, blockysize=200)
+    data = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", data, 4)
+    for k in range(struct.unpack_from("<H", data, start)[0]):
+        at = start + 2 + 12 * k
+        if struct.unpack_from("<H", data, at)[0] == tag:
+            struct.pack_into("<I", data, at + 8, value)
+    path.write_bytes(data)
+    assert re.search(match, damaged_block(path))
+
+
+def test_sparse_files_and_other_formats_pass(tmp_path) -> None:
+    path = tmp_path / "a.tif"
+    with pytest.warns(NotGeoreferencedWarning):
+        rasterio.open(
+            path,
+            "w",
+            driver="GTiff",
+            width=900,
+            height=900,
+            count=1,
+            dtype="uint16",
+            sparse_ok=True,
+            compress="deflate",
+        ).close()
+    assert damaged_block(path) == ""
+    (tmp_path / "b.png").write_bytes(b"\x89PNG")
+    assert damaged_block(tmp_path / "b.png") == ""

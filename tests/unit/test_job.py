@@ -1,0 +1,83 @@
+"""What a job says when it fails."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from stereotruth.errors import InputError
+from stereotruth.job import in_own_process, job
+
+
+def test_input_errors_are_one_line_in_any_alphabet(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("LC_ALL", "C")
+    log = tmp_path / "a.log"
+    with pytest.raises(SystemExit), job(log, "ingest ö"):
+        raise InputError("5° − 3 × 2", file="ü.laz", remedy="→ другой")
+    assert "ERROR ingest ö: error: ü.laz: 5° − 3 × 2. Remedy: → другой" in log.read_text("utf-8")
+
+
+def test_panics_of_libraries_are_logged(tmp_path) -> None:
+    """Those of Rust are no Exception; the log was empty."""
+    panic = type("PanicException", (BaseException,), {})
+    with pytest.raises(panic), job(tmp_path / "a.log", "ingest"):
+        raise panic("index out of bounds")
+    text = (tmp_path / "a.log").read_text("utf-8")
+    assert "unexpected failure" in text
+    assert "index out of bounds" in text
+
+
+def test_an_interrupt_is_no_failure(tmp_path) -> None:
+    with pytest.raises(KeyboardInterrupt), job(tmp_path / "a.log", "ingest"):
+        raise KeyboardInterrupt
+    assert (tmp_path / "a.log").read_text("utf-8") == ""
+
+
+def test_work_in_a_process_of_its_own_returns_and_raises(tmp_path) -> None:
+    assert in_own_process(lambda: {"a": [1]}, "a.laz") == {"a": [1]}
+
+    def refuse():
+        raise InputError("is wrong", file="b.laz", remedy="mend it")
+
+    with pytest.raises(InputError, match=r"b.laz: is wrong. Remedy: mend it"):
+        in_own_process(refuse, "a.laz")
+    with pytest.raises(OSError, match="full") as error:
+        in_own_process(lambda: os.write(3, (_ for _ in ()).throw(OSError(28, "full"))), "a.laz")
+    assert error.value.errno == 28
+    assert "Traceback" in error.value.__notes__[0]
+
+
+def test_a_crash_of_that_process_is_a_refusal() -> None:
+    """Some damaged LAZ files crash lazrs."""
+    with pytest.raises(InputError, match=r"a.laz: damaged: the decoder crashed .*-9"):
+        in_own_process(lambda: os.kill(os.getpid(), signal.SIGKILL), "a.laz")
+
+
+def test_that_process_ends_with_its_parent(tmp_path) -> None:
+    """A job that was killed must not publish later."""
+    file = tmp_path / "pid"
+    script = (
+        "import os, time, pathlib; from stereotruth.job import in_own_process\n"
+        f"file = pathlib.Path({str(file)!r})\n"
+        "def work():\n    file.with_suffix('.new').write_text(str(os.getpid()))\n"
+        "    file.with_suffix('.new').rename(file)\n    time.sleep(100)\n"
+        "in_own_process(work, 'a.laz')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script])
+    while not file.exists():
+        assert parent.poll() is None
+        time.sleep(0.05)
+    parent.kill()
+    parent.wait()
+    for _ in range(400):
+        state = Path(f"/proc/{file.read_text()}/stat")
+        if not state.exists() or state.read_text().split(") ")[1][0] == "Z":
+            return
+        time.sleep(0.05)
+    pytest.fail("it is still there")

@@ -1,0 +1,107 @@
+"""Mutants of good files of every format, and environments with little in them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stereotruth
+from stereotruth.alignment.align import align
+from stereotruth.alignment.align_report import write_alignment
+
+from ..synthetic import damage_rounds
+from ..synthetic.damage import BYTES, TEXT, damaged
+from ..synthetic.damage_rounds import REST, Worker, rounds
+from ..synthetic.damaged_cases import synthetic_cases
+from ..synthetic.project import SIZE, row_of
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory):
+    return synthetic_cases(tmp_path_factory.mktemp("damage") / "good")
+
+
+@pytest.mark.slow
+def test_mutants_are_refused_or_right_or_cannot_be_told(cases, tmp_path) -> None:
+    """The table of docs/damaged_input.md, with a seed of its own."""
+    outcomes = list(rounds(cases, 600, 20260, tmp_path))
+    assert [o for o in outcomes if o.came in REST] == []
+    assert max(o.seconds for o in outcomes) < 30
+    assert max(o.mib for o in outcomes) < 2048
+    assert {"refused", "right", "cannot be told"} <= {o.came for o in outcomes}
+
+
+@pytest.mark.slow
+def test_the_harness_would_find_them(cases, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(damage_rounds, "SECONDS", 3.0)
+    file = tmp_path / "good.bin"
+    file.write_bytes(bytes(range(256)))
+    kinds = ("abort", "hang", "memory", "traceback", "other values")
+    wrong = [replace(cases[0], name=k, reader=f"misbehave: {k}", file=file) for k in kinds]
+    worker = Worker(wrong, tmp_path)
+    try:
+        came = {kind: worker.outcome(kind, 5).came for kind in kinds}
+    finally:
+        worker.close()
+    assert came == {k: "traceback" if k == "memory" else k for k in kinds}
+
+
+def test_damage_follows_from_its_seed() -> None:
+    text = b"id,lon\nA,1.5\nB,2.5\n" * 40
+    for ways in (BYTES, TEXT):
+        made = [damaged(text, k, ways) for k in range(300)]
+        assert made == [damaged(text, k, ways) for k in range(300)]
+        assert np.mean([data != text for data, _ in made]) > 0.9
+
+
+def test_ids_with_signs_of_formulas_do_not_break_the_figure(cases, tmp_path) -> None:
+    gcps = next(case.file for case in cases if case.format == "GCP CSV")
+    text = gcps.read_text().replace("G01,", r"$\frac$,").replace("G02,", "$^,")
+    (tmp_path / "gcps.csv").write_text(text)
+    found = align(gcps.with_name("left.tif"), gcps.with_name("right.tif"), tmp_path / "gcps.csv")
+    write_alignment(found, *(tmp_path / f"a.{kind}" for kind in ("json", "csv", "png")))
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("home", ["none", "read-only", "writable"])
+def test_compiled_code_has_a_place_without_a_home_and_with_a_read_only_package(
+    tmp_path, monkeypatch, home
+) -> None:
+    package, real = Path(stereotruth.__file__).parent, os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != package and real(path, mode))
+    (tmp_path / "file").touch()  # nobody can make folders in it
+
+    def where() -> Path:
+        if home == "none":
+            raise RuntimeError("Could not determine home directory.")
+        return tmp_path / ("file" if home == "read-only" else "home")
+
+    monkeypatch.setattr(Path, "home", where)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = Path(stereotruth._compiled_code_folder())
+    if home == "writable":
+        assert folder.parent == tmp_path / "home/.cache/stereotruth"
+        return
+    assert folder.parent == tmp_path / f"stereotruth-{os.getuid()}"
+    assert folder.parent.stat().st_mode & 0o077 == 0
+    folder.parent.chmod(0o777)  # as if made by somebody else, who could put code there
+    assert Path(stereotruth._compiled_code_folder()).parent != folder.parent
+
+
+@pytest.mark.slow
+def test_a_run_without_utf8_says_all_it_has_to_say(data, project, monkeypatch) -> None:
+    """LC_ALL=C ended right runs in UnicodeEncodeError."""
+    monkeypatch.setenv("LC_ALL", "C")
+    monkeypatch.setenv("PYTHONUTF8", "0")
+    shutil.copytree(data, project.folder / "in")
+    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
+    run = project.snakemake("tiles/Tiny", "report", "evaluate", "--configfile", "tiny.yaml")
+    assert run.status == 0, run.text[-4000:]
+    assert "Look at tiles/Tiny/manifest.csv" in run.text
+    assert "UnicodeEncodeError" not in run.text
