@@ -42,6 +42,15 @@ from .adjustment import (
     with_corrections,
 )
 from .aligned_pair import Alignment, ViewFit
+from .lidar_checks import (
+    HeightOffset,
+    control_points_of,
+    doubt_at_gcps,
+    doubt_by_rpcs,
+    height_by_images,
+    height_by_rpcs,
+    pixel_m,
+)
 from .tie_points import Geometry, TiePoints, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -207,16 +216,26 @@ def _search(
 
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
-    """What is odd about a refinement that is applied all the same."""
-    if chi2.sf(found.pull, found.pull_freedom) > DOUBTFUL:
+    """What is odd about tie points that fit each other, by what the alignment is known to."""
+    height = HeightOffset(**record["lidar_height"])
+    if height.doubtful:
+        known = "ground control points' own scatter explains"
+        if not any(fit.gcps for fit in alignment.fits):
+            known = "errors of the RPCs explain"
+        return [
+            f"LiDAR and images differ by {height.offset_m:+.2f} m of height, more than the {known} "
+            f"({height.told_from_m:.2f} m): {record['before']['disparity']['median']:+.2f} px of "
+            f"disparity; check the LiDAR's vertical datum and unit, and the points' heights"
+        ]
+    if chi2.sf(found.contradiction, found.contradiction_freedom) > DOUBTFUL:
         return []
-    ratio = abs(epipolar_model(alignment).report["disparity_px_per_m"]["mean"])
-    offset = record["before"]["disparity"]["median"]
+    col, row = found.alone[2], found.alone[5]
     return [
-        "LiDAR and images differ by more than the ground control points' own scatter explains: "
-        f"{offset:+.2f} px of disparity ({offset / ratio:+.2f} m of height), "
+        "LiDAR and images differ by more than the uncertainty of the alignment explains: tie "
+        f"points alone would move the left image by ({col:+.1f}, {row:+.1f}) px, with "
+        f"{record['before']['disparity']['median']:+.2f} px of disparity and "
         f"{record['before']['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
-        "vertical datum and the points' heights"
+        "coordinate system and the points' coordinates"
     ]
 
 
@@ -258,32 +277,46 @@ def refine(
     with open_pair(left_image, right_image) as (left, right):
         stores = [PointStore(path) for path in sorted(Path(p) for p in point_stores)]
         prior = prior_of(alignment)
+        gcps = control_points_of(alignment)
+        sensors = alignment.left, alignment.right
+        doubts = [
+            doubt_at_gcps(gcps, stores, pixel_m(alignment)) if gcps else "",
+            doubt_by_rpcs(stores, sensors),
+        ]
+        doubts = [text for text in doubts if text]
         result = _search(alignment, (left, right), stores, prior)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
-        if not any(fit.gcps for fit in alignment.fits):
+        if not gcps:
             raise InputError(
-                f"no alignment without ground control points: {result}{of}",
+                f"no alignment without ground control points: {'; '.join([result, *doubts])}{of}",
                 file=left_image,
                 remedy="measure GCPs, and check that LiDAR and images show the same ground",
             )
-        _warn([f"not refined: {result}"], strict, left_image, of)
+        doubts = [f"not refined: {result}", *doubts]
+        _warn(doubts, strict, left_image, of)
         record = {"applied": False, "reason": result}
-        return replace(alignment, refinement=record, provenance=record_of), None
+        warnings = (*alignment.warnings, *doubts)
+        return (
+            replace(alignment, warnings=warnings, refinement=record, provenance=record_of),
+            None,
+        )
     observations, found, refined = result
     insignificant = _chance(found) > SIGNIFICANT
     reason = "the tie points do not contradict the alignment" if insignificant else ""
     record = _record(alignment, refined, observations, found, reason)
+    offset = height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined)
+    record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     if insignificant:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
         observations = replace(observations, after=observations.before)
         record["after"] = record["before"]
-    doubts = [] if insignificant else _doubts(alignment, record, found)
+    doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
     height = alignment.reference_height
-    if not any(fit.gcps for fit in alignment.fits):  # it was that of the RPCs, far off perhaps
+    if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
