@@ -110,8 +110,8 @@ def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pix
     candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
     counts = np.array([agreeing(shift) for shift in candidates])
     best = int(np.argmax(counts))
-    near = [d[np.argmin(np.abs(d - candidates[best]))] for d in around]
-    shift = float(np.median([d for d in near if abs(d - candidates[best]) <= tolerance]))
+    near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
+    shift = float(np.median([np.median(d) for d in near if d.size]))
     cause = (
         f"{counts[best]} would agree with it if it were {abs(shift):.1f} m "
         f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
@@ -173,7 +173,7 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     return HeightOffset(offset, sigma, float(norm.isf(CHANCE / 2)) * sigma)
 
 
-def height_by_rpcs(alignment: Alignment, refined: Alignment) -> HeightOffset:
+def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:
     """The same where nothing is known but that RPC errors have no preferred direction.
 
     Of the four shifts of both images (two each), one combination looks like a fault of heights;
@@ -187,7 +187,7 @@ def height_by_rpcs(alignment: Alignment, refined: Alignment) -> HeightOffset:
         rpc = np.linalg.solve(after.affine[:, :2], middle - after.affine[:, 2])
         shifts.append(middle - before.affine @ (*rpc, 1.0))
         covariance[2 * k : 2 * k + 2, 6 * k : 6 * k + 6] = after.design(*middle)
-    covariance = covariance @ refined.covariance @ covariance.T
+    covariance = covariance @ found.covariance @ covariance.T
     along = -look.ravel() / length
     moved = np.concatenate(shifts)
     amount = float(along @ moved)

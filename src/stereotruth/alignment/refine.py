@@ -305,7 +305,9 @@ def refine(
     insignificant = _chance(found) > SIGNIFICANT
     reason = "the tie points do not contradict the alignment" if insignificant else ""
     record = _record(alignment, refined, observations, found, reason)
-    offset = height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined)
+    offset = (
+        height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
+    )
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     if insignificant:  # what is not applied adds to the uncertainty
