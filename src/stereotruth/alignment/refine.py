@@ -217,25 +217,26 @@ def _search(
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
     """What is odd about tie points that fit each other, by what the alignment is known to."""
+    with_gcps = any(fit.gcps for fit in alignment.fits)
+    before = record["before"]
     height = HeightOffset(**record["lidar_height"])
     if height.doubtful:
-        known = "ground control points' own scatter explains"
-        if not any(fit.gcps for fit in alignment.fits):
-            known = "errors of the RPCs explain"
+        known = "ground control points' own scatter" if with_gcps else "errors of the RPCs"
         return [
-            f"LiDAR and images differ by {height.offset_m:+.2f} m of height, more than the {known} "
-            f"({height.told_from_m:.2f} m): {record['before']['disparity']['median']:+.2f} px of "
-            f"disparity; check the LiDAR's vertical datum and unit, and the points' heights"
+            f"LiDAR and images differ by {height.offset_m:+.2f} m of height "
+            f"({before['disparity']['median']:+.2f} px of disparity), more than the {known} "
+            f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
+            + (", and the points' heights" if with_gcps else "")
         ]
     if chi2.sf(found.contradiction, found.contradiction_freedom) > DOUBTFUL:
         return []
-    col, row = found.alone[2], found.alone[5]
+    others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
         "LiDAR and images differ by more than the uncertainty of the alignment explains: tie "
-        f"points alone would move the left image by ({col:+.1f}, {row:+.1f}) px, with "
-        f"{record['before']['disparity']['median']:+.2f} px of disparity and "
-        f"{record['before']['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
-        "coordinate system and the points' coordinates"
+        f"points alone would move the left image by ({found.alone[2]:+.1f}, "
+        f"{found.alone[5]:+.1f}) px, with {before['disparity']['median']:+.2f} px of disparity "
+        f"and {before['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
+        f"coordinate system, and {others}"
     ]
 
 
