@@ -15,6 +15,7 @@ import argparse
 import csv
 import json
 import logging
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -351,6 +352,7 @@ FAULTS: dict[str, tuple[Callable[[Floats], Floats], str | None]] = {
         for metres in (1.0, 2.0, 5.0, 10.0)
     },
 }
+UNTOLD = "cannot be told"  # what is said of every pair without control points
 CONTROLS = ("all", "four", "none")  # which control points: as they are, four with noise, none
 
 
@@ -426,7 +428,7 @@ def alignment_rows(records: Sequence[Mapping[str, Any]], scene: Scene) -> list[d
                 continue
             row = {"GCPs": what, "planted": kind, "trials": str(len(trials))}
             row["refused"] = str(len(trials) - len(done))
-            row["remarks"] = str(sum(bool(r["remarks"]) for r in done))
+            row["remarks"] = str(sum(any(UNTOLD not in t for t in r["remarks"]) for r in done))
             for name in QUANTITIES[:2]:
                 before, after = ([r[s][name]["rms"] for r in done] for s in ("start", "left"))
                 row[f"{name} px: before"] = f"{np.median(before):.2f}"
@@ -469,12 +471,16 @@ def found(record: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
     words = {
         "not refined": "not refined",
         "ground control points only": "control points",
-        "more than the": "tie points",
-        "tie points alone": "tie points (place)",
+        "m of height (": "tie points' height",
+        "tie points alone": "tie points' place",
         "of the RPC:": "RPC's heights",
     }
-    new = [t for t in record["remarks"] if t not in usual["remarks"]]
-    return ", ".join(dict.fromkeys(w for t in new for k, w in words.items() if k in t)) or "–"
+    new = [text for text in record["remarks"] if text not in usual["remarks"]]
+    told = dict.fromkeys(word for text in new for key, word in words.items() if key in text)
+    untold = next((text for text in record["remarks"] if UNTOLD in text), "")
+    if told or not untold:
+        return ", ".join(told) or "–"
+    return "– (below " + re.search(r"less than (\d+ m)", untold)[1] + ")"
 
 
 def datum_rows(records: Mapping[tuple[str, str], Mapping[str, Any]]) -> list[dict[str, str]]:

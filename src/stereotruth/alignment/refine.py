@@ -318,6 +318,13 @@ def refine(
         record["after"] = record["before"]
     doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
+    if not gcps and not doubts:
+        unknown = (
+            f"without ground control points a fault of the LiDAR's heights of less than "
+            f"{offset.told_from_m:.0f} m cannot be told from errors of the RPCs"
+        )
+        log.warning("warning: %s", unknown)
+        doubts = [unknown]
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
