@@ -164,6 +164,8 @@ def _search(
     for number in range(ROUNDS):
         if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
             sites = choose_sites(current.left, current.right, sizes, stores)
+            if not sites:
+                return "there is no ground that both images show and the LiDAR covers"
             places = find_places(current.left, current.right, sources[0], stores, sites)
             found_at = parameters
             if len(places) < MIN_PLACES:
