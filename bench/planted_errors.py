@@ -470,7 +470,7 @@ def found(record: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
         return "refused"
     words = {
         "not refined": "not refined",
-        "ground control points only": "control points",
+        "point within": "control points",
         "m of height (": "tie points' height",
         "tie points alone": "tie points' place",
         "of the RPC:": "RPC's heights",

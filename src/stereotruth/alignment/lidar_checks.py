@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from ..epipolar.rpc import SensorModel
+from ..lidar.lattice import PER_M
 from ..lidar.point_store import PointStore, query_points
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
@@ -113,21 +114,22 @@ def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pix
     near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
     shift = float(np.median([np.median(d) for d in near if d.size]))
     cause = (
-        f"{counts[best]} would agree with it if it were {abs(shift):.1f} m "
+        f"{counts[best]} would if it were {abs(shift):.1f} m "
         f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
         "feet), and that the points' heights are ellipsoidal"
         if 2 * counts[best] > len(around)
-        else "at no other height would they; check the LiDAR's coordinate system and height unit"
+        else "at no other height would most of them; check the LiDAR's coordinate system and "
+        "height unit"
     )
     return (
-        f"the LiDAR has a point within {tolerance:.1f} m of the height of {here} of {len(around)} "
-        f"ground control points only: {cause}"
+        f"only {here} of {len(around)} ground control points have a LiDAR point within "
+        f"{tolerance:.1f} m of their height: {cause}"
     )
 
 
 def doubt_by_rpcs(stores: Sequence[PointStore], sensors: Sequence[SensorModel]) -> str:
     """A sentence if most of the LiDAR is outside an RPC's heights by more than a quarter."""
-    heights = np.concatenate([s.cell_heights.mean(axis=1) for s in stores]) * 1e-4
+    heights = np.concatenate([s.cell_heights.mean(axis=1) for s in stores]) / PER_M
     counts = np.concatenate([s.cell_counts for s in stores])
     for sensor in sensors:
         low, high = sensor.rpc.ground_box[4:]

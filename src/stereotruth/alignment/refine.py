@@ -137,7 +137,8 @@ def _record(
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
-        "of the images, and y-parallax; changes in px of the original images over the whole image",
+        "of the images, and y-parallax; changes in px of the original images over the whole image; "
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
     }
 
 

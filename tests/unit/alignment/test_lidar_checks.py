@@ -69,7 +69,7 @@ def test_an_offset_is_doubted_and_told(tmp_path, offset):
     told = re.search(r"if it were (\d+\.\d) m (lower|higher)", text)
     assert told[2] == ("lower" if offset > 0 else "higher")
     assert float(told[1]) == pytest.approx(abs(offset), abs=0.11)
-    assert "height of 0 of 9" in text and "vertical datum" in text
+    assert "only 0 of 9" in text and "vertical datum" in text
 
 
 def test_feet_for_metres_are_doubted(tmp_path):
