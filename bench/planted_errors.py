@@ -353,6 +353,7 @@ FAULTS: dict[str, tuple[Callable[[Floats], Floats], str | None]] = {
     },
 }
 UNTOLD = "cannot be told"  # what is said of every pair without control points
+FAR_PX = 1000.0  # farther off, no label is left
 CONTROLS = ("all", "four", "none")  # which control points: as they are, four with noise, none
 
 
@@ -421,7 +422,7 @@ def alignment_rows(records: Sequence[Mapping[str, Any]], scene: Scene) -> list[d
     for what, with_gcps in (("with", True), ("without", False)):
         own = [r for r in records if r["with_gcps"] == with_gcps]
         parts = {kind: [r for r in own if r["kind"] == kind] for kind in KINDS}
-        parts |= {"all": own, "all, no tilt but RPCs'": [r for r in own if usual(r, scene)]}
+        parts |= {"all": own, "all, tilts as RPCs'": [r for r in own if usual(r, scene)]}
         for kind, trials in parts.items():
             done = [r for r in trials if "left" in r]
             if not done:
@@ -494,7 +495,7 @@ def datum_rows(records: Mapping[tuple[str, str], Mapping[str, Any]]) -> list[dic
                 continue
             row[f"{control} control points"] = found(record, records["none", control])
             off = record.get("left", {}).get("disparity", {}).get("mean")
-            row[f"off px ({control})"] = "" if off is None else f"{off:+.2f}"
+            row[f"off px ({control})"] = f"{off:+.2f}" if off and abs(off) < FAR_PX else ""
         rows.append(row)
     return rows
 
