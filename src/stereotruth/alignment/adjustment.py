@@ -47,7 +47,11 @@ class Estimate:
 
     ``ratio``, ``site_ratio`` [2]: standard deviation of a match along and across the rows, and the
     part that a site shares, in units of the match's own. ``statistic``: chi-square of the
-    observations against no change, ``pull``: that of the change against the prior.
+    observations against no change, ``contradiction``: that of the observations against the prior,
+    the uncertainties of both counted.
+
+    ``root`` [12, r]: a root of the prior's covariance; ``normal`` [r, r]: information of the
+    observations about parameters / root; ``alone`` [12]: what they say by themselves.
     """
 
     parameters: Floats
@@ -57,8 +61,24 @@ class Estimate:
     site_ratio: Floats
     statistic: float
     freedom: int
-    pull: float
-    pull_freedom: int
+    contradiction: float
+    contradiction_freedom: int
+    root: Floats
+    normal: Floats
+    alone: Floats
+
+    def amount_along(self, direction: Floats) -> tuple[float, float]:
+        """By how much of a direction [12] observations and prior differ, and its deviation.
+
+        The direction's amount is unknown to the prior: generalised least squares of the difference
+        of both, whose covariance is the sum of theirs.
+        """
+        rank = len(self.normal)
+        along = np.linalg.pinv(self.root) @ direction
+        both = np.linalg.solve(np.eye(rank) + self.normal, self.normal)
+        information = float(along @ both @ along)
+        observed = np.linalg.pinv(self.root) @ self.alone
+        return float(along @ both @ observed) / information, information**-0.5
 
 
 def prior_of(alignment: Alignment) -> Floats:
@@ -149,10 +169,10 @@ def estimate(
         residuals = observed - inner @ z
         if step > 12 and np.abs(inner @ (z - last)).max() < 1e-5:
             break
-    z = np.linalg.solve(np.eye(rank) + normal, right)
+    alone, z = z, np.linalg.solve(np.eye(rank) + normal, right)
     values, vectors = np.linalg.eigh(normal)
     seen = values > 1e-9 * values.max()
-    statistic = float(np.sum((vectors[:, seen].T @ right) ** 2 / values[seen]))
+    values, squares = values[seen], (vectors[:, seen].T @ right) ** 2
     covariance = root @ np.linalg.inv(np.eye(rank) + normal) @ root.T
     return Estimate(
         np.round(root @ z, 8),  # so that the count of threads leaves no trace
@@ -160,10 +180,13 @@ def estimate(
         weights,
         sigma,
         site_sigma,
-        statistic,
+        float(np.sum(squares / values)),
         int(seen.sum()),
-        float(z @ z),
-        rank,
+        float(np.sum(squares / (values + values**2))),
+        int(seen.sum()),
+        root,
+        normal,
+        root @ alone,
     )
 
 

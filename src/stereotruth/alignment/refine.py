@@ -42,6 +42,15 @@ from .adjustment import (
     with_corrections,
 )
 from .aligned_pair import Alignment, ViewFit
+from .lidar_checks import (
+    HeightOffset,
+    control_points_of,
+    doubt_at_gcps,
+    doubt_by_rpcs,
+    height_by_images,
+    height_by_rpcs,
+    pixel_m,
+)
 from .tie_points import Geometry, TiePoints, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -128,7 +137,8 @@ def _record(
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
-        "of the images, and y-parallax; changes in px of the original images over the whole image",
+        "of the images, and y-parallax; changes in px of the original images over the whole image; "
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
     }
 
 
@@ -155,6 +165,8 @@ def _search(
     for number in range(ROUNDS):
         if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
             sites = choose_sites(current.left, current.right, sizes, stores)
+            if not sites:
+                return "there is no ground that both images show and the LiDAR covers"
             places = find_places(current.left, current.right, sources[0], stores, sites)
             found_at = parameters
             if len(places) < MIN_PLACES:
@@ -207,16 +219,27 @@ def _search(
 
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
-    """What is odd about a refinement that is applied all the same."""
-    if chi2.sf(found.pull, found.pull_freedom) > DOUBTFUL:
+    """What is odd about tie points that fit each other, by what the alignment is known to."""
+    with_gcps = any(fit.gcps for fit in alignment.fits)
+    before = record["before"]
+    height = HeightOffset(**record["lidar_height"])
+    if height.doubtful:
+        known = "ground control points' own scatter" if with_gcps else "errors of the RPCs"
+        return [
+            f"LiDAR and images differ by {height.offset_m:+.2f} m of height "
+            f"({before['disparity']['median']:+.2f} px of disparity), more than the {known} "
+            f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
+            + (", and the points' heights" if with_gcps else "")
+        ]
+    if chi2.sf(found.contradiction, found.contradiction_freedom) > DOUBTFUL:
         return []
-    ratio = abs(epipolar_model(alignment).report["disparity_px_per_m"]["mean"])
-    offset = record["before"]["disparity"]["median"]
+    others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
-        "LiDAR and images differ by more than the ground control points' own scatter explains: "
-        f"{offset:+.2f} px of disparity ({offset / ratio:+.2f} m of height), "
-        f"{record['before']['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
-        "vertical datum and the points' heights"
+        "LiDAR and images differ by more than the uncertainty of the alignment explains: tie "
+        f"points alone would move the left image by ({found.alone[2]:+.1f}, "
+        f"{found.alone[5]:+.1f}) px, with {before['disparity']['median']:+.2f} px of disparity "
+        f"and {before['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
+        f"coordinate system, and {others}"
     ]
 
 
@@ -258,32 +281,55 @@ def refine(
     with open_pair(left_image, right_image) as (left, right):
         stores = open_stores(sorted(Path(p) for p in point_stores))
         prior = prior_of(alignment)
+        gcps = control_points_of(alignment)
+        sensors = alignment.left, alignment.right
+        doubts = [
+            doubt_at_gcps(gcps, stores, pixel_m(alignment)) if gcps else "",
+            doubt_by_rpcs(stores, sensors),
+        ]
+        doubts = [text for text in doubts if text]
         result = _search(alignment, (left, right), stores, prior)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
-        if not any(fit.gcps for fit in alignment.fits):
+        if not gcps:
             raise InputError(
-                f"no alignment without ground control points: {result}{of}",
+                f"no alignment without ground control points: {'; '.join([result, *doubts])}{of}",
                 file=left_image,
                 remedy="measure GCPs, and check that LiDAR and images show the same ground",
             )
-        _warn([f"not refined: {result}"], strict, left_image, of)
+        doubts = [f"not refined: {result}", *doubts]
+        _warn(doubts, strict, left_image, of)
         record = {"applied": False, "reason": result}
-        return replace(alignment, refinement=record, provenance=record_of), None
+        warnings = (*alignment.warnings, *doubts)
+        return (
+            replace(alignment, warnings=warnings, refinement=record, provenance=record_of),
+            None,
+        )
     observations, found, refined = result
     insignificant = _chance(found) > SIGNIFICANT
     reason = "the tie points do not contradict the alignment" if insignificant else ""
     record = _record(alignment, refined, observations, found, reason)
+    offset = (
+        height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
+    )
+    record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     if insignificant:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
         observations = replace(observations, after=observations.before)
         record["after"] = record["before"]
-    doubts = [] if insignificant else _doubts(alignment, record, found)
+    doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
+    if not gcps and not doubts:
+        unknown = (
+            f"without ground control points a fault of the LiDAR's heights of less than "
+            f"{offset.told_from_m:.0f} m cannot be told from errors of the RPCs"
+        )
+        log.warning("warning: %s", unknown)
+        doubts = [unknown]
     height = alignment.reference_height
-    if not any(fit.gcps for fit in alignment.fits):  # it was that of the RPCs, far off perhaps
+    if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,

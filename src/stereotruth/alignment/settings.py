@@ -20,7 +20,8 @@ class Settings:
     """true: tie points between LiDAR and both images are matched and what is left between them
     (disparity, y-parallax) is taken out of both corrections, with the ground control points'
     covariance as prior; if the tie points do not contradict the alignment it stays as it is.
-    `results/refine/<city>/<scene>/` says what was seen and changed"""
+    `results/refine/<city>/<scene>/` says what was seen and changed, and doubts heights of the LiDAR
+    that do not fit the control points, the images or the RPCs; with false nothing checks them"""
 
     fixed: Annotated[dict[str, Text], Unit("scene: path")] = field(default_factory=dict)
     """an `alignment.json` that a scene is made with as it is (a published one, or

@@ -188,6 +188,7 @@ def test_lidar_of_another_datum_changes_nothing(images, tmp_path):
     refined, _ = refine(planted, *images, [store])
     assert not refined.refinement["applied"]
     assert refined.refinement["reason"]
+    assert refined.refinement["reason"] in refined.warnings[0]  # so that alignment.json says it
     assert (refined.right.affine == planted.right.affine).all()
 
 
@@ -201,6 +202,37 @@ def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
     with pytest.raises(InputError, match="vertical datum"):
         refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store], strict=True)
     assert "+1.0" in refined.warnings[0] or "+0.9" in refined.warnings[0]
+
+
+def test_lidar_beside_its_place_is_doubted(images, tmp_path):
+    """What the disparities do not see: the common part is told by the slopes."""
+    cloud = lidar()
+    cloud[:, 0] += 2.0 / METRES[0]
+    store = write_points(tmp_path, cloud)
+    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
+    assert len(refined.warnings) == 1 and "coordinate system" in refined.warnings[0]
+    assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
+
+
+@pytest.mark.parametrize(("metres", "doubted"), [(0.0, False), (0.4, False), (-30.0, True)])
+def test_heights_without_control_points_are_held_against_the_rpcs(
+    images, tmp_path, metres, doubted
+):
+    """RPCs that are a px off; a fault of 0.4 m is as likely an error of theirs."""
+    cloud = lidar()
+    cloud[:, 2] += metres
+    store = write_points(tmp_path, cloud)
+    left = np.array([[0.0, 0.0, 0.8], [0.0, 0.0, -1.1]])
+    right = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.6]])
+    refined, _ = refine(start(left, right, 10.0), *images, [store])
+    found = refined.refinement["lidar_height"]
+    assert found["offset_m"] == pytest.approx(metres, abs=3.0)
+    (text,) = refined.warnings
+    assert ("vertical datum" in text) == doubted
+    assert doubted or f"less than {found['told_from_m']:.0f} m cannot be told" in text
+    # The labels' disparities are right all the same, as tie points alone would have them.
+    raised = refined.left.project(LON, LAT, HEIGHT + metres)
+    assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
 
 
 def test_the_order_of_the_stores_changes_nothing(images, tmp_path):

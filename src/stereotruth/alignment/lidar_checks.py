@@ -1,0 +1,199 @@
+"""Doubts about the LiDAR's heights: by the control points, by the images, and by the RPCs.
+
+A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
+the LiDAR along the vertical, which the images see as a shift of both, each along its own line of
+sight. Three witnesses can tell it: the heights of the control points; the tie points, against what
+the alignment's uncertainty allows; and without control points the RPCs, whose errors have no
+reason to look like a fault of heights. Nothing else in the data can: with a pair of RPCs that are
+off by an unknown amount, a common vertical shift is a change of both images like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm, t
+
+from ..epipolar.rpc import SensorModel
+from ..lidar.lattice import PER_M
+from ..lidar.point_store import PointStore, query_points
+from .adjustment import Estimate
+from .align import CAREFUL_SIGMA
+from .aligned_pair import Alignment, GcpResidual
+
+Floats = NDArray[np.float64]
+
+
+LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
+FAR_OFF = 4.0  # deviations that no point of the LiDAR around a control point may lie off it
+CHANCE = 1e-4  # probability that heights without a fault are doubted by the tie points
+CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tell about
+AROUND = 12  # points around a control point that are looked at, or all
+WIDEST_M = 5.0  # within this, or none
+FEWEST_GCPS = 3
+METRES_PER_DEGREE = 111_320.0
+
+
+@dataclass(frozen=True)
+class HeightOffset:
+    """The LiDAR's height minus that of the images, m.
+
+    ``sigma_m``: standard uncertainty, the LiDAR's own and that of the alignment before the
+    refinement counted; ``told_from_m``: a fault of less is not told from these.
+    """
+
+    offset_m: float
+    sigma_m: float
+    told_from_m: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it is more than the uncertainties explain."""
+        return abs(self.offset_m) > self.told_from_m
+
+
+def control_points_of(alignment: Alignment) -> list[GcpResidual]:
+    """The control points that either view uses, by their ids."""
+    used = {g.id: g for fit in alignment.fits for g in fit.gcps if g.used}
+    return [used[name] for name in sorted(used)]
+
+
+def _heights_around(
+    stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float
+) -> NDArray[np.float64]:
+    """Heights m of the points within ``reach_m`` of a control point, or of the AROUND nearest.
+
+    None where there are fewer within WIDEST_M.
+    """
+    metres = METRES_PER_DEGREE * np.array([np.cos(np.radians(gcp.lat)), 1.0])
+    widest = max(WIDEST_M, reach_m)
+    east, north = widest / metres
+    points = query_points(stores, gcp.lon - east, gcp.lat - north, gcp.lon + east, gcp.lat + north)
+    distance = np.hypot((points.lon - gcp.lon) * metres[0], (points.lat - gcp.lat) * metres[1])
+    distance, height = distance[distance <= widest], points.height[distance <= widest]
+    if distance.size < AROUND:
+        return np.empty(0)
+    return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
+
+
+def pixel_m(alignment: Alignment) -> float:
+    """Size of a pixel of the left image on the ground, m."""
+    cols, rows = alignment.left_fit.size
+    ends = [
+        np.array(alignment.left.localize(cols / 2 + step, rows / 2, alignment.reference_height))
+        for step in (-0.5, 0.5)
+    ]
+    lon, lat = ends[1] - ends[0]
+    return METRES_PER_DEGREE * float(np.hypot(lon * np.cos(np.radians(ends[0][1])), lat))
+
+
+def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
+    """A sentence if most control points lie on no point of the LiDAR, else nothing.
+
+    A control point on a roof's corner has ground beside it: any of the points around may be the
+    one that it stands for. ``pixel``: size on the ground, m; a measurement is good to a part of it.
+    """
+    tolerance = FAR_OFF * float(np.hypot(LIDAR_SIGMA_M, CAREFUL_SIGMA[0] * pixel))
+    around = [_heights_around(stores, gcp, pixel) - gcp.height for gcp in gcps]
+    around = [differences for differences in around if differences.size]
+    if len(around) < FEWEST_GCPS:
+        return ""
+
+    def agreeing(shift: float) -> int:
+        return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
+
+    here = agreeing(0.0)
+    if 2 * here >= len(around):
+        return ""
+    candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
+    counts = np.array([agreeing(shift) for shift in candidates])
+    best = int(np.argmax(counts))
+    near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
+    shift = float(np.median([np.median(d) for d in near if d.size]))
+    cause = (
+        f"{counts[best]} would if it were {abs(shift):.1f} m "
+        f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
+        "feet), and that the points' heights are ellipsoidal"
+        if 2 * counts[best] > len(around)
+        else "at no other height would most of them; check the LiDAR's coordinate system and "
+        "height unit"
+    )
+    return (
+        f"only {here} of {len(around)} ground control points have a LiDAR point within "
+        f"{tolerance:.1f} m of their height: {cause}"
+    )
+
+
+def doubt_by_rpcs(stores: Sequence[PointStore], sensors: Sequence[SensorModel]) -> str:
+    """A sentence if most of the LiDAR is outside an RPC's heights by more than a quarter."""
+    heights = np.concatenate([s.cell_heights.mean(axis=1) for s in stores]) / PER_M
+    counts = np.concatenate([s.cell_counts for s in stores])
+    for sensor in sensors:
+        low, high = sensor.rpc.ground_box[4:]
+        margin = (high - low) / 4
+        outside = (heights < low - margin) | (heights > high + margin)
+        if 2 * counts[outside].sum() > counts.sum():
+            return (
+                f"most of the LiDAR, at {np.median(heights):.0f} m, is outside the {low:.0f} to "
+                f"{high:.0f} m of the RPC: are its heights ellipsoidal metres?"
+            )
+    return ""
+
+
+def lines_of_sight(alignment: Alignment) -> Floats:
+    """[2, 2] px: how far a metre of height moves a point in the middle of the left image.
+
+    In the left and the right image, (col, row).
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    moved = []
+    for sensor in (alignment.left, alignment.right):
+        ends = [np.array(sensor.project(lon, lat, height + z)) for z in (-5.0, 5.0)]
+        moved.append((ends[1] - ends[0]) / 10.0)
+    return np.array(moved)
+
+
+def _constants(shifts: Floats) -> Floats:
+    """Parameters [12] of shifts [2, 2] of both images."""
+    parameters = np.zeros(12)
+    parameters[[2, 5, 8, 11]] = shifts.ravel()
+    return parameters
+
+
+def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
+    """The fault of height that tie points and prior would agree with, by generalised least squares.
+
+    ``alignment`` as it came, whose covariance is the prior.
+    """
+    offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
+    sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
+    return HeightOffset(offset, sigma, float(norm.isf(CHANCE / 2)) * sigma)
+
+
+def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:
+    """The same where nothing is known but that RPC errors have no preferred direction.
+
+    Of the four shifts of both images (two each), one combination looks like a fault of heights;
+    the other three, with what is not known of them, say how far these RPCs are off: Student's t.
+    """
+    look = lines_of_sight(alignment)
+    length = float(np.linalg.norm(look))
+    shifts, covariance = [], np.zeros((4, 12))
+    for k, (before, after) in enumerate(zip(alignment.fits, refined.fits)):
+        middle = (np.array(after.size) - 1) / 2
+        rpc = np.linalg.solve(after.affine[:, :2], middle - after.affine[:, 2])
+        shifts.append(middle - before.affine @ (*rpc, 1.0))
+        covariance[2 * k : 2 * k + 2, 6 * k : 6 * k + 6] = after.design(*middle)
+    covariance = covariance @ found.covariance @ covariance.T
+    along = -look.ravel() / length
+    moved = np.concatenate(shifts)
+    amount = float(along @ moved)
+    others = np.eye(4) - np.outer(along, along)
+    square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
+    sigma = float(np.hypot(np.sqrt(square / 3) / length, LIDAR_SIGMA_M))
+    return HeightOffset(amount / length, sigma, float(t.isf(CHANCE_OF_RPCS / 2, 3)) * sigma)
