@@ -12,7 +12,8 @@ there (99 % in a city): what is missing is its outline. So
 3. the ratios are pooled over neighbours that show the same plane, in ROUNDS rounds of mean-field
    updates of a Potts model, in which labels are fixed and *none of them* is one more candidate.
 
-A pixel is labelled if the winner's probability is at least SURE. All is computed in a fixed order
+A pixel is labelled if the winner's probability is at least SURE, and if the ratios of its plane in
+the pixels around say so without their neighbours' help. All is computed in a fixed order
 from the pixels around each pixel alone, so that results do not depend on windows.
 """
 
@@ -29,6 +30,7 @@ from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.warping import warp_rows
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 
@@ -40,7 +42,9 @@ ROUNDS = 10
 PULL = 0.8  # of a neighbour that shows the same plane, in units of the log-likelihood
 CAP = 3.0  # of a pixel's log-likelihood ratio
 SURE = 0.999
-MARGIN = REACH + AROUND + ROUNDS + 2  # px around a pixel that have a say
+BACKERS = 2  # px around a pixel whose
+BACKED = 4.0  # log-likelihood ratios must say so, too: neighbours alone prove nothing
+MARGIN = REACH + AROUND + ROUNDS + BACKERS  # px around a pixel that have a say
 _STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
@@ -176,6 +180,28 @@ def _settle(
         belief[:] = spare
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _backed(
+    row: Steps, col: Steps, best: Ints, index: Steps, plane: Floats, number: Steps, ratio: Floats,
+    out: Floats,
+) -> None:  # fmt: skip
+    """Sum of the log-likelihood ratios of the winner's plane in the open pixels around."""
+    rows, cols = index.shape
+    for i in range(row.size):
+        y, x, k = row[i], col[i], best[i]
+        out[i] = 0.0
+        for b in range(max(y - BACKERS, 0), min(y + BACKERS + 1, rows)):
+            for a in range(max(x - BACKERS, 0), min(x + BACKERS + 1, cols)):
+                j = index[b, a]
+                if j < 0:
+                    continue
+                at = plane[i, k, 0] + plane[i, k, 1] * (a - x) + plane[i, k, 2] * (b - y)
+                for m in range(number[j]):
+                    if abs(plane[j, m, 0] - at) <= SURFACE_PX and not np.isnan(ratio[j, m]):
+                        out[i] += ratio[j, m]
+                        break
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """Open pixels that show a surface: ``row``, ``col`` [n]; its ``disparity`` and ``slope``
@@ -251,6 +277,8 @@ def surfaces_by_images(
     belief, spare = np.zeros((n, MOST + 1)), np.zeros((n, MOST + 1))
     _settle(row, col, index, known, plane, number, ratio, belief, spare)
     best = belief[:, :MOST].argmax(axis=1)
-    take = np.flatnonzero(belief[np.arange(n), best] >= SURE)
+    backed = np.zeros(n)
+    _backed(row, col, best, index, plane, number, ratio, backed)
+    take = np.flatnonzero((belief[np.arange(n), best] >= SURE) & (backed >= BACKED))
     k = best[take]
     return Found(row[take], col[take], plane[take, k, 0], plane[take, k, 1:].T, source[take, k])
