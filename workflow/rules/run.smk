@@ -4,6 +4,8 @@ import json
 import re
 
 from stereotruth.products.locks import FileLock
+from stereotruth.products.publication import end_older_jobs
+from stereotruth.products.runs import begin_run
 
 LOCKS = []  # held until this process ends
 
@@ -25,6 +27,8 @@ def refuse_second_run():
 
 onstart:
     refuse_second_run()
+    end_older_jobs()
+    begin_run()
 
 
 def complaints(snakemake_logs):

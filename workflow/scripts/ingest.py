@@ -3,6 +3,7 @@
 from stereotruth.job import job
 from stereotruth.lidar.ingest import ingest
 from stereotruth.products.provenance import describe
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
@@ -10,7 +11,10 @@ if __name__ == "__main__":
         "lidar_crs": snakemake.params.lidar_crs,
         "drop_classes": snakemake.params.drop_classes,
     }
-    with job(snakemake.log[0], f"ingest {scene}"):
+    with (
+        job(snakemake.log[0], f"ingest {scene}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         ingest(
             snakemake.input.lidar,
             snakemake.output.store,

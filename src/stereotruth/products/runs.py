@@ -1,0 +1,141 @@
+"""Which run of the workflow is the newest in a folder; older ones publish nothing any more.
+
+Jobs may outlive their run: it is killed, the batch system goes on. A run begins by writing its
+name where the jobs of all runs see it. A product takes its place only while the name there is
+that of the job's own run, under a lock that the beginning of a run waits for: when a run has begun,
+nothing of an earlier one can appear. Where locks of files do nothing, the name alone is left: what
+slips through between looking and publishing, a moment, is found afterwards and told.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import threading
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .locks import FileLock
+
+log = logging.getLogger("stereotruth")
+
+KEPT = Path(".snakemake", "stereotruth")  # copied and deleted with Snakemake's own records
+RUN = "STEREOTRUTH_RUN"  # variable of the environment: the run that a job belongs to
+SECONDS = 5.0  # between two looks whether there is a newer run
+
+
+def _newest(folder: Path) -> str:
+    try:
+        return (folder / "run").read_text()
+    except FileNotFoundError:
+        return ""
+
+
+@contextmanager
+def _locked(folder: Path, *, shared: bool) -> Iterator[None]:
+    lock = FileLock(folder / "publishing.lock")
+    try:
+        lock.take("publishing", shared=shared)
+        yield
+    finally:
+        lock.close()
+
+
+def begin_run(folder: Path = KEPT) -> None:
+    """Make a new run the newest; its jobs get its name by the environment."""
+    name = uuid.uuid4().hex
+    with _locked(folder, shared=False):
+        (folder / "run").write_text(name)  # in place: other machines may have it open
+    os.environ[RUN] = name
+
+
+class Run:
+    """The run that this job belongs to."""
+
+    def __init__(self, folder: Path = KEPT) -> None:
+        self._folder = folder
+        self.name = os.environ.get(RUN) or _newest(folder)
+
+    def is_newest(self) -> bool:
+        """Whether no other run has begun since."""
+        return _newest(self._folder) == self.name
+
+    def _refuse_older(self) -> None:
+        if not self.is_newest():
+            raise InputError(
+                "another run has begun here since; this job is of an earlier one and publishes "
+                "nothing",
+                file=Path.cwd(),
+                remedy="none is needed, the other run makes what it needs",
+            )
+
+    @contextmanager
+    def standing(self) -> Iterator[None]:
+        """No other run begins meanwhile. Raises InputError if one has begun before."""
+        with _locked(self._folder, shared=True):
+            self._refuse_older()
+            yield
+            self._refuse_older()  # where locks do nothing
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """End this process soon after another run has begun."""
+        ended = threading.Event()
+
+        def look() -> None:
+            while not ended.wait(SECONDS):
+                if not self.is_newest():
+                    log.error("error: another run has begun here since: this job ends")
+                    os._exit(1)
+
+        threading.Thread(target=look, daemon=True).start()
+        try:
+            yield
+        finally:
+            ended.set()
+
+
+def this_process() -> dict[str, Any]:
+    """What tells this process from all others, of other machines and times too (Linux)."""
+    try:
+        return _process(os.getpid())
+    except OSError:
+        return {}
+
+
+def _process(pid: int) -> dict[str, Any]:
+    return {
+        "boot": Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        "pids": str(Path("/proc/self/ns/pid").readlink()),
+        "pid": pid,
+        "start": Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19],
+    }
+
+
+def end_process(known: Mapping[str, Any]) -> bool:
+    """Kill a process of this machine by what :func:`this_process` said in it; True if it lived.
+
+    A job that is stopped holds its locks, and would wake up to find that it is of no use.
+    """
+    if not known or known["pid"] == os.getpid():
+        return False
+    try:
+        handle = os.pidfd_open(known["pid"])
+    except (OSError, AttributeError):
+        return False
+    try:
+        if _process(known["pid"]) != dict(known):
+            return False
+        signal.pidfd_send_signal(handle, signal.SIGKILL)
+        select.select([handle], [], [], 30.0)
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
