@@ -1,0 +1,561 @@
+"""Jobs whose inputs change while they run, that are stopped, or outlive their killed run.
+
+    python -m tests.workflow.disturbing --rounds 5 scratch/folder [stage …]
+
+makes small cities in the folder, once, and then disturbs each stage: all cities make a product of
+it at the same time, and of each city the job is disturbed by a KIND at a random moment, while the
+run ends well or loses Snakemake alone, or all its processes (KILLS). Then runs follow until
+Snakemake has nothing to do, stopped jobs go on, and runs follow again. A round has left something
+stale if the product is not that of the input that is there, byte by byte, as an undisturbed run
+makes it. A line per round goes to rounds.jsonl in the folder, and at the end the table of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stereotruth.simulate.__main__ import make_scene
+
+from ..synthetic.project import ROOT, SIZE, TINY, Project, row_of
+from ..synthetic.small_pairs import RANGE, small_dataset
+from .killing import family, kill, start
+
+KINDS = ("edit", "replace", "revert", "stop")
+KILLS = ("none", "snakemake", "tree")
+LONGEST = 240.0  # s, that a run may wait for a stopped job before that goes on
+
+
+def _edit_gcps(data: bytes) -> bytes:
+    lines = data.decode().splitlines()
+    cells = lines[1].split(",")
+    cells[4] = f"{float(cells[4]) + 0.5:.4f}"
+    return ("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n").encode()
+
+
+def _edit_laz(data: bytes) -> bytes:
+    import io
+
+    import laspy
+
+    las, out = laspy.read(io.BytesIO(data)), io.BytesIO()
+    las.z = np.asarray(las.z) + 1.0
+    las.write(out, do_compress=True)
+    return out.getvalue()
+
+
+def _edit_alignment(data: bytes) -> bytes:
+    values = json.loads(data)
+    values["left"]["affine"][0][2] += 0.7
+    return (json.dumps(values, indent=1) + "\n").encode()
+
+
+def _edit_image(data: bytes) -> bytes:
+    """Another left image: brighter in every second pixel."""
+    from rasterio.io import MemoryFile
+
+    with MemoryFile(data) as there, there.open() as source:
+        values, profile = source.read(), source.profile
+    values[..., ::2] += 40
+    with MemoryFile() as out:
+        with out.open(**profile) as target:
+            target.write(values)
+        return out.read()
+
+
+def _drop_lines(data: bytes) -> bytes:
+    lines = data.splitlines(keepends=True)
+    return b"".join([lines[0], *lines[1 : 1 + (len(lines) - 1) // 2]])
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A rule, what is edited of its input, and its products; ``{c}`` stands for the city.
+
+    ``other`` makes the other version of a file; the other version of a folder is the product of
+    ``of``, another stage, where that one's own input was edited.
+    """
+
+    rule: str
+    log: str
+    input: str
+    products: tuple[str, ...]
+    other: Callable[[bytes], bytes] | None = None
+    of: str = ""
+
+
+STAGES = {
+    "ingest": Stage(
+        "ingest",
+        "logs/ingest/{c}/{c}-1/Tiny-1_0_0.log",
+        "{c}/lidar/Tiny-1_0_0.laz",
+        ("results/ingest/{c}/{c}-1/Tiny-1_0_0.zarr",),
+        _edit_laz,
+    ),
+    "align": Stage(
+        "align",
+        "logs/align/{c}/{c}-1.log",
+        "{c}/gcps.csv",
+        tuple(
+            f"results/align/{{c}}/{{c}}-1/{n}"
+            for n in ("alignment.json", "residuals.csv", "residuals.png")
+        ),
+        _edit_gcps,
+    ),
+    "refine": Stage(
+        "refine",
+        "logs/refine/{c}/{c}-1.log",
+        "results/align/{c}/{c}-1/alignment.json",
+        tuple(
+            f"results/refine/{{c}}/{{c}}-1/{n}"
+            for n in ("alignment.json", "observations.csv", "refinement.png")
+        ),
+        _edit_alignment,
+    ),
+    "rectify": Stage(
+        "rectify",
+        "logs/rectify/{c}/{c}-1.log",
+        "results/refine/{c}/{c}-1/alignment.json",
+        tuple(
+            f"results/rectify/{{c}}/{{c}}-1/{n}"
+            for n in ("epipolar.json", "left.zarr", "right.zarr")
+        ),
+        _edit_alignment,
+    ),
+    "project": Stage(
+        "project",
+        "logs/project/{c}/{c}-1.log",
+        "results/ingest/{c}/{c}-1/Tiny-1_0_0.zarr",
+        ("results/project/{c}/{c}-1.zarr",),
+        of="ingest",
+    ),
+    "export": Stage(
+        "export",
+        "logs/export/{c}.log",
+        "results/project/{c}/{c}-1.zarr",
+        ("tiles/{c}", "results/export/{c}/matches.csv", "results/export/{c}/summary.json"),
+        of="project",
+    ),
+    "evaluate_images": Stage(
+        "evaluate_images",
+        "logs/evaluate_images/{c}.log",
+        "results/export/{c}/matches.csv",
+        tuple(f"results/evaluate/{{c}}/{n}.csv" for n in ("table4", "sift", "warping")),
+        _drop_lines,
+    ),
+    "report": Stage(
+        "report_city",
+        "logs/report_city/{c}.log",
+        "results/evaluate/{c}/sift.csv",
+        ("results/report/{c}/index.html",),
+        _drop_lines,
+    ),
+    "predict": Stage(
+        "predict_scene",
+        "logs/predict_scene/{c}/{c}-1/sgm.log",
+        "results/rectify/{c}/{c}-1/left.zarr",
+        ("results/predict/{c}/{c}-1/sgm.zarr",),
+        of="rectify",
+    ),
+    "dsm": Stage(
+        "dsm",
+        "logs/dsm/{c}/{c}-1/sgm.log",
+        "results/predict/{c}/{c}-1/sgm.zarr",
+        ("results/predict/{c}/{c}-1/sgm_dsm.tif",),
+        of="predict",
+    ),
+    "match": Stage(
+        "match",
+        "logs/match/{c}/sgm.log",
+        "{c}/pairs/val/left/QC_left_3.tiff",
+        ("results/match/{c}/sgm",),
+        _edit_image,
+    ),
+    "score": Stage(
+        "score",
+        "logs/score/{c}/sgm.log",
+        "{c}/pairs/val/disp/QC_disparity_3.tiff",
+        ("benchmark/{c}/sgm",),
+        _edit_image,
+    ),
+    "audit": Stage(
+        "audit",
+        "logs/audit/{c}.log",
+        "{c}/pairs/val/left/QC_left_3.tiff",
+        ("audit/{c}",),
+        _edit_image,
+    ),
+    "train": Stage(
+        "train",
+        "logs/train/{c}/net.log",
+        "{c}/pairs/train/left/QC_left_0.tiff",
+        tuple(f"results/train/{{c}}/net/{n}" for n in ("best.pt", "curves.csv", "training.json")),
+        _edit_image,
+    ),
+}
+OF_DATASETS = ("match", "score", "audit", "train")
+CONFIG = {
+    **SIZE,
+    "predict": {"block_px": 256, "overlap_px": 32},
+    "training": {"epochs": 2, "crop_px": [32, 64], "device": "cpu"},
+}
+
+
+def city_names(count: int) -> list[str]:
+    return [f"C{k}" for k in range(count)]
+
+
+def make_cities(folder: Path, count: int, data: Path | None = None) -> Project:
+    """The input of so many cities, equal but for their names, and of as many datasets of pairs."""
+    project = Project(folder)
+    if (folder / "my.yaml").exists():
+        return project
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("Snakefile", "workflow", "profiles", "envs", "config", "src"):
+        (folder / name).symlink_to(ROOT / name)
+    cities = city_names(count)
+    if data is None:
+        data = folder / cities[0]
+        make_scene(TINY, TINY.scenes[0], data, spacing_m=0.4, seed=1)
+    for city in cities:
+        if folder / city != data:
+            skip = shutil.ignore_patterns("truth.zarr", "pairs")
+            shutil.copytree(data, folder / city, ignore=skip)
+        small_dataset(folder / city / "pairs")
+    datasets = {
+        c: {"root": f"{c}/pairs", "layout": "whu", "disparity_range": list(RANGE)} for c in cities
+    }
+    methods = {"net": {"kind": "stereonet"}, "sgm": {"kind": "sgm"}}
+    bench = {"datasets": datasets, "methods": methods, "split": "val", "bootstrap": 50}
+    rows = [row_of(Path(c), scene=f"{c}-1", city=c) for c in cities]
+    project.add_scene("my", rows, **CONFIG, benchmark=bench)
+    return project
+
+
+@dataclass
+class Cities:
+    """Cities of a folder, of which each has one of two versions of a stage's input."""
+
+    folder: Path
+    stage: Stage
+    names: Sequence[str]
+
+    def __post_init__(self) -> None:
+        self.aside = self.folder / "aside" / self.stage.rule
+        self.version = dict.fromkeys(self.names, "A")
+
+    def input(self, city: str) -> Path:
+        return self.folder / self.stage.input.format(c=city)
+
+    def products(self, city: str) -> list[Path]:
+        return [self.folder / p.format(c=city) for p in self.stage.products]
+
+    def keep(self, city: str, version: str) -> None:
+        """Lay a copy of the input aside."""
+        place = self.aside / version / city
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        source = self.input(city)
+        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, place / "input")
+
+    def put(self, city: str, version: str, way: str) -> None:
+        """Give a city a version of the input, written in place or put in the place of the old."""
+        source, target = self.aside / version / city / "input", self.input(city)
+        scratch = target.with_name(f".{target.name}.new")
+        if source.is_dir():
+            shutil.copytree(source, scratch)
+            if target.exists():
+                target.rename(target.with_name(f".{target.name}.away"))
+            scratch.rename(target)
+            shutil.rmtree(target.with_name(f".{target.name}.away"), ignore_errors=True)
+        elif way == "replace":
+            shutil.copyfile(source, scratch)
+            scratch.replace(target)
+        else:
+            with target.open("r+b") as stream:
+                stream.write(source.read_bytes())
+                stream.truncate()
+        self.version[city] = version
+
+    def remove_products(self, city: str) -> None:
+        for path in self.products(city):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def hashes(self, city: str) -> dict[str, str]:
+        """Content of the city's products by name, the city's own name taken out."""
+        found = {}
+        for path in self.products(city):
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                if file.is_file() and file.name != ".snakemake_timestamp":
+                    name = str(file.relative_to(self.folder)).replace(city, "{c}")
+                    found[name] = _content(file, city)
+        return found
+
+
+def _content(file: Path, city: str) -> str:
+    if file.suffix == ".pt":
+        import torch
+
+        weights = torch.load(file, weights_only=False)["weights"]
+        data = b"".join(t.numpy().tobytes() for t in weights.values())
+    else:
+        data = file.read_bytes()
+        if file.suffix in (".json", ".csv", ".html", ".txt"):
+            data = data.replace(city.encode(), b"{c}")
+    return hashlib.sha256(data).hexdigest()
+
+
+class Harness:
+    """Disturbs one stage after the other in the cities of a folder."""
+
+    def __init__(self, project: Project, names: Sequence[str], seed: int) -> None:
+        self.project, self.folder, self.names = project, project.folder, list(names)
+        self.rng = random.Random(seed)
+
+    def begin(self, *targets: str):
+        (self.folder / "run.log").write_text("")
+        cores = str(2 * len(self.names))
+        return start(
+            self.folder, *targets, "--configfile", "my.yaml", "--keep-going", "--cores", cores
+        )
+
+    def settle(self, *targets: str, free: Callable[[], None] = lambda: None) -> int:
+        """Runs until there is nothing to do; how many. ``free``: lets stopped jobs go on."""
+        for number in range(1, 7):
+            run = self.begin(*targets)
+            end = time.monotonic() + LONGEST
+            while run.poll() is None:
+                if time.monotonic() > end:
+                    free()
+                time.sleep(0.1)
+            if run.returncode == 0 and "Nothing to be done" in self.said():
+                return number
+        raise AssertionError(f"does not come to rest: {self.said()[-4000:]}")
+
+    def said(self) -> str:
+        return (self.folder / "run.log").read_text()
+
+    def prepare(self, stage: Stage) -> tuple[Cities, dict[str, dict[str, str]]]:
+        """All cities with version A; what the stage makes of A and B, where names say nothing."""
+        cities = Cities(self.folder, stage, self.names)
+        targets = [str(cities.products(c)[0].relative_to(self.folder)) for c in self.names]
+        self.settle(*targets)
+        first = self.names[0]
+        for city in self.names:
+            cities.keep(city, "A")
+        if stage.other is None:
+            self._other_folder(cities, STAGES[stage.of])
+        else:
+            for city in self.names:
+                place = cities.aside / "B" / city
+                place.mkdir(parents=True, exist_ok=True)
+                (place / "input").write_bytes(stage.other(cities.input(city).read_bytes()))
+        self.settle(*targets)
+        found = {"A": cities.hashes(first)}
+        others = [cities.hashes(city) for city in self.names[1:]]
+        cities.put(first, "B", "replace")
+        cities.remove_products(first)
+        begin = time.monotonic()
+        self.settle(targets[0])
+        self.seconds = (time.monotonic() - begin) / 3
+        found["B"] = cities.hashes(first)
+        cities.put(first, "A", "replace")
+        cities.remove_products(first)
+        self.settle(targets[0])
+        others.append(cities.hashes(first))
+        same = {n for n, h in found["A"].items() if all(other.get(n) == h for other in others)}
+        found = {v: {n: h for n, h in of.items() if n in same} for v, of in found.items()}
+        assert found["A"] != found["B"], f"{stage.rule}: both versions give the same"
+        return cities, found
+
+    def _other_folder(self, cities: Cities, of: Stage) -> None:
+        """The product of stage ``of`` of the first city, made of its other input, for all."""
+        first = cities.names[0]
+        upstream = Cities(self.folder, of, [first])
+        upstream.keep(first, "A")
+        if of.other is None:
+            self._other_folder(upstream, STAGES[of.of])
+        else:
+            place = upstream.aside / "B" / first
+            place.mkdir(parents=True, exist_ok=True)
+            (place / "input").write_bytes(of.other(upstream.input(first).read_bytes()))
+        upstream.put(first, "B", "replace")
+        self.settle(str(cities.input(first).relative_to(self.folder)))
+        cities.keep(first, "B")
+        for city in cities.names[1:]:
+            shutil.copytree(cities.aside / "B" / first, cities.aside / "B" / city)
+        upstream.put(first, "A", "replace")
+        self.settle(str(cities.input(first).relative_to(self.folder)))
+        cities.put(first, "A", "replace")
+
+    def batch(self, name: str, cities: Cities, made: dict, kinds: Sequence[str]) -> Iterator[dict]:
+        """One round in each city."""
+        stage, rng = cities.stage, self.rng
+        targets = [str(cities.products(c)[0].relative_to(self.folder)) for c in self.names]
+        plan = {
+            c: {"stage": name, "kind": rng.choice(kinds), "at": rng.uniform(0, 1.2), "city": c}
+            for c in self.names
+        }
+        victim, kill_at = rng.choice(KILLS), rng.uniform(0.2, 1.5)
+        logs = {c: self.folder / stage.log.format(c=c) for c in self.names}
+        for city in self.names:
+            cities.remove_products(city)
+            logs[city].unlink(missing_ok=True)
+        run = self.begin(*targets)
+        began: dict[str, float] = {}
+        stopped: dict[str, int] = {}
+        waiting: dict[str, list[tuple[float, Callable[[], None]]]] = {}
+        killed, all_pids = False, set()
+        limit = time.monotonic() + LONGEST
+        long = self.seconds
+
+        def act(city: str) -> None:
+            kind, pid = plan[city]["kind"], _writer(logs[city], all_pids)
+            way = "replace" if kind == "replace" else rng.choice(("edit", "replace"))
+            plan[city]["alive"] = pid is not None
+            old, new = cities.version[city], "AB".replace(cities.version[city], "")
+            now = time.monotonic()
+            if kind == "stop" and pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGSTOP)
+                stopped[city] = pid
+                if victim == "none":
+                    wait = rng.uniform(0.2, long)
+                    waiting[city] = [(now + wait, lambda: go_on(city))]
+            cities.put(city, new, way)
+            if kind == "revert":
+                again = now + rng.uniform(0.0, long / 2)
+                waiting[city] = [(again, lambda: cities.put(city, old, way))]
+
+        def go_on(city: str) -> None:
+            with suppress(ProcessLookupError):
+                os.kill(stopped.pop(city), signal.SIGCONT)
+
+        def free() -> None:
+            for city in list(stopped):
+                plan[city]["waited"] = True
+                go_on(city)
+
+        todo = set(self.names)
+        while True:
+            now = time.monotonic()
+            if run.poll() is None or (killed and victim == "snakemake"):
+                all_pids |= set(family(run.pid)[0]) if run.poll() is None else set()
+            for city in sorted(todo):
+                if city not in began and logs[city].exists():
+                    began[city] = now
+                due = city in began and now > began[city] + plan[city]["at"] * long
+                if due or run.poll() is not None:
+                    todo.discard(city)
+                    act(city)
+            for city in list(waiting):
+                if run.poll() is not None and not killed and city in stopped:
+                    go_on(city)
+                waiting[city] = [(at, do) for at, do in waiting[city] if at > now or do()]
+                if not waiting[city]:
+                    del waiting[city]
+            first = min(began.values(), default=now)
+            if victim != "none" and not killed and now > first + kill_at * long and began:
+                killed = True
+                if run.poll() is None:
+                    kill(run, victim)
+            if now > limit:
+                free()
+                limit = now + LONGEST
+            if run.poll() is not None and not todo and not waiting:
+                break
+            time.sleep(0.1)
+        runs = self.settle(*targets, free=free)
+        for city in list(stopped):
+            go_on(city)
+        end = time.monotonic() + 60
+        while any(Path(f"/proc/{pid}").exists() for pid in all_pids) and time.monotonic() < end:
+            time.sleep(0.1)
+        if victim != "none":
+            runs += self.settle(*targets)
+        for city in self.names:
+            found = cities.hashes(city)
+            wanted = made[cities.version[city]]
+            stale = sorted(n for n, h in wanted.items() if found.get(n) != h)
+            yield plan[city] | {"kill": victim, "runs": runs, "stale": stale}
+
+    def rounds(self, names: Sequence[str], count: int, kinds: Sequence[str] = KINDS):
+        """Rounds of each of the stages, at least ``count``."""
+        for name in names:
+            cities, made = self.prepare(STAGES[name])
+            done = 0
+            while done < count:
+                for one in self.batch(name, cities, made, kinds):
+                    done += 1
+                    yield one
+                    if one["stale"]:  # begin anew from what is right
+                        cities.remove_products(one["city"])
+            for city in self.names:
+                cities.put(city, "A", "replace")
+                cities.remove_products(city)
+            self.settle(*(str(cities.products(c)[0].relative_to(self.folder)) for c in self.names))
+
+
+def _writer(log: Path, pids: set[int]) -> int | None:
+    """The process that writes a log file."""
+    for pid in sorted(pids):
+        with suppress(OSError):
+            for handle in Path(f"/proc/{pid}/fd").iterdir():
+                if re.sub(r" \(deleted\)$", "", str(handle.readlink())) == str(log):
+                    return pid
+    return None
+
+
+def table(rounds: Sequence[dict]) -> str:
+    """Rounds by stage, kind and kill, and how many left something stale."""
+    lines = []
+    stale = [one for one in rounds if one["stale"]]
+    for key in ("stage", "kind", "kill"):
+        wrong = Counter(one[key] for one in stale)
+        for name, count in Counter(one[key] for one in rounds).items():
+            lines.append(f"{key:6} {name:16} {count:4} rounds, {wrong[name]:3} stale")
+    return "\n".join([*lines, f"{len(rounds)} rounds, {len(stale)} stale"])
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=5, help="of each stage, at least")
+    parser.add_argument("--cities", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--data", type=Path, help="a scene of the small city, if it is made")
+    parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("stages", nargs="*", metavar="stage")
+    given = parser.parse_args()
+    project = make_cities(given.folder.absolute(), given.cities, given.data)
+    harness, found = Harness(project, city_names(given.cities), given.seed), []
+    for one in harness.rounds(given.stages or list(STAGES), given.rounds, given.kinds):
+        found.append(one)
+        with (given.folder / "rounds.jsonl").open("a") as stream:
+            stream.write(json.dumps(one) + "\n")
+        print(json.dumps(one), flush=True)
+    print(table(found))
+    sys.exit(any(one["stale"] for one in found))
+
+
+if __name__ == "__main__":
+    main()
