@@ -77,7 +77,8 @@ def stamp(path: str | Path) -> Stamp:
             state = file.stat() if name else _fresh(file)
         except FileNotFoundError:
             continue
-        row = [name, state.st_size, state.st_mtime_ns, state.st_ino, state.st_dev]
+        # no number of the device: other machines have others for the same file
+        row = [name, state.st_size, state.st_mtime_ns, state.st_ino]
         place.update(json.dumps(row).encode())
         change.update(f"{state.st_ctime_ns} ".encode())
         newest = max(newest, state.st_mtime_ns, state.st_ctime_ns)
@@ -184,5 +185,5 @@ def _mark(path: Path) -> tuple[int, ...]:
     except FileNotFoundError:
         return ()
     if path.is_dir():  # the workflow's own are replaced, never written into
-        return state.st_dev, state.st_ino
-    return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
+        return (state.st_ino,)
+    return state.st_ino, state.st_size, state.st_mtime_ns

@@ -41,7 +41,11 @@ def _newest(folder: Path) -> str:
 def _locked(folder: Path, *, shared: bool) -> Iterator[None]:
     lock = FileLock(folder / "publishing.lock")
     try:
-        lock.take("publishing", shared=shared)
+        if not lock.take(Path.cwd(), shared=shared, wait=False):
+            log.warning(
+                "%s: waiting for a job that is publishing, or a run that begins", Path.cwd()
+            )
+            lock.take(Path.cwd(), shared=shared)
         yield
     finally:
         lock.close()
