@@ -47,11 +47,11 @@ def _files(path: Path) -> Iterator[tuple[str, Path]]:
     written = {here / name for name in WRITTEN_BY_RUNS} if around else set()
     seen = set()
     for folder, folders, names in os.walk(path, followlinks=True):
-        inode = Path(folder).stat().st_ino
-        if inode in seen:  # a link to a folder above
+        state = Path(folder).stat()
+        if (state.st_dev, state.st_ino) in seen:  # a link to a folder above
             folders.clear()
             continue
-        seen.add(inode)
+        seen.add((state.st_dev, state.st_ino))
         folders[:] = sorted(
             name
             for name in folders
