@@ -4,8 +4,7 @@ import json
 import re
 
 from stereotruth.products.locks import FileLock
-from stereotruth.products.publication import end_older_jobs
-from stereotruth.products.runs import begin_run
+from stereotruth.products.runs import begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
 

@@ -22,7 +22,7 @@ from typing import Any
 from ..errors import InputError
 from .inputs import Checksums, Inputs, Marks, marks, refuse_replaced
 from .provenance import digest
-from .runs import KEPT, Run, end_process, this_process
+from .runs import KEPT, Run, listed
 
 log = logging.getLogger("stereotruth")
 
@@ -54,7 +54,7 @@ class _Job:
         self.run = Run()
         self.published: dict[str, Marks] = {}
         with self.run.standing():
-            _write(self.first, {"made": made, "making": this_process()})
+            _write(self.first, {"made": made})
         inputs = list(map(str, inputs))
         self.marks = marks(inputs)
         self.inputs = Inputs(inputs, Checksums(KEPT / "checksums"))
@@ -86,14 +86,15 @@ def publication(inputs: Iterable[str], outputs: Iterable[str], made: str) -> Ite
     Raises InputError if an input changes meanwhile, or another run begins.
     """
     global _job
-    job = _Job(inputs, outputs, made)
-    _job = job
-    try:
-        with job.run.watched():
-            yield
-            job.end()
-    finally:
-        _job = None
+    with listed():
+        job = _Job(inputs, outputs, made)
+        _job = job
+        try:
+            with job.run.watched():
+                yield
+                job.end()
+        finally:
+            _job = None
 
 
 @contextmanager
@@ -146,10 +147,3 @@ def made_of(product: str) -> str:
             log.warning("%s is made again: %s changed", product, ", ".join(sorted(other)))
             return digest({"before": record["made"], "inputs": other})
     return record.get("made", "")
-
-
-def end_older_jobs() -> None:
-    """Kill what is left on this machine of earlier runs that were killed."""
-    for file in (KEPT / "made").rglob("*.json"):
-        if end_process(_read(file).get("making", {})):
-            log.warning("%s: a job of an earlier run was still at work: ended", file.stem)

@@ -9,6 +9,7 @@ slips through between looking and publishing, a moment, is found afterwards and 
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import select
@@ -105,15 +106,8 @@ class Run:
             ended.set()
 
 
-def this_process() -> dict[str, Any]:
-    """What tells this process from all others, of other machines and times too (Linux)."""
-    try:
-        return _process(os.getpid())
-    except OSError:
-        return {}
-
-
 def _process(pid: int) -> dict[str, Any]:
+    """What tells a process from all others, of other machines and times too (Linux)."""
     return {
         "boot": Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
         "pids": str(Path("/proc/self/ns/pid").readlink()),
@@ -122,19 +116,49 @@ def _process(pid: int) -> dict[str, Any]:
     }
 
 
-def end_process(known: Mapping[str, Any]) -> bool:
-    """Kill a process of this machine by what :func:`this_process` said in it; True if it lived.
+@contextmanager
+def listed(folder: Path = KEPT) -> Iterator[None]:
+    """This process is among those that :func:`end_older_jobs` ends, if its run has been killed."""
+    file = folder / "jobs" / f"{uuid.uuid4().hex}.json"
+    try:
+        me = _process(os.getpid())
+    except OSError:  # no Linux
+        yield
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(me))
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)
 
-    A job that is stopped holds its locks, and would wake up to find that it is of no use.
+
+def end_older_jobs(folder: Path = KEPT) -> None:
+    """Kill what is left on this machine of earlier runs that were killed.
+
+    They could publish nothing, and one that is stopped would keep its locks.
     """
-    if not known or known["pid"] == os.getpid():
+    for file in (folder / "jobs").glob("*.json"):
+        try:
+            known = json.loads(file.read_text())
+            here = _process(os.getpid())
+        except (OSError, json.JSONDecodeError):
+            continue
+        if any(known.get(key) != here[key] for key in ("boot", "pids")) or known == here:
+            continue
+        if _end(known):
+            log.warning("process %d of an earlier run was still at work: ended", known["pid"])
+        file.unlink(missing_ok=True)
+
+
+def _end(known: Mapping[str, Any]) -> bool:
+    """Kill a process, if it is that one still."""
+    try:
+        handle = os.pidfd_open(known["pid"])  # never that of a later process of the same number
+    except OSError:
         return False
     try:
-        handle = os.pidfd_open(known["pid"])
-    except (OSError, AttributeError):
-        return False
-    try:
-        if _process(known["pid"]) != dict(known):
+        if _process(known["pid"]) != known:
             return False
         signal.pidfd_send_signal(handle, signal.SIGKILL)
         select.select([handle], [], [], 30.0)

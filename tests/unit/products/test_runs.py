@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import time
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.runs import RUN, Run, begin_run, end_process, this_process
+from stereotruth.products.runs import RUN, Run, begin_run, end_older_jobs, listed
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
@@ -68,30 +69,49 @@ def test_a_run_that_slips_in_where_locks_do_nothing_is_told(folder, monkeypatch)
         (folder / "run").write_text("another")
 
 
-CHILD = "import json, sys, time; from stereotruth.products.runs import this_process; \
-print(json.dumps(this_process()), flush=True); time.sleep(60)"
+CHILD = """
+import sys, time
+from pathlib import Path
+from stereotruth.products.runs import listed
+with listed(Path(sys.argv[1])):
+    print("at work", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def child(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(folder)], stdout=subprocess.PIPE, text=True
+    )
+    process.stdout.readline()
+    yield process
+    process.kill()
+    process.wait()
 
 
 @linux
 @pytest.mark.parametrize("stopped", [False, True])
-def test_a_process_is_ended_by_what_it_said_of_itself(stopped):
-    import json
-
-    child = subprocess.Popen([sys.executable, "-c", CHILD], stdout=subprocess.PIPE, text=True)
-    known = json.loads(child.stdout.readline())
-    for other in ({**known, "start": "1"}, {**known, "boot": "x"}, {**known, "pids": "x"}, {}):
-        assert not end_process(other)
-    assert child.poll() is None
+def test_jobs_of_earlier_runs_are_ended(folder, child, stopped):
     if stopped:
         child.send_signal(signal.SIGSTOP)
-    assert end_process(known)
-    assert child.wait(10) == -signal.SIGKILL
-    assert not end_process(known)
+    with listed(folder):  # this process stays
+        end_older_jobs(folder)
+        assert child.wait(10) == -signal.SIGKILL
+        assert len(list((folder / "jobs").iterdir())) == 1
+    assert list((folder / "jobs").iterdir()) == []
 
 
 @linux
-def test_a_process_does_not_end_itself():
-    assert not end_process(this_process())
+@pytest.mark.parametrize("other", [{"start": "1"}, {"boot": "x"}, {"pids": "x"}])
+def test_other_processes_are_left_alone(folder, child, other):
+    """Of another machine, or with the number of one that has ended."""
+    (file,) = (folder / "jobs").iterdir()
+    file.write_text(json.dumps(json.loads(file.read_text()) | other))
+    end_older_jobs(folder)
+    time.sleep(0.2)
+    assert child.poll() is None
+    assert file.exists() == ("start" not in other)
 
 
 WATCHED = """
