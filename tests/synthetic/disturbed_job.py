@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import random
 import signal
@@ -27,31 +28,31 @@ from stereotruth.products.publication import made_of, publication
 from stereotruth.products.runs import begin_run, end_older_jobs
 
 SOURCE, FILE, FOLDER = Path("in.csv"), Path("out/a.json"), Path("out/b")
-KINDS = ("edit", "replace", "revert", "touch back")
+KINDS = ("edit", "replace", "revert", "touch back", "setting", "late")
 ENDS = ("none", "orphan", "stop", "stop elsewhere", "kill")
 
 
-def _work(made: str, slow: float) -> None:
-    """Both products say what was read."""
+def _work(made: str, setting: str, slow: float) -> None:
+    """Both products say what was read, and a setting of the run."""
     with publication([str(SOURCE)], [str(FILE), str(FOLDER)], made):
         first = SOURCE.read_text()
         time.sleep(slow)
         with replacing(FILE) as scratch:
-            scratch.write_text(first)
+            scratch.write_text(first + setting)
             time.sleep(slow / 4)
         with whole_folder(FOLDER) as scratch:
-            (scratch / "1").write_text(SOURCE.read_text())
+            (scratch / "1").write_text(SOURCE.read_text() + setting)
             time.sleep(slow / 4)
 
 
-def _start(made: str, slow: float) -> int:
+def _start(made: str, setting: str, slow: float) -> int:
     pid = os.fork()
     if pid:
         return pid
     status = 1
     try:
         with suppress(InputError):
-            _work(made, slow)
+            _work(made, setting, slow)
             status = 0
     finally:
         os._exit(status)
@@ -84,19 +85,19 @@ class Rounds:
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
-        self.done: str | None = None  # the parameter of the last job that ended well
-        self.number = 0
+        self.done: tuple[str, str] | None = None  # parameters of the last job that ended well
+        self.number, self.setting = 0, ""
         _write_new()
 
     def run(self) -> bool:
         """A run to its end; whether there was something to do."""
         begin_run()
-        made = _plan()
-        if self.done == made and FILE.exists() and FOLDER.exists():
+        wanted = _plan(), self.setting
+        if self.done == wanted and FILE.exists() and FOLDER.exists():
             return False
         self.done = None
-        if _ended(_start(made, 0.0)):
-            self.done = made
+        if _ended(_start(*wanted, 0.0)):
+            self.done = wanted
         return True
 
     def round(self) -> tuple[str, str, bool]:
@@ -106,21 +107,23 @@ class Rounds:
         slow = rng.choice((0.0, 0.01))
         old, new = SOURCE.read_text(), f"{self.number:06d}"
         begin_run()
-        job = _start(_plan(), slow)
-        self.done = None
-        made = _plan()
+        began = _plan(), self.setting
+        job, self.done = _start(*began, slow), None
         time.sleep(rng.uniform(0.0, 0.012 + 1.6 * slow))
         if end.startswith("stop"):
             os.kill(job, signal.SIGSTOP)
         if end == "kill":
             os.kill(job, signal.SIGKILL)
-        _write(new, kind)
+        if kind == "setting":  # edited when its run is over; else that run's job is right
+            self.setting = new
+        elif kind != "late":
+            _write(new, kind)
         if kind == "revert":
             time.sleep(rng.uniform(0.0, slow))
             _write(old, kind)
         if end == "none":
             if _ended(job):
-                self.done = made
+                self.done = began
         else:
             if (
                 end == "stop elsewhere"
@@ -133,12 +136,14 @@ class Rounds:
             with suppress(ProcessLookupError):
                 os.kill(job, signal.SIGCONT)
             _ended(job)
+        if kind == "late":  # after the publishing, before anybody looks
+            _write(new, rng.choice(("edit", "replace", "touch back")))
         for _ in range(5):
             if not self.run():
                 break
         else:
             raise AssertionError("does not come to rest")
-        wanted = SOURCE.read_text()
+        wanted = SOURCE.read_text() + self.setting
         stale = FILE.read_text() != wanted or (FOLDER / "1").read_text() != wanted
         return kind, end, stale
 
@@ -157,6 +162,7 @@ def main() -> None:
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     os.chdir(given.folder)
+    logging.disable()
     rounds, count, stale = Rounds(given.seed), Counter(), Counter()
     for _ in range(given.rounds):
         kind, end, wrong = rounds.round()

@@ -449,7 +449,12 @@ class Harness:
         stage, rng = cities.stage, self.rng
         targets = [str(cities.products(c)[0].relative_to(self.folder)) for c in self.names]
         plan = {
-            c: {"stage": name, "kind": rng.choice(kinds), "at": rng.uniform(0, 1.2), "city": c}
+            c: {
+                "stage": name,
+                "kind": rng.choice(kinds),
+                "at": rng.uniform(0, 1.2) * rng.random(),
+                "city": c,
+            }
             for c in self.names
         }
         victim, kill_at = rng.choice(KILLS), rng.uniform(0.2, 1.5)

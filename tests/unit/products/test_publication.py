@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -167,3 +169,23 @@ def test_a_block_of_an_input_that_was_replaced_has_no_record(here):
         Path("in.csv").unlink()
         store.write((slice(0, 1), slice(0, 1)), "key", {}, None)
     assert not (here / "work/done").exists()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_a_job_that_is_disturbed_at_random_moments_leaves_nothing_stale(here):
+    root = Path(__file__).parents[3]
+    rounds = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "tests.synthetic.disturbed_job",
+            "--rounds",
+            "60",
+            str(here / "work"),
+        ],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert "60 rounds, 0 stale" in rounds.stdout, rounds.stderr
