@@ -13,13 +13,18 @@ makes it. A line per round goes to rounds.jsonl in the folder, and at the end th
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
+import importlib
 import json
+import logging
 import os
 import random
 import re
+import runpy
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -29,7 +34,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
-from ..synthetic.project import Project
+from ..synthetic.project import ROOT, Project
 from .killing import family, kill
 
 KINDS = ("edit", "replace", "revert", "stop")
@@ -113,6 +118,40 @@ def _content(file: Path, city: str) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+FORK_JOBS = False  # jobs are processes forked from Snakemake's, which spares them the imports, too
+
+
+def _fork_jobs() -> None:
+    """Have this Snakemake fork its scripts; what they import is imported by then."""
+    import snakemake.script
+
+    def execute(self: object, fname: str, edit: bool = False) -> None:
+        pid = os.fork()
+        if not pid:
+            status = 1
+            try:
+                runpy.run_path(fname, run_name="__main__")
+                status = 0
+            except SystemExit as end:
+                status = int(bool(end.code))
+            finally:
+                logging.shutdown()
+                os._exit(status)
+        if os.waitpid(pid, 0)[1]:
+            raise subprocess.CalledProcessError(1, fname)
+
+    snakemake.script.PythonScript.execute_script = execute
+
+
+def _import_stages() -> None:
+    for script in (ROOT / "workflow" / "scripts").glob("*.py"):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth"):
+                importlib.import_module(node.module)
+    for name in ("xarray", "rasterio", "matplotlib.figure", "rioxarray", "cv2", "scipy.optimize"):
+        importlib.import_module(name)
+
+
 class Run:
     """Snakemake in a forked process and session of its own, which spares it the imports."""
 
@@ -130,6 +169,8 @@ class Run:
                 os.dup2(out, stream)
             os.chdir(folder)
             sys.argv = ["snakemake", *arguments]
+            if FORK_JOBS:
+                _fork_jobs()
             snakemake.cli.main()
         except SystemExit as end:
             sys.stdout.flush()
@@ -375,9 +416,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--data", type=Path, help="a scene of the small city, if it is made")
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
+    parser.add_argument("--fork-jobs", action="store_true", help="cheaper by their imports")
     parser.add_argument("folder", type=Path)
     parser.add_argument("stages", nargs="*", metavar="stage")
     given = parser.parse_args()
+    if given.fork_jobs:
+        global FORK_JOBS
+        FORK_JOBS = True
+        _import_stages()
     project = make_cities(given.folder.absolute(), given.cities, given.data)
     harness, found = Harness(project, city_names(given.cities), given.seed), []
     for one in harness.rounds(given.stages or list(STAGES), given.rounds, given.kinds):

@@ -4,7 +4,7 @@ import json
 import re
 
 from stereotruth.products.locks import FileLock
-from stereotruth.products.runs import begin_run, end_older_jobs
+from stereotruth.products.runs import Run, begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
 
@@ -22,6 +22,13 @@ def refuse_second_run():
             "Remedy: wait until it ends, or stop it"
         )
     LOCKS.append(lock)
+
+
+if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, maybe a late one
+    try:
+        Run().refuse_older()
+    except InputError as error:
+        raise WorkflowError(str(error))
 
 
 onstart:

@@ -3,8 +3,8 @@
 A job of the workflow says what it reads and what it makes (:func:`publication`). Each product
 takes its place (:func:`publishing`) only if the job's run is still the newest and its inputs are
 what they were when the job began. When all have, a record of the inputs' checksums is kept, and
-each later run holds it against the files (:func:`made_of`). A product without a record was made
-by hand, or by a job that did not end, which Snakemake knows.
+each later run holds it against the files (:func:`made_of`). A product without any record was made
+by hand.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from ..errors import InputError
 from .inputs import Checksums, Inputs, Marks, marks, refuse_replaced
 from .provenance import digest
-from .runs import KEPT, Run, listed
+from .runs import KEPT, RUN, Run, listed
 
 log = logging.getLogger("stereotruth")
 
@@ -54,7 +54,7 @@ class _Job:
         self.run = Run()
         self.published: dict[str, Marks] = {}
         with self.run.standing():
-            _write(self.first, {"made": made})
+            _write(self.first, {"made": made, "run": self.run.name})
         inputs = list(map(str, inputs))
         self.marks = marks(inputs)
         self.inputs = Inputs(inputs, Checksums(KEPT / "checksums"))
@@ -72,7 +72,11 @@ class _Job:
         with self.standing():
             for found in self.published.values():
                 refuse_replaced(found)
-            record = {"made": self.made, "inputs": dict(self.inputs.checksums)}
+            record = {
+                "made": self.made,
+                "run": self.run.name,
+                "inputs": dict(self.inputs.checksums),
+            }
             _write(self.first, record)
 
 
@@ -136,11 +140,15 @@ def made_of(product: str) -> str:
     """What the making of a product is called, as a parameter of its rule.
 
     The same as when it was made, while its inputs have the checksums that were recorded: an
-    input that changed unseen by Snakemake gives another, and so makes the product again.
+    input that changed unseen by Snakemake gives another, and so makes the product again. So does
+    a product of a job that did not end, unless this is its own run, which tries again.
     """
     record = _read(_record_file(product))
-    then = record.get("inputs", {})
-    if then and Path(product).exists():
+    then = record.get("inputs")
+    if record and Path(product).exists():
+        if then is None:
+            mine = record.get("run") == os.environ.get(RUN, "")
+            return record["made"] if mine else digest({"not ended": record})
         now = {path: _checksum(path) for path in then}
         other = {path: found for path, found in now.items() if found and found != then[path]}
         if other:

@@ -34,7 +34,7 @@ SECONDS = 5.0  # between two looks whether there is a newer run
 def _newest(folder: Path) -> str:
     try:
         return (folder / "run").read_text()
-    except FileNotFoundError:
+    except OSError:  # deleted, or a file server that is away for a moment
         return ""
 
 
@@ -69,9 +69,10 @@ class Run:
 
     def is_newest(self) -> bool:
         """Whether no other run has begun since."""
-        return _newest(self._folder) == self.name
+        return _newest(self._folder) in ("", self.name)
 
-    def _refuse_older(self) -> None:
+    def refuse_older(self) -> None:
+        """Raise InputError if another run has begun since."""
         if not self.is_newest():
             raise InputError(
                 "another run has begun here since; this job is of an earlier one and publishes "
@@ -84,9 +85,9 @@ class Run:
     def standing(self) -> Iterator[None]:
         """No other run begins meanwhile. Raises InputError if one has begun before."""
         with _locked(self._folder, shared=True):
-            self._refuse_older()
+            self.refuse_older()
             yield
-            self._refuse_older()  # where locks do nothing
+            self.refuse_older()  # where locks do nothing
 
     @contextmanager
     def watched(self) -> Iterator[None]:
