@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
 from ..synthetic.project import ROOT, Project
@@ -125,7 +126,8 @@ def _fork_jobs() -> None:
     """Have this Snakemake fork its scripts; what they import is imported by then."""
     import snakemake.script
 
-    def execute(self: object, fname: str, edit: bool = False) -> None:
+    def execute(self: Any, fname: str, edit: bool = False) -> None:
+        begin = time.monotonic()
         pid = os.fork()
         if not pid:
             status = 1
@@ -137,7 +139,9 @@ def _fork_jobs() -> None:
             finally:
                 logging.shutdown()
                 os._exit(status)
-        if os.waitpid(pid, 0)[1]:
+        status = os.waitpid(pid, 0)[1]
+        self.bench_record.running_time = time.monotonic() - begin
+        if status:
             raise subprocess.CalledProcessError(1, fname)
 
     snakemake.script.PythonScript.execute_script = execute
