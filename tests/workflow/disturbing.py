@@ -131,6 +131,7 @@ def _fork_jobs() -> None:
         pid = os.fork()
         if not pid:
             status = 1
+            os.closerange(3, 4096)  # as another program would: the run's lock stays with the run
             try:
                 runpy.run_path(fname, run_name="__main__")
                 status = 0
