@@ -58,6 +58,11 @@ def _start(made: str, setting: str, slow: float) -> int:
         os._exit(status)
 
 
+def _wake(pid: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
+
+
 def _ended(pid: int) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
@@ -128,13 +133,12 @@ class Rounds:
             if (
                 end == "stop elsewhere"
             ):  # no process of this machine: it holds its locks until later
-                awake = threading.Timer(rng.uniform(0.0, 0.1), os.kill, (job, signal.SIGCONT))
+                awake = threading.Timer(rng.uniform(0.0, 0.1), _wake, (job,))
                 awake.start()
             else:
                 end_older_jobs()
             self.run()
-            with suppress(ProcessLookupError):
-                os.kill(job, signal.SIGCONT)
+            _wake(job)
             _ended(job)
         if kind == "late":  # after the publishing, before anybody looks
             _write(new, rng.choice(("edit", "replace", "touch back")))
