@@ -172,6 +172,7 @@ class Run:
             out = os.open(folder / "run.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(out, stream)
+            sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
             os.chdir(folder)
             sys.argv = ["snakemake", *arguments]
             if FORK_JOBS:
