@@ -12,7 +12,7 @@ pytest.register_assert_rewrite("tests.synthetic")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Test files of the workflow whose fixtures build on one city, made once for all of them.
-OF_ONE_CITY = {"audit", "benchmark", "end_to_end", "predict", "report", "restart"}
+OF_ONE_CITY = {"audit", "benchmark", "disturbed", "end_to_end", "predict", "report", "restart"}
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -33,6 +33,7 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
     file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))

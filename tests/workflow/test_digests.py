@@ -45,7 +45,7 @@ REACH = {
 # there are, and a scene more is no other scene.
 ANYWHERE = {"errors", "error_statistics", "job", "settings"}
 # Who reports and records does not change what is computed.
-NOT_COVERED = {"job", "products.provenance"}
+NOT_COVERED = {"job", "products.provenance", "products.publication"}
 
 
 def covered(rule) -> set[str]:
@@ -112,3 +112,13 @@ def test_every_script_has_its_rule_and_log(script):
     (work,) = (node for node in main.body if isinstance(node, ast.With))
     assert ast.unparse(work.items[0].context_expr).startswith("job(snakemake.log[0], ")
     assert not any(isinstance(node, ast.Expr) for node in main.body)
+    if makes_something(rule):
+        publication = "publication(snakemake.input, snakemake.output, snakemake.params.made)"
+        assert ast.unparse(work.items[1].context_expr) == publication
+
+
+@pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
+def test_every_product_is_held_against_the_record_of_its_inputs(name):
+    """The parameter that changes if an input is not what the product was made of."""
+    params = WITH_SCRIPT[name].directives["params"]
+    assert f"made=lambda w: making_of(rules.{name}, w)," in params

@@ -28,6 +28,7 @@ rule align:
         mem_mb=1000,
         runtime=10,
     params:
+        made=lambda w: making_of(rules.align, w),
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
         code=source_digest("alignment.align", "alignment.align_report"),

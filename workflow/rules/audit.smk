@@ -16,6 +16,7 @@ rule audit:
         mem_mb=4000,
         runtime=240,
     params:
+        made=lambda w: making_of(rules.audit, w),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=asdict(SETTINGS.audit),
         measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),

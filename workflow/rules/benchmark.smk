@@ -18,6 +18,7 @@ rule match:
         mem_mb=6000,
         runtime=480,
     params:
+        made=lambda w: making_of(rules.match, w),
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
         split=SETTINGS.benchmark.split,
@@ -49,6 +50,7 @@ rule score:
         mem_mb=2000,
         runtime=120,
     params:
+        made=lambda w: making_of(rules.score, w),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         label=lambda w: method_label(w.method),
@@ -100,6 +102,7 @@ rule benchmark_tables:
         mem_mb=2000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.benchmark_tables, w),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,

@@ -9,6 +9,7 @@ from stereotruth import sheets
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.products.provenance import PACKAGE, file_sha256, source_digest
+from stereotruth.products.publication import made_of
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
 CONDA = Path(workflow.basedir) / "envs" / "workflow.yaml"
@@ -87,3 +88,8 @@ def scenes_of(city):
     if not found:
         raise WorkflowError(f"{SETTINGS.scenes}: no scene of city {city!r}. Remedy: add a row")
     return found
+
+
+def making_of(rule, wildcards):
+    """What the making of a job's products is called; other than it was if they are stale."""
+    return made_of(rule.output[0].format(**wildcards))

@@ -14,6 +14,7 @@ rule grid_truth:
         mem_mb=3000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.grid_truth, w),
         code=source_digest("evaluation.epipolar_truth"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
@@ -45,6 +46,7 @@ rule evaluate_truth:
         mem_mb=3000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.evaluate_truth, w),
         code=source_digest("evaluation.labels_against_truth"),
     message:
         "Comparing scene {wildcards.scene} with its exact truth"
@@ -80,6 +82,7 @@ rule evaluate_truth_city:
         mem_mb=3000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.evaluate_truth_city, w),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("evaluation.labels_against_truth"),
     message:

@@ -44,6 +44,7 @@ rule evaluate_images:
         mem_mb=2000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.evaluate_images, w),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         code=source_digest("evaluation.labels_against_images"),
     message:

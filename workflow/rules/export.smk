@@ -40,6 +40,7 @@ rule export:
         mem_mb=4000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.export, w),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         city=lambda w: asdict(CITIES[w.city]),
         settings={
@@ -72,6 +73,7 @@ rule dataset:
         mem_mb=1000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.dataset, w),
         code=source_digest("dataset.published_layout"),
     message:
         "Putting the cities together in the layout of the published dataset"

@@ -18,6 +18,7 @@ rule predict_scene:
         mem_mb=6000,
         runtime=720,
     params:
+        made=lambda w: making_of(rules.predict_scene, w),
         method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
@@ -45,6 +46,7 @@ rule dsm:
         mem_mb=2000,
         runtime=240,
     params:
+        made=lambda w: making_of(rules.dsm, w),
         settings=asdict(SETTINGS.predict.dsm),
         code=source_digest("matching.scenes.surface_model"),
     message:

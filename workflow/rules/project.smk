@@ -22,6 +22,7 @@ rule project:
         mem_mb=4000,
         runtime=240,
     params:
+        made=lambda w: making_of(rules.project, w),
         view="left",
         settings=PROJECTION,
         code=source_digest("disparity.project"),
@@ -44,6 +45,7 @@ use rule project as project_right with:
     benchmark:
         "benchmarks/project_right/{city}/{scene}.tsv"
     params:
+        made=lambda w: making_of(rules.project_right, w),
         view="right",
         settings=PROJECTION,
         code=source_digest("disparity.project"),
@@ -69,6 +71,7 @@ rule project_strip:
         mem_mb=4000,
         runtime=120,
     params:
+        made=lambda w: making_of(rules.project_strip, w),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
         settings=PROJECTION,

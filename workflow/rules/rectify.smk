@@ -19,6 +19,7 @@ rule rectify:
         mem_mb=2000,
         runtime=120,
     params:
+        made=lambda w: making_of(rules.rectify, w),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",
@@ -49,6 +50,7 @@ rule rectify_strip:
         mem_mb=2000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.rectify_strip, w),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         code=source_digest(
             "epipolar.rectify",

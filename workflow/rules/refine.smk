@@ -29,6 +29,7 @@ rule refine:
         mem_mb=2000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.refine, w),
         strict=SETTINGS.strict,
         code=source_digest("alignment.refine", "alignment.refine_report"),
     message:

@@ -32,6 +32,7 @@ rule report_city:
         mem_mb=2000,
         runtime=60,
     params:
+        made=lambda w: making_of(rules.report_city, w),
         sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),
         template=file_sha256(PACKAGE / "report" / "page.html.jinja"),

@@ -5,6 +5,7 @@ import re
 import sys
 
 from stereotruth.products.locks import FileLock
+from stereotruth.products.runs import Run, begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
 
@@ -24,8 +25,17 @@ def refuse_second_run():
     LOCKS.append(lock)
 
 
+if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, maybe a late one
+    try:
+        Run().refuse_older()
+    except InputError as error:
+        raise WorkflowError(str(error))
+
+
 onstart:
     refuse_second_run()
+    end_older_jobs()
+    begin_run()
 
 
 def complaints(snakemake_logs):

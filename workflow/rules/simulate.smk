@@ -12,6 +12,7 @@ rule simulate_image:
         mem_mb=3000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.simulate_image, w),
         seed=SETTINGS.seed,
         code=source_digest("simulate.render"),
     message:
@@ -36,6 +37,7 @@ rule simulate_lidar:
         mem_mb=3000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.simulate_lidar, w),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
         code=source_digest("simulate.lidar"),
@@ -61,6 +63,7 @@ rule simulate_truth:
         mem_mb=3000,
         runtime=30,
     params:
+        made=lambda w: making_of(rules.simulate_truth, w),
         seed=SETTINGS.seed,
         code=source_digest("simulate.truth", "simulate.control_points"),
     message:

@@ -26,6 +26,7 @@ rule train:
         mem_mb=12000,
         runtime=2880,
     params:
+        made=lambda w: making_of(rules.train, w),
         dataset=lambda w: dataset_entry(w.dataset),
         kind=lambda w: method_settings(w.method)["kind"],
         training=lambda w: training_of(w.method),

@@ -4,11 +4,15 @@ from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.job import job
 from stereotruth.products.provenance import describe
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     model, strict = snakemake.params.model, snakemake.params.strict
-    with job(snakemake.log[0], f"align {scene}"):
+    with (
+        job(snakemake.log[0], f"align {scene}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
         if snakemake.input.gcps:

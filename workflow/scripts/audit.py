@@ -4,10 +4,14 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params
-    with job(snakemake.log[0], f"audit {name}"):
+    with (
+        job(snakemake.log[0], f"audit {name}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         audit(
             StereoDataset.of(name, params.dataset),
             snakemake.output[0],

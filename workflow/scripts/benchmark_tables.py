@@ -5,10 +5,14 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
-    with job(snakemake.log[0], f"benchmark {of.dataset}"):
+    with (
+        job(snakemake.log[0], f"benchmark {of.dataset}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         compare(
             StereoDataset.of(of.dataset, params.dataset),
             params.split,

@@ -2,12 +2,14 @@
 
 from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.surface_model import write_dsm
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.config["dask"]["scheduler_address"]
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
         dask_scheduler(address) as scheduler,
     ):
         write_dsm(

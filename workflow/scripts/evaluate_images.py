@@ -2,11 +2,15 @@
 
 from stereotruth.evaluation.labels_against_images import evaluate_city
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     stores = zip(given.left, given.right, given.disparity)
-    with job(snakemake.log[0], f"evaluate {city}") as log:
+    with (
+        job(snakemake.log[0], f"evaluate {city}") as log,
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         table = evaluate_city(
             city,
             given.tiles,

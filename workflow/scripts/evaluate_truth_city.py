@@ -4,10 +4,14 @@ from pathlib import Path
 
 from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
-    with job(snakemake.log[0], f"evaluate {city}"):
+    with (
+        job(snakemake.log[0], f"evaluate {city}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         evaluate_truth(
             city,
             [

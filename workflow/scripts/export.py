@@ -8,11 +8,16 @@ from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.settings import Settings
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.job import job
+from stereotruth.products.files import replacing
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
-    with job(snakemake.log[0], f"export {city['city']}") as log:
+    with (
+        job(snakemake.log[0], f"export {city['city']}") as log,
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         summary = export_city(
             scenes=list(
                 map(
@@ -36,6 +41,7 @@ if __name__ == "__main__":
             work=Path(snakemake.output.summary).with_name(".tiles.work"),
         )
         summary["lines"] = summary_lines(summary, snakemake.output.tiles)
-        Path(snakemake.output.summary).write_text(json.dumps(summary, indent=2) + "\n")
+        with replacing(snakemake.output.summary) as scratch:
+            scratch.write_text(json.dumps(summary, indent=2) + "\n")
         for line in summary["lines"]:
             log.info(line)

@@ -3,12 +3,16 @@
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.job import job
 from stereotruth.products.provenance import describe
+from stereotruth.products.publication import publication
 from stereotruth.simulate.cities import CITIES
 
 if __name__ == "__main__":
     city = CITIES[snakemake.wildcards.city]
     scene = city.scene(snakemake.wildcards.scene)
-    with job(snakemake.log[0], f"truth of {scene.name}"):
+    with (
+        job(snakemake.log[0], f"truth of {scene.name}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         write_grid_truth(
             city,
             scene,

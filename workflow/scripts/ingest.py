@@ -3,6 +3,7 @@
 from stereotruth.job import in_own_process, job
 from stereotruth.lidar.ingest import ingest
 from stereotruth.products.provenance import describe
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
@@ -10,9 +11,10 @@ if __name__ == "__main__":
         "lidar_crs": snakemake.params.lidar_crs,
         "drop_classes": snakemake.params.drop_classes,
     }
-    with job(snakemake.log[0], f"ingest {scene}"):
-        in_own_process(  # some damaged LAZ files crash the decoder
-            lambda: ingest(
+
+    def ingest_file() -> None:
+        with publication(snakemake.input, snakemake.output, snakemake.params.made):
+            ingest(
                 snakemake.input.lidar,
                 snakemake.output.store,
                 lidar_crs=parameters["lidar_crs"] or None,
@@ -20,6 +22,8 @@ if __name__ == "__main__":
                 drop_classes=tuple(parameters["drop_classes"]),
                 scene=scene,
                 provenance=describe(snakemake.input, parameters, snakemake.params.code),
-            ),
-            snakemake.input.lidar,
-        )
+            )
+
+    with job(snakemake.log[0], f"ingest {scene}"):
+        # some damaged LAZ files crash the decoder
+        in_own_process(ingest_file, snakemake.input.lidar)

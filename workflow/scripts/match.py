@@ -5,11 +5,15 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.predictions import predict
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     out = Path(snakemake.output[0])
-    with job(snakemake.log[0], f"match {of.dataset} {of.method}"):
+    with (
+        job(snakemake.log[0], f"match {of.dataset} {of.method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         predict(
             StereoDataset.of(of.dataset, params.dataset),
             params.split,

@@ -3,12 +3,14 @@
 from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.config["dask"]["scheduler_address"]
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
         dask_scheduler(address) as scheduler,
     ):
         predict_scene(

@@ -3,10 +3,15 @@
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.settings import Settings
 from stereotruth.job import dask_scheduler, job
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, snakemake.config["dask"]["scheduler_address"]
-    with job(snakemake.log[0], f"project {scene}"), dask_scheduler(address) as scheduler:
+    with (
+        job(snakemake.log[0], f"project {scene}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        dask_scheduler(address) as scheduler,
+    ):
         project_scene(
             snakemake.input.left,
             snakemake.input.right,

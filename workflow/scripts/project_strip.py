@@ -4,10 +4,14 @@ from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
-    with job(snakemake.log[0], f"project {scene} {strip}"):
+    with (
+        job(snakemake.log[0], f"project {scene} {strip}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         project_scene(
             snakemake.input.left,
             snakemake.input.right,

@@ -7,12 +7,16 @@ from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.job import job
 from stereotruth.products.provenance import describe
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     files = [*snakemake.input.left, *snakemake.input.right, snakemake.input.alignment]
     names = snakemake.input.left[0], snakemake.input.right[0]
-    with job(snakemake.log[0], f"rectify {scene}"):
+    with (
+        job(snakemake.log[0], f"rectify {scene}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         alignment = Alignment.load(snakemake.input.alignment)
         with open_pair(*names) as (left, right):
             model = fit_epipolar(

@@ -6,11 +6,15 @@ from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
     names = snakemake.input.left[0], snakemake.input.right[0]
-    with job(snakemake.log[0], f"rectify {scene} {strip}"):
+    with (
+        job(snakemake.log[0], f"rectify {scene} {strip}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         alignment = Alignment.load(snakemake.input.alignment)
         with open_pair(*names) as (left, right):
             model = fit_epipolar(

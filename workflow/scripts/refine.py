@@ -8,10 +8,14 @@ from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.provenance import describe, digest, file_sha256
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
-    with job(snakemake.log[0], f"refine {scene}"):
+    with (
+        job(snakemake.log[0], f"refine {scene}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         files = [*snakemake.input.left, *snakemake.input.right, snakemake.input.alignment]
         inputs = {Path(file).name: file_sha256(file) for file in files}
         for store in map(PointStore, snakemake.input.points):

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 from stereotruth.report.page import write_report
 
 if __name__ == "__main__":
@@ -12,7 +13,10 @@ if __name__ == "__main__":
         """Files results/<stage>/<city>/<scene>/<file> by scene."""
         return {Path(file).parent.name: file for file in files}
 
-    with job(snakemake.log[0], f"report {city}"):
+    with (
+        job(snakemake.log[0], f"report {city}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         write_report(
             city,
             given.tiles,

@@ -6,11 +6,15 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.score_method import score
 from stereotruth.matching.benchmark.strata import Products
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     own = (Path("tiles"), Path("results/project"), Path("results/truth"))
-    with job(snakemake.log[0], f"score {of.dataset} {of.method}"):
+    with (
+        job(snakemake.log[0], f"score {of.dataset} {of.method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         score(
             StereoDataset.of(of.dataset, params.dataset),
             params.split,

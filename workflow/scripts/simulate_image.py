@@ -1,6 +1,7 @@
 """One image of a synthetic scene."""
 
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.render import simulate_image
 
@@ -8,5 +9,8 @@ if __name__ == "__main__":
     city = CITIES[snakemake.wildcards.city]
     scene = city.scene(snakemake.wildcards.scene)
     view = snakemake.wildcards.view
-    with job(snakemake.log[0], f"simulate {scene.name} {view}"):
+    with (
+        job(snakemake.log[0], f"simulate {scene.name} {view}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         simulate_image(city, scene, view, snakemake.output.image, seed=snakemake.params.seed)

@@ -1,6 +1,7 @@
 """One LiDAR file of a synthetic scene."""
 
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.lidar import simulate_lidar_tile
 
@@ -8,7 +9,10 @@ if __name__ == "__main__":
     city = CITIES[snakemake.wildcards.city]
     scene = city.scene(snakemake.wildcards.scene)
     tile = snakemake.wildcards.tile
-    with job(snakemake.log[0], f"simulate {tile}"):
+    with (
+        job(snakemake.log[0], f"simulate {tile}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         simulate_lidar_tile(
             city,
             scene,

@@ -1,6 +1,7 @@
 """The exact truth of a synthetic scene: per pixel, and as points."""
 
 from stereotruth.job import job
+from stereotruth.products.publication import publication
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.truth import simulate_truth
@@ -8,7 +9,10 @@ from stereotruth.simulate.truth import simulate_truth
 if __name__ == "__main__":
     city = CITIES[snakemake.wildcards.city]
     scene = city.scene(snakemake.wildcards.scene)
-    with job(snakemake.log[0], f"simulate {scene.name} truth"):
+    with (
+        job(snakemake.log[0], f"simulate {scene.name} truth"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         simulate_points(
             city,
             scene,

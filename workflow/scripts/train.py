@@ -5,10 +5,14 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.kinds import need_pytorch
+from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
-    with job(snakemake.log[0], f"train {of.dataset} {of.method}"):
+    with (
+        job(snakemake.log[0], f"train {of.dataset} {of.method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
         need_pytorch(of.method, params.kind)
         from stereotruth.matching.networks.training import train
         from stereotruth.matching.networks.training_settings import TrainingSettings

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from .locks import exclusive
+from .publication import publishing
 
 
 @contextmanager
@@ -26,7 +27,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     with exclusive(path):
         try:
             yield scratch
-            scratch.replace(path)
+            with publishing(path):
+                scratch.replace(path)
         finally:
             scratch.unlink(missing_ok=True)
 
@@ -39,16 +41,20 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f"{path.name}.partial")
+    scratch, old = path.with_name(f"{path.name}.partial"), path.with_name(f".{path.name}.old")
     with exclusive(path):
-        shutil.rmtree(scratch, ignore_errors=True)  # of a writer that was killed
+        for rest in (scratch, old):
+            shutil.rmtree(rest, ignore_errors=True)  # of a writer that was killed
         scratch.mkdir()
         try:
             yield scratch
-            shutil.rmtree(path, ignore_errors=True)
-            scratch.rename(path)
+            with publishing(path):
+                if path.exists():
+                    path.rename(old)
+                scratch.rename(path)
         finally:
-            shutil.rmtree(scratch, ignore_errors=True)
+            for rest in (scratch, old):
+                shutil.rmtree(rest, ignore_errors=True)
 
 
 def link(source: Path, target: Path) -> None:

@@ -16,6 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from .files import replacing
+
 Picture = NDArray[np.uint8]
 
 
@@ -71,10 +73,9 @@ def round_length(value: float) -> float:
 
 def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     """Write a matplotlib figure without any global state; no time or version goes into the file."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
+    with replacing(path) as scratch:
+        figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
 
 
 QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks

@@ -24,7 +24,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,10 @@ from numpy.typing import NDArray
 from .files import link, replacing
 from .finished_pieces import Ledger
 from .grids import Layer, building, create_grid
+from .inputs import Marks, refuse_replaced
 from .locks import FileLock
 from .provenance import digest
+from .publication import marks_of_inputs
 
 log = logging.getLogger("stereotruth")
 Block = tuple[slice, slice]
@@ -51,6 +53,7 @@ class BlockStore:
     folder: Path
     layers: tuple[str, ...]
     shard: int
+    inputs: Marks = field(default_factory=marks_of_inputs)
 
     @property
     def store(self) -> Path:
@@ -73,11 +76,13 @@ class BlockStore:
     ) -> None:
         """Write a block, one value per pixel of its ``arrays``, and its record.
 
-        Arrays that are not given hold their fill values. ``result`` is JSON-ready.
+        Arrays that are not given hold their fill values. ``result`` is JSON-ready. Raises
+        InputError if what the job reads was replaced meanwhile: the key would be that of others.
         """
         group = zarr.open_group(self.store, mode="r+")
         for name, values in arrays.items():
             group[name][block] = values
+        refuse_replaced(self.inputs)
         self._done.put(self._name(block), key, self._files(block), result)
 
     def missing(self, blocks: Sequence[Block], keys: Sequence[str], workers: int) -> list[int]:

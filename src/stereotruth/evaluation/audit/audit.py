@@ -29,6 +29,7 @@ from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
 from ...products.files import replacing, whole_folder, write_table
 from ...products.finished_pieces import Ledger
+from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
 from .page import write_page
@@ -89,6 +90,7 @@ def _measure_all(
 
     def one(pair: Pair) -> dict[str, Any]:
         files = [file for file in (pair.left, pair.right, pair.disparity) if file is not None]
+        before = marks(files)
         key = digest(settings | {"files": [file_sha256(file) for file in files]})
         products = {"features": work / f"{pair.name}.npz"}
         piece = ledger.find(pair.name, key, products)
@@ -96,7 +98,9 @@ def _measure_all(
             found = features(read_image(pair.left))
             with replacing(products["features"]) as scratch:
                 np.savez(scratch, **asdict(found))
-            piece = ledger.put(pair.name, key, products, measure(dataset, pair))
+            figures = measure(dataset, pair)
+            refuse_replaced(before)
+            piece = ledger.put(pair.name, key, products, figures)
         return piece.result
 
     with ThreadPoolExecutor(workers) as pool:

@@ -32,6 +32,7 @@ from ...errors import InputError
 from ...job import progress
 from ...products.files import link, whole_folder
 from ...products.finished_pieces import Ledger
+from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
 from ..kinds import FOLDER
@@ -68,13 +69,16 @@ def predict(
     ``settings``: the method's entry of the configuration; ``files``: what else the method is made
     of (weights, the user's code). ``work``: where finished pairs stay.
 
-    Raises InputError if a pair, the method or one of its results cannot be used.
+    Raises InputError if a pair, the method or one of its results cannot be used, or is written
+    while it is used.
     """
     pairs = dataset.pairs(split)
     work = Path(work)
+    files = [file for file in files if Path(file).is_file()]
+    before = marks(files)
     made_of = {
         "method": dict(settings),
-        "files": [file_sha256(file) for file in files if Path(file).is_file()],
+        "files": [file_sha256(file) for file in files],
         "range": list(dataset.disparity_range),
         "code": code,
     }
@@ -87,12 +91,15 @@ def predict(
     found = {}
     for pair in progress(pairs, len(pairs), f"{name}: pairs matched"):
         file = work / f"{pair.name}.tiff"
-        key = digest(made_of | {"images": maker.sources(pair)})
+        sources = maker.sources(pair)
+        here = marks(sources)
+        key = digest(made_of | {"images": [file_sha256(source) for source in sources]})
         piece = ledger.find(pair.name, key, {"disparity": file})
         if piece is None:
             disparity, made = maker(pair)
             _check(disparity, pair, name)
             write_disparity(file, disparity)
+            refuse_replaced(before | here)
             piece = ledger.put(pair.name, key, {"disparity": file}, vars(made))
         found[pair.name] = Prediction(**piece.result)
     record = {
@@ -129,9 +136,9 @@ class _Runs:
         self._warm = False
         self.device = str(getattr(self._matcher, "device", f"CPU, {platform.machine()}"))
 
-    def sources(self, pair: Pair) -> list[str]:
-        """Checksums of what the disparity of a pair follows from."""
-        return [file_sha256(pair.left), file_sha256(pair.right)]
+    def sources(self, pair: Pair) -> list[Path]:
+        """The files that the disparity of a pair follows from."""
+        return [pair.left, pair.right]
 
     def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
         """Disparity of a pair, and what it took."""
@@ -173,9 +180,9 @@ class _Results:
             )
         return file
 
-    def sources(self, pair: Pair) -> list[str]:
-        """Checksum of the result of a pair."""
-        return [file_sha256(self._file(pair))]
+    def sources(self, pair: Pair) -> list[Path]:
+        """The file with the result of a pair."""
+        return [self._file(pair)]
 
     def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
         """Disparity of a pair."""

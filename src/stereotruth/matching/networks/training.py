@@ -93,6 +93,7 @@ def train(
     work = out.with_name(f".{out.name}.work")
     work.mkdir(parents=True, exist_ok=True)
     job = TrainingJob(model, training, data, held, out, work, device.type, processes)
+    log.info("training %s", job.key)  # of the files as they are before any is read
     with exclusive(out):
         if processes > 1:
             rendezvous = work / "rendezvous"
@@ -147,6 +148,7 @@ def _run(job: TrainingJob, rank: int, network: nn.Module, device: torch.device) 
 
     def keep() -> None:
         if rank == 0:
+            job.refuse_changed()
             save_state(
                 last,
                 {
@@ -228,6 +230,7 @@ def _end_epoch(
 ) -> None:
     """Validate, keep the weights if they are the best, add a row to the curves."""
     if rank == 0:
+        job.refuse_changed()
         epe, d1 = validate(network, job.held, device, precision)
         state.curve.append(
             {

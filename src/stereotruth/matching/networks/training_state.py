@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch import nn
 from ...dataset.stereo_dataset import StereoDataset
 from ...errors import InputError
 from ...products.files import replacing
+from ...products.inputs import Marks, marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
 from .load_network import load_network
@@ -130,22 +132,34 @@ class TrainingJob:
     processes: int
 
     @cached_property
+    def files(self) -> list[Path]:
+        """What is read: the files of all pairs, and initial weights."""
+        pairs = (*self.data.pairs, *self.held.pairs)
+        found = [Path(file) for p in pairs for file in (p.left, p.right, p.disparity)]
+        initial = self.training.initial_weights
+        return [*found, Path(initial)] if initial else found
+
+    @cached_property
     def key(self) -> str:
         """Digest of all that the weights follow from, as it was when the training began."""
-        files = {
-            pair.name: [str(pair.left), str(pair.right), str(pair.disparity)]
-            for pair in (*self.data.pairs, *self.held.pairs)
+        return self._began[0]
+
+    def refuse_changed(self) -> None:
+        """Raise InputError if a file was written since the training began."""
+        refuse_replaced(self._began[1])
+
+    @cached_property
+    def _began(self) -> tuple[str, Marks]:
+        before = marks(self.files)
+        with ThreadPoolExecutor() as pool:
+            sums = list(pool.map(file_sha256, self.files))
+        made_of = {
+            "model": asdict(self.model),
+            "training": self.training.content(),
+            "files": dict(zip(map(str, self.files), sums)),
+            "processes": self.processes,
         }
-        initial = self.training.initial_weights
-        return digest(
-            {
-                "model": asdict(self.model),
-                "training": self.training.content(),
-                "initial": file_sha256(initial) if initial else None,
-                "files": files,
-                "processes": self.processes,
-            }
-        )
+        return digest(made_of), before
 
 
 def save_state(path: Path, record: Mapping[str, Any]) -> None:

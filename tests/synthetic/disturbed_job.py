@@ -1,0 +1,180 @@
+"""A small job in a process of its own, disturbed at random moments; a run is what starts it.
+
+    python -m tests.synthetic.disturbed_job --rounds 3000 scratch/folder
+
+Hundreds of rounds a minute, so that moments within the publishing are met, too. The planning is
+Snakemake's, without its look at times: a job that did not end well is made again, and one whose
+parameter has changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import random
+import signal
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+from stereotruth.errors import InputError
+from stereotruth.products import publication as module
+from stereotruth.products.files import replacing, whole_folder
+from stereotruth.products.publication import made_of, publication
+from stereotruth.products.runs import begin_run, end_older_jobs
+
+SOURCE, FILE, FOLDER = Path("in.csv"), Path("out/a.json"), Path("out/b")
+KINDS = ("edit", "replace", "revert", "touch back", "setting", "late")
+ENDS = ("none", "orphan", "stop", "stop elsewhere", "kill")
+
+
+def _work(made: str, setting: str, slow: float) -> None:
+    """Both products say what was read, and a setting of the run."""
+    with publication([str(SOURCE)], [str(FILE), str(FOLDER)], made):
+        first = SOURCE.read_text()
+        time.sleep(slow)
+        with replacing(FILE) as scratch:
+            scratch.write_text(first + setting)
+            time.sleep(slow / 4)
+        with whole_folder(FOLDER) as scratch:
+            (scratch / "1").write_text(SOURCE.read_text() + setting)
+            time.sleep(slow / 4)
+
+
+def _start(made: str, setting: str, slow: float) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    status = 1
+    try:
+        with suppress(InputError):
+            _work(made, setting, slow)
+            status = 0
+    finally:
+        os._exit(status)
+
+
+def _wake(pid: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
+
+
+def _ended(pid: int) -> bool:
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+
+
+def _plan() -> str:
+    for function in (made_of, module._checksum, module._checksums):
+        function.cache_clear()
+    return made_of(str(FILE))
+
+
+def _write(text: str, way: str) -> None:
+    if way == "replace":
+        new = SOURCE.with_name("new")
+        new.write_text(text)
+        new.replace(SOURCE)
+    else:
+        then = SOURCE.stat()
+        SOURCE.write_text(text)
+        if way == "touch back":
+            os.utime(SOURCE, ns=(then.st_atime_ns, then.st_mtime_ns))
+
+
+class Rounds:
+    """Rounds in the working directory, one after the other."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.done: tuple[str, str] | None = None  # parameters of the last job that ended well
+        self.number, self.setting = 0, ""
+        _write_new()
+
+    def run(self) -> bool:
+        """A run to its end; whether there was something to do."""
+        begin_run()
+        wanted = _plan(), self.setting
+        if self.done == wanted and FILE.exists() and FOLDER.exists():
+            return False
+        self.done = None
+        if _ended(_start(*wanted, 0.0)):
+            self.done = wanted
+        return True
+
+    def round(self) -> tuple[str, str, bool]:
+        """Kind, end, and whether something stale is left."""
+        rng, self.number = self.rng, self.number + 1
+        kind, end = rng.choice(KINDS), rng.choice(ENDS)
+        slow = rng.choice((0.0, 0.01))
+        old, new = SOURCE.read_text(), f"{self.number:06d}"
+        begin_run()
+        began = _plan(), self.setting
+        job, self.done = _start(*began, slow), None
+        time.sleep(rng.uniform(0.0, 0.012 + 1.6 * slow))
+        if end.startswith("stop"):
+            os.kill(job, signal.SIGSTOP)
+        if end == "kill":
+            os.kill(job, signal.SIGKILL)
+        if kind == "setting":  # edited when its run is over; else that run's job is right
+            self.setting = new
+        elif kind != "late":
+            _write(new, kind)
+        if kind == "revert":
+            time.sleep(rng.uniform(0.0, slow))
+            _write(old, kind)
+        if end == "none":
+            if _ended(job):
+                self.done = began
+        else:
+            if (
+                end == "stop elsewhere"
+            ):  # no process of this machine: it holds its locks until later
+                awake = threading.Timer(rng.uniform(0.0, 0.1), _wake, (job,))
+                awake.start()
+            else:
+                end_older_jobs()
+            self.run()
+            _wake(job)
+            _ended(job)
+        if kind == "late":  # after the publishing, before anybody looks
+            _write(new, rng.choice(("edit", "replace", "touch back")))
+        for _ in range(5):
+            if not self.run():
+                break
+        else:
+            raise AssertionError("does not come to rest")
+        wanted = SOURCE.read_text() + self.setting
+        stale = FILE.read_text() != wanted or (FOLDER / "1").read_text() != wanted
+        return kind, end, stale
+
+
+def _write_new() -> None:
+    SOURCE.write_text("000000")
+    FILE.parent.mkdir(exist_ok=True)
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("folder", type=Path)
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    os.chdir(given.folder)
+    logging.disable()
+    rounds, count, stale = Rounds(given.seed), Counter(), Counter()
+    for _ in range(given.rounds):
+        kind, end, wrong = rounds.round()
+        count[kind, end] += 1
+        stale[kind, end] += wrong
+    print(json.dumps({" + ".join(k): [n, stale[k]] for k, n in sorted(count.items())}, indent=1))
+    print(f"{count.total()} rounds, {stale.total()} stale")
+
+
+if __name__ == "__main__":
+    main()
