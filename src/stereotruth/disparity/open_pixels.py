@@ -263,9 +263,11 @@ def surfaces_by_images(
     residual = left - warp_rows(right, columns - known)
     residual[left == 0.0] = np.nan
     there = np.full((n, MOST), np.nan)
+    which, place = np.nonzero(np.arange(MOST) < number[:, None])
+    hidden = np.zeros((n, MOST), np.bool_)
+    hidden[which, place] = behind(row[which], col[which], plane[which, place, 0])
     for k in range(MOST):
-        has = np.flatnonzero(number > k)
-        seen = has[~behind(row[has], col[has], plane[has, k, 0])]
+        seen = np.flatnonzero((number > k) & ~hidden[:, k])
         at = np.full(known.shape, np.nan)
         at[row[seen], col[seen]] = col[seen] - first_col - plane[seen, k, 0]
         there[:, k] = warp_rows(right, at)[row, col]

@@ -34,6 +34,7 @@ BACK = 1.5  # before a corner the last points are left out: they may already lie
 GAP = 4.6  # points expected in an area that is empty with a chance of 1 %
 SLACK_CELLS = 0.12  # horizontal noise of points, in cells
 MARGIN_CELLS = 0.2  # added to either side of the feasible span
+SMALLEST = 0.1  # area of a triangle that is worth a cut, in squares of the mean distance
 WIDEST = 0.75  # half the width of a strip that still tells something, in mean distances
 STEEPEST = 1.2  # slope of an edge against its first guess
 _MOST = 4096  # points that have a say at most
@@ -169,7 +170,7 @@ def _no_gap(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cuts(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, smooth: Bools, plane: Floats,
-    row_start: Ints, distance: float, largest: float, step: float,
+    beside: Ints, row_start: Ints, distance: float, largest: float, step: float,
     line: Floats, sheets: Floats, noise: Floats, anchor: Steps, few: float, least: float,
 ) -> None:  # fmt: skip
     """For each triangle that spans a step of two surfaces: where, and their planes.
@@ -177,7 +178,8 @@ def _cuts(
     ``line`` [m, 4]: (p, q, r, w): places with p x + q y - r <= -w lie low, >= w high, x and y from
     the triangle's first vertex; w NaN for none. ``sheets`` [m, 8]: low, high plane: height at the
     first vertex, slopes; least and greatest height around. ``noise`` [m, 2]: variance of heights
-    about both. ``anchor`` [m, 2]: vertices that tell the planes' classes.
+    about both. ``anchor`` [m, 2]: vertices that tell the planes' classes. ``beside``: the vertices
+    of triangles that are not smooth, those of a row of cells from ``row_start`` on.
     """
     reach, near, band = REACH * distance, NEAR * distance, BAND * distance
     slack = SLACK_CELLS * PART
@@ -190,7 +192,10 @@ def _cuts(
         line[t, 3] = np.nan
         if smooth[t] or radius[t] > largest:
             continue
-        a = corner[t, 0]
+        a, b, c = corner[t]
+        area = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
+        if area < 2.0 * SMALLEST * distance * distance:
+            continue
         ox = float(x[corner[t, 1]] - x[a] + x[corner[t, 2]] - x[a]) / 3.0
         oy = float(y[corner[t, 1]] - y[a] + y[corner[t, 2]] - y[a]) / 3.0
         # surfaces of its own vertices, at the middle
@@ -222,16 +227,17 @@ def _cuts(
             west = mid_x - far
             while first < end:  # first vertex of the row at or beyond west
                 half = (first + end) >> 1
-                if x[half] < west:
+                if x[beside[half]] < west:
                     first = half + 1
                 else:
                     end = half
             for k in range(first, row_start[row + 1]):
-                if x[k] > mid_x + far or n == _MOST:
+                w = beside[k]
+                if x[w] > mid_x + far or n == _MOST:
                     break
-                px, py = float(x[k] - x[a]) - ox, float(y[k] - y[a]) - oy
+                px, py = float(x[w] - x[a]) - ox, float(y[w] - y[a]) - oy
                 if px * px + py * py <= reach * reach:
-                    which[n], dx[n], dy[n] = k, px, py
+                    which[n], dx[n], dy[n] = w, px, py
                     n += 1
         if top_h - low_h <= 2.0 * step:
             # One surface only: the other one may be known nearby.
@@ -286,14 +292,14 @@ def _cuts(
             gap = at_t - at_l
             if gap < 2.0 * step:
                 continue
-            r = np.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
-            tolerance = min(step * (1.0 + r / (4.0 * distance)), gap / 3.0)
+            away = np.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
+            tolerance = min(step * (1.0 + away / (4.0 * distance)), gap / 3.0)
             is_low = abs(float(h[w]) - at_l) <= tolerance
             if not is_low and abs(float(h[w]) - at_t) > tolerance:
                 continue
             which[m], dx[m], dy[m], high[m] = w, dx[k], dy[k], not is_low
             m += 1
-            if r <= near:
+            if away <= near:
                 if is_low:
                     near_l += 1
                     sum_lx += dx[m - 1]
@@ -326,7 +332,7 @@ def _cuts(
             found = _feasible(u, v, high, order, m, extent, band, slack, limit, polygon, spare)
             if found < 3:
                 continue
-        found = _no_gap(u, v, high, m, band, limit, polygon, found, spare)
+        found = _no_gap(u, v, high, m, distance, limit, polygon, found, spare)
         mean_a, mean_b = polygon[0, :found].mean(), polygon[1, :found].mean()
         norm = np.sqrt(1.0 + mean_b * mean_b)
         least, most = np.inf, -np.inf
@@ -345,12 +351,12 @@ def _cuts(
             continue
         # (u - a - b v) / norm, in x and y from the first vertex
         p, q = (nx + mean_b * ny) / norm, (ny - mean_b * nx) / norm
-        c = mean_a / norm + p * ox + q * oy
+        r = mean_a / norm + p * ox + q * oy
         good = True
         for i in range(3):
             w = corner[t, i]
             px, py = float(x[w] - x[a]), float(y[w] - y[a])
-            s = p * px + q * py - c
+            s = p * px + q * py - r
             on_l = abs(float(h[w]) - low_h - lx * (px - ox) - ly * (py - oy)) <= step
             on_t = abs(float(h[w]) - top_h - tx * (px - ox) - ty * (py - oy)) <= step
             if on_l:
@@ -361,7 +367,7 @@ def _cuts(
                 good &= abs(s) <= width + 2.0 * slack
         if not good:
             continue
-        line[t, 0], line[t, 1], line[t, 2], line[t, 3] = p, q, c, width
+        line[t, 0], line[t, 1], line[t, 2], line[t, 3] = p, q, r, width
         sheets[t, 0] = low_h + off_l / near_l - lx * ox - ly * oy
         sheets[t, 1], sheets[t, 2] = lx, ly
         sheets[t, 3] = top_h + off_t / near_t - tx * ox - ty * oy
@@ -457,13 +463,17 @@ def cut_at_outlines(
     """
     for _ in range(2):
         plane = _handed_on(x, y, h, corner, radius, plane, smooth_radius, step)
-    rows = (y >> PART_BITS).astype(np.int64)
+    # Of the points, those beside a step alone can bound it.
+    at_step = np.zeros(x.size, np.bool_)
+    at_step[corner[~smooth].reshape(-1)] = True
+    beside = np.flatnonzero(at_step)
+    rows = y[beside] >> PART_BITS
     row_start = np.searchsorted(rows, np.arange(int(rows.max(initial=-1)) + 2))
     size = len(corner)
     line, sheets, noise = np.empty((size, 4)), np.empty((size, 8)), np.empty((size, 2))
     anchor = np.empty((size, 2), np.int32)
     _cuts(
-        x, y, h, corner, radius, smooth, plane, row_start, distance, smooth_radius, step,
+        x, y, h, corner, radius, smooth, plane, beside, row_start, distance, smooth_radius, step,
         line, sheets, noise, anchor, few, least,
     )  # fmt: skip
     cut = ~np.isnan(line[:, 3])
