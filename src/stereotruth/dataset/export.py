@@ -38,7 +38,7 @@ from ..products.provenance import describe, file_sha256, source_digest
 from .orientation import save
 from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
-from .scene_stores import SceneFiles, open_stores
+from .scene_stores import SceneFiles, SceneStores, open_stores
 from .settings import Limits, Settings
 from .sift_matches import MATCH_COLUMNS, match_rows
 from .split_names import NONE
@@ -50,18 +50,34 @@ from .windows import cell_step, choose_windows, scan_scene
 
 log = logging.getLogger("stereotruth")
 
+SPARSE = 1.0  # LiDAR points in a pixel; with fewer, most windows have too few labels
+
 
 def _refuse_empty(
-    city: str, outcomes: Mapping[str, Mapping[str, int]], size: int, min_labelled: float
+    city: str,
+    outcomes: Mapping[str, Mapping[str, int]],
+    size: int,
+    min_labelled: float,
+    sources: Sequence[SceneStores],
 ) -> None:
     lines = [
         f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
         for scene, outcome in outcomes.items()
     ]
+    sparse = ", ".join(
+        f"{source.scene} {source.points_per_px:.2g}"
+        for source in sources
+        if source.points_per_px is not None and source.points_per_px < SPARSE
+    )
+    if sparse:
+        sparse = (
+            f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
+            "project.fill: surface labels pixels between them"
+        )
     raise InputError(
         f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)})",
         remedy=f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
-        f"{min_labelled:g}), or LiDAR that covers the overlap of the two images",
+        f"{min_labelled:g}), or LiDAR that covers the overlap of the two images{sparse}",
     )
 
 
@@ -115,7 +131,7 @@ def export_city(
         phases[source.scene], outcomes[source.scene] = phase, outcome
         scans[source.scene] = (cells.picture, cells.mask, cells.scale)
     if not any(window.labelled for _, window in chosen):
-        _refuse_empty(city, outcomes, size, settings.min_labelled)
+        _refuse_empty(city, outcomes, size, settings.min_labelled, sources)
     chosen.sort(key=lambda pair: not pair[1].labelled)  # stable: unlabelled pairs get last numbers
     parameters = {
         "size": size,

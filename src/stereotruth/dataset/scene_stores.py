@@ -48,6 +48,7 @@ class SceneStores:
     sensors: Mapping[str, Mapping[str, Any]]
     flags: Mapping[int, str]
     inputs: Mapping[str, str]
+    points_per_px: float | None
 
 
 def open_stores(item: SceneFiles) -> SceneStores:
@@ -95,6 +96,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
         flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
         inputs=inputs,
+        points_per_px=disparity.attrs.get("points_per_px"),
     )
 
 

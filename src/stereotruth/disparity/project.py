@@ -26,9 +26,11 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import BlockProgress
+from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import describe, digest
 from ..products.resumable_grids import BlockStore, making
+from .hidden_pixels import CELL_PX
 from .label_window import label_window
 from .layers import layers
 from .overlap_check import apart, refuse_apart
@@ -41,6 +43,26 @@ log = logging.getLogger("stereotruth")
 CHUNK = 256
 SHARD = 1024
 MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
+
+
+ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have more labels
+
+
+def _tell_density(inputs: SceneInputs) -> None:
+    """Log how dense the points are, and what that leaves without a label."""
+    per_px = inputs.scale.points_per_px
+    pixel = inputs.rays.cell[1] * LATTICE_DEG * DEGREE_M / CELL_PX
+    share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
+    said = f"about {per_px / pixel**2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
+    if inputs.settings.fills or share > ENOUGH:
+        log.info("%s", said)
+        return
+    log.warning(
+        "%s: a point falls into %.0f %% of the pixels, and the others get no label. "
+        "project.fill: surface labels pixels between points, too",
+        said,
+        share,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +178,13 @@ def project_scene(
         "view": view,
         "epipolar": dict(left_attrs["epipolar"]),
         "points_bounds": points_bounds,
+        "points_per_px": round(inputs.scale.points_per_px, 4),
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
         "settings": parameters,
         "provenance": describe(made_of, parameters, code),
     }
+    _tell_density(inputs)
     content = digest(
         {
             "images": [_identity(require_complete(p).attrs) for p in (left_store, right_store)],

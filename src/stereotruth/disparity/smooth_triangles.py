@@ -72,6 +72,11 @@ class Scale:
         return CELL_PX * self.distance / PART
 
     @property
+    def points_per_px(self) -> float:
+        """Points in a pixel on the average; more than four count as four."""
+        return 1.0 / self.distance_px**2
+
+    @property
     def trust(self) -> float:
         """How far a lack of points tells that nothing is there: 1 for dense points, less where
         things of NOTICED_PX fall between them."""

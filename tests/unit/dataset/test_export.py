@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import zarr
 
 from stereotruth.dataset.quick_looks import SPLIT_COLOURS
 from stereotruth.dataset.scene_stores import SceneFiles
@@ -119,6 +120,13 @@ def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None
     with pytest.raises(InputError, match=r"Town: not one labelled .*labels incomplete") as caught:
         run([scene], tmp_path / "T", min_labelled=0.99)
     assert "tiles.min_labelled" in caught.value.remedy
+    assert "project.fill" not in caught.value.remedy
+    grid = zarr.open_group(scene.disparity, mode="r+")
+    grid.attrs["points_per_px"] = 0.42
+    with pytest.raises(InputError, match="not one labelled") as caught:
+        run([scene], tmp_path / "T", min_labelled=0.99)
+    assert "s1 0.42" in caught.value.remedy and "project.fill: surface" in caught.value.remedy
+    del grid.attrs["points_per_px"]
     with pytest.raises(InputError, match="grid smaller than a tile"):
         run([scene], tmp_path / "T", size=1024)
     with pytest.raises(InputError, match=r"tiles\.stride"):

@@ -47,8 +47,11 @@ def test_a_plane_is_labelled_between_its_points(plane, method) -> None:
     assert "labelled_between" in grid["status"].attrs["flag_meanings"].split()
 
 
-def test_without_fill_nothing_tells_of_it(plane) -> None:
+def test_without_fill_nothing_tells_of_it_but_sparse_points_do(plane, caplog) -> None:
     grid = plane.project(method="geometric")
+    assert "LiDAR points per m², pixels of 0.65 m: a point falls into" in caplog.text
+    assert "project.fill: surface" in caplog.text
+    assert 0.0 < grid.attrs["points_per_px"] < 0.1  # one in 15 pixels
     assert "labelled_between" not in grid["status"].attrs["flag_meanings"]
     assert "labelled_between" not in plane.summary["pixels"]
     assert not (grid["status"].values == Status.LABELLED_BETWEEN).any()
