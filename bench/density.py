@@ -142,8 +142,12 @@ class Block:
         visible, hidden = groups["visible"] & land, groups["hidden"] & land
         known = is_labelled(found["status"])
         error = found["disparity"].astype(np.float64) - self.truth.disparity
-        measured = visible & (found["status"] == Status.LABELLED)
-        between = visible & (found["status"] == Status.LABELLED_BETWEEN)
+        kinds = {
+            "measured": Status.LABELLED,
+            "between": Status.LABELLED_BETWEEN,
+            "by images": Status.LABELLED_BY_IMAGES,
+        }
+        kinds = {name: visible & (found["status"] == kind) for name, kind in kinds.items()}
         edge = visible & np.isin(self.truth.kind, (ROOF_EDGE, TREE_EDGE))
         sigma = found["uncertainty"].astype(np.float64)
 
@@ -151,16 +155,20 @@ class Block:
             return 100.0 * float((part & of).sum()) / max(int(of.sum()), 1)
 
         off = np.abs(np.nan_to_num(error)) > 1.0
-        result = {
-            "visible": share(known, visible),
-            "hidden": share(known, hidden),
-            "hidden by the LiDAR's world, too": share(known, hidden & ~groups["hidden_bared"]),
-            "over 1 px": share(off, visible & known),
-            "measured": share(measured, visible),
-            "edges": share(known, edge),
-            "edges > 1 px": share(off, edge & known),
-        }
-        for name, part in (("measured", measured), ("between", between)):
+        result = (
+            {
+                "visible": share(known, visible),
+                "hidden": share(known, hidden),
+                "hidden by the LiDAR's world, too": share(known, hidden & ~groups["hidden_bared"]),
+                "over 1 px": share(off, visible & known),
+            }
+            | {name: share(part, visible) for name, part in kinds.items()}
+            | {
+                "edges": share(known, edge),
+                "edges > 1 px": share(off, edge & known),
+            }
+        )
+        for name, part in kinds.items():
             e, s = error[part], sigma[part]
             if e.size:
                 result |= {
@@ -192,16 +200,43 @@ class Block:
         return result
 
 
+def draw(path: Path, scene: str, figures: dict[str, dict[float, dict[str, Any]]]) -> None:
+    """Shares of visible and of hidden pixels with a label by density, for each fill."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    titles = {
+        "visible": "visible pixels with a label, %",
+        "hidden": "hidden pixels with a label, %",
+    }
+    for panel, (name, title) in zip(panels, titles.items()):
+        for fill, found in figures.items():
+            panel.plot(list(found), [f[name] for f in found.values()], "o-", ms=4, label=fill)
+        panel.set_xscale("log", base=2)
+        densities = sorted({d for found in figures.values() for d in found})
+        panel.set_xticks(densities, [f"{d:.2g}" for d in densities])
+        panel.set(title=title, xlabel="LiDAR points per m²", ylim=(0, None))
+        panel.grid(alpha=0.3)
+    panels[0].legend(title="project.fill", frameon=False)
+    figure.suptitle(scene, fontsize="medium")
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", help="whose results/rectify, ingest and truth are made")
     parser.add_argument("--results", type=Path, default=Path("results"))
     parser.add_argument("--densities", type=float, nargs="+", default=list(TARGETS))
-    parser.add_argument("--fill", nargs="+", default=["none", "surface"])
+    parser.add_argument("--fill", nargs="+", default=["none", "surface", "surface_and_images"])
     parser.add_argument("--first", type=int, nargs=2, default=(1024, 1024), help="row, column")
     parser.add_argument("--size", type=int, default=1024, help="px; 0: to the end of the grid")
     parser.add_argument("--kinds", action="store_true", help="statuses by kind of surface")
+    parser.add_argument("--figure", type=Path, help="PNG of the shares by density")
     options = parser.parse_args()
+    drawn: dict[str, dict[float, dict[str, Any]]] = {}
     city = options.scene.rsplit("-", 1)[0]
     shape = open_truth(options.results / "truth" / city / f"{options.scene}.zarr")["visible"].shape
     rows, cols = (
@@ -219,6 +254,7 @@ def main() -> None:
             found = block.labels(job)
             took = (time.process_time() - start) / megapixels
             figures = block.figures(found)
+            drawn.setdefault(fill, {})[min(target, block.density)] = figures
             print(f"\n{fill}, {target:g} points/m²: {took:.1f} s a megapixel")
             if target in TARGETS and fill != "none":
                 print("  to reach: {} / {} / {}".format(*TARGETS[target]))
@@ -227,6 +263,8 @@ def main() -> None:
                 for name, row in block.losses(found).items():
                     shown = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if v >= 0.005)
                     print(f"    {name}: {shown}")
+    if options.figure:
+        draw(options.figure, options.scene, drawn)
 
 
 if __name__ == "__main__":
