@@ -44,7 +44,10 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products",
         "products.files",
         "products.grids",
+        "products.inputs",
         "products.locks",
         "products.provenance",
+        "products.publication",
+        "products.runs",
         "settings",
     }
