@@ -71,7 +71,8 @@ def foreign_files(folder: str | Path) -> list[str]:
 def verify(folders: Iterable[str | Path]) -> dict[str, int]:
     """Check folders; the number of files that the manifest of each lists.
 
-    Files of other programs are named in the log and left alone. Raises InputError, after all were looked at, naming the files that do not.
+    Files of other programs are named in the log and left alone. Raises InputError, after all were
+    looked at, naming the files that do not agree.
     """
     counts, bad = {}, []
     for folder in map(Path, folders):
