@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import rasterio
 import rioxarray
+import xarray as xr
+import zarr
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
@@ -154,6 +156,27 @@ def both_views(made, tmp_path_factory) -> Project:
     run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
     assert run.status == 0, run.text[-4000:]
     return other
+
+
+def test_the_store_of_a_scene_opens_by_xarray_alone(made):
+    """All layers as Zarr has them, status in whole numbers, and in them the values of the tiles."""
+    store = made.folder / "results/project/Tiny/Tiny-1.zarr"
+    raw = zarr.open_group(store, mode="r")
+    with xr.open_zarr(store) as grid:
+        assert {"disparity", "status", "height", "uncertainty"} <= set(grid.data_vars)
+        for name, layer in grid.data_vars.items():
+            assert layer.dims == ("y", "x") and layer.dtype == raw[name].dtype
+            assert np.array_equal(layer.values, raw[name][:], equal_nan=layer.dtype.kind == "f")
+        tiles = [row for row in manifest(made) if row["complete"] == "yes"]
+        for row in tiles:
+            y, x, size = (int(row[key]) for key in ("row0", "col0", "size"))
+            here = grid.isel(y=slice(y, y + size), x=slice(x, x + size))
+            wanted = here.disparity.values.astype(np.float64) - int(row["right_offset_px"])
+            for kind, values in (("disp", wanted), ("status", here.status.values)):
+                path = made.folder / "tiles/Tiny" / row[kind]
+                found = rioxarray.open_rasterio(path, masked=kind == "disp")[0].values
+                np.testing.assert_allclose(found, values, rtol=0, atol=1 / 2048)
+    assert tiles
 
 
 def test_the_right_view_is_a_second_product(made, both_views):

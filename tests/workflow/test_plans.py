@@ -61,6 +61,23 @@ def test_a_wrong_call_ends_before_any_work(project, arguments, words):
     assert not (project.folder / "data").exists()
 
 
+def test_a_forgotten_configuration_is_thought_of(project):
+    run = project.snakemake("--dry-run", "tiles/Mine")
+    assert run.status != 0
+    for word in ("no city 'Mine'", "(configuration: config/config.yaml)", "add --configfile FILE"):
+        assert word in run.text
+    row = {"scene": "Mine-1", "city": "Mine"}
+    for name in ("left_image", "right_image", "lidar", "gcps"):
+        (project.folder / f"{name}.laz").touch()
+        row[name] = f"{name}.laz"
+    mine = project.add_scene("mine", [row])
+    run = project.snakemake("--dry-run", "tiles/Mime", "--configfile", mine)
+    assert run.status != 0
+    for word in ("no city 'Mime'", "(configuration: config/config.yaml, mine.yaml)", "one of Mine"):
+        assert word in run.text
+    assert "FILE" not in run.text  # it was not forgotten
+
+
 @pytest.mark.parametrize("column", ["left_image", "right_image", "lidar", "geoid", "gcps"])
 def test_a_missing_file_is_named(project, column):
     row = {"scene": "Mine-1", "city": "Mine"}

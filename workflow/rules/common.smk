@@ -77,16 +77,24 @@ wildcard_constraints:
     lidar="[^/]+",
 
 
+def no_scenes(sheet, what, remedy):
+    """The error of a city that the sheets do not have, as where --configfile was forgotten."""
+    given, here = map(Path, workflow.overwrite_configfiles), Path.cwd()
+    given = [str(f.relative_to(here) if f.is_relative_to(here) else f) for f in given]
+    if not given:
+        remedy = f"add --configfile FILE if it was forgotten; or else {remedy}"
+    read = ", ".join(["config/config.yaml", *given])
+    return WorkflowError(f"{sheet}: no {what} (configuration: {read}). Remedy: {remedy}")
+
+
 def scenes_of(city):
     """The scenes of a city, in the order of the sheet."""
     if city not in CITIES:
-        raise WorkflowError(
-            f"{SETTINGS.cities}: no city {city!r}. "
-            f"Remedy: take one of {', '.join(CITIES)}, or add a row"
-        )
+        remedy = f"take one of {', '.join(CITIES)}, or add a row"
+        raise no_scenes(SETTINGS.cities, f"city {city!r}", remedy)
     found = [scene for scene in SCENES.values() if scene.city == city]
     if not found:
-        raise WorkflowError(f"{SETTINGS.scenes}: no scene of city {city!r}. Remedy: add a row")
+        raise no_scenes(SETTINGS.scenes, f"scene of city {city!r}", "add a row")
     return found
 
 

@@ -50,10 +50,7 @@ Conventions
 
 def _rounding(rows: Sequence[dict[str, str]]) -> str:
     largest = max((float(r["disparity_rounding_px"]) for r in rows), default=0.0)
-    return (
-        f"Stored values are rounded by at most {largest:.4f} px (16-bit float: 1/128 px below\n"
-        "  32 px, 1/64 below 64, 1/32 below 128, 1/16 from 128 px on)."
-    )
+    return f"Stored values are rounded by at most {largest:.4f} px."
 
 
 def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def summarise(
                 "16-bit float: at most 1/128 px off below 32 px, 1/64 below 64, 1/32 below 128, "
                 "1/16 from 128 px on"
                 if half
-                else "32-bit float: none that matters"
+                else "32-bit float, rounded to 1/1024 px: at most 1/2048 px off"
             ),
         },
     }

@@ -30,9 +30,14 @@ FILES = ("left", "right", "disp", "status", "orientation")
 RIGHT_FILES = ("disp_right", "status_right")  # labels of the right view, where a scene has them
 
 
-def round_disparity(disparity: NDArray[np.float64], dtype: str) -> NDArray[np.float32]:
-    """Disparities as stored, in float32: rounded to nearest for float16."""
-    return disparity.astype(dtype).astype(np.float32)
+STEPS = 1024  # in a px, of disparities in 32 bits: they compress to little more than half
+
+
+def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.float32]:
+    """Disparities as stored, in float32, rounded to nearest: of 1/1024 px, or of float16."""
+    if dtype == "float16":
+        return disparity.astype(np.float16).astype(np.float32)
+    return (np.rint(disparity * STEPS) / STEPS).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterable
+from fnmatch import fnmatch
 from pathlib import Path
 
 from ..errors import InputError
@@ -15,12 +16,19 @@ log = logging.getLogger("stereotruth")
 
 
 LOOSE = {"manifest.csv", "export.json", "README.txt"}  # files that the manifest does not list
+FOREIGN = (  # what other programs leave beside the files that they open; in lower case
+    "*.aux.xml",  # GDAL, QGIS: statistics
+    "*.ovr",  # GDAL, QGIS: pyramids
+    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
+    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
+)
 
 
 def defects(folder: str | Path) -> list[str]:
     """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
 
-    Works on ``tiles/<City>`` and on ``dataset``. Raises InputError if there is no manifest.
+    Works on ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`)
+    are no defects. Raises InputError if there is no manifest.
     """
     folder = Path(folder)
     found = []
@@ -36,7 +44,11 @@ def defects(folder: str | Path) -> list[str]:
                 found.append(f"{name}: changed")
     files = (p for p in folder.rglob("*") if p.is_file())
     # a workflow manager may leave a hidden time stamp of its own
-    present = {p.relative_to(folder).as_posix() for p in files if not p.name.startswith(".")}
+    present = {
+        p.relative_to(folder).as_posix()
+        for p in files
+        if not p.name.startswith(".") and not _is_foreign(p)
+    }
     found += [f"{name}: not in the manifest" for name in sorted(present - listed - LOOSE)]
     if (record := folder / "export.json").is_file():
         wanted = json.loads(record.read_text(encoding="utf-8"))["manifest_sha256"]
@@ -45,10 +57,22 @@ def defects(folder: str | Path) -> list[str]:
     return found
 
 
-def verify(folders: Iterable[str | Path]) -> dict[str, int]:
-    """Check folders; the number of files of each that agree with its manifest.
+def _is_foreign(path: Path) -> bool:
+    return any(fnmatch(path.name.lower(), pattern) for pattern in FOREIGN)
 
-    Raises InputError, after all were looked at, naming the files that do not.
+
+def foreign_files(folder: str | Path) -> list[str]:
+    """Files that other programs have left in a folder of tiles, as paths in it, sorted."""
+    folder = Path(folder)
+    files = (p for p in folder.rglob("*") if p.is_file() and _is_foreign(p))
+    return sorted(p.relative_to(folder).as_posix() for p in files)
+
+
+def verify(folders: Iterable[str | Path]) -> dict[str, int]:
+    """Check folders; the number of files that the manifest of each lists.
+
+    Files of other programs are named in the log and left alone. Raises InputError, after all were
+    looked at, naming the files that do not agree.
     """
     counts, bad = {}, []
     for folder in map(Path, folders):
@@ -59,6 +83,12 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         rows = read_manifest(folder)
         files = [1 for row in rows for key in row if key.endswith("_sha256") and row[key]]
         counts[str(folder)] = len(files)
+        if foreign := foreign_files(folder):
+            more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
+            log.info(
+                "%s: files of other programs, left alone: %s%s",
+                *(folder, ", ".join(foreign[:5]), more),
+            )
         if not found:
             log.info("%s: %d files as in the manifest", folder, len(files))
     if bad:

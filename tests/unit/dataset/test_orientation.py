@@ -58,7 +58,7 @@ def test_sidecar_leads_back_to_sensor_pixels_and_ground(
 
 
 def test_height_from_stored_disparity(exported: tuple[Path, dict]) -> None:
-    """From files and the polynomial alone: the terrain, within float16's rounding."""
+    """From files and the polynomial alone: the terrain, within the rounding of its values."""
     folder, _ = exported
     row = rows_of(folder)[0]
     record = json.loads((folder / row["orientation"]).read_text())

@@ -5,17 +5,17 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
-from PIL import Image
+import zarr
 from scipy.ndimage import map_coordinates
 
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.tile_files import round_disparity
 from stereotruth.products.rasters import write_tiff
 
+from ...synthetic.other_programs import PROGRAMS
 from ...synthetic.tiled_scene import SIZE, labels, read, rows_of, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -32,7 +32,7 @@ def test_right_tile_warped_by_the_disparity_is_the_left_tile(exported: tuple[Pat
             match = x - disparity
             use = np.isfinite(disparity) & (match > 4) & (match < SIZE - 5)
             warped = map_coordinates(right, [y[use], match[use]], order=3)
-            # Texture ±360, 0.02 px of float16 and of cubic interpolation: 1 to 2 grey values.
+            # Texture ±360, 0.02 px of cubic interpolation: 1 to 2 grey values.
             assert np.abs(warped - left[use]).mean() < 2.5
             shifted = map_coordinates(right, [y[use], match[use] + 1.0], order=3)
             assert np.abs(shifted - left[use]).mean() > 10
@@ -69,14 +69,50 @@ def test_half_precision_tiff(tmp_path: Path) -> None:
     assert np.array_equal(np.frombuffer(raw, "<f2"), stored.astype("f2").ravel())
 
 
-def test_other_readers(exported: tuple[Path, dict], scene: SceneFiles, tmp_path: Path) -> None:
-    folder, _ = exported
-    left = read(folder / "left" / "TN_left_0.tiff")
-    for path in (folder / "left" / "TN_left_0.tiff",):
-        assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), left)
-        assert np.array_equal(np.asarray(Image.open(path)), left)
-    run([scene], tmp_path / "T", disparity_dtype="float32")
-    path = tmp_path / "T" / "disp" / "TN_disparity_0.tiff"
-    wanted = read(path)
-    assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), wanted)
-    assert np.array_equal(np.asarray(Image.open(path)), wanted)
+@pytest.fixture(scope="module")
+def of_both_views(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiles with labels of the right view too (here those of the left: only the files matter)."""
+    folder = tmp_path_factory.mktemp("both") / "Town"
+    run([scene._replace(disparity_of_right=scene.disparity)], folder)
+    return folder
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_the_tiles(
+    of_both_views: Path, scene: SceneFiles, program: str
+) -> None:
+    """What each reads are the values of the scene's stores."""
+    left, right, labels_of = (
+        zarr.open_group(path, mode="r") for path in (scene.left, scene.right, scene.disparity)
+    )
+    for row in rows_of(of_both_views)[::5]:
+        assert float(row["disparity_rounding_px"] or 0) <= 1 / 2048
+        offset = int(row["right_offset_px"])
+        rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
+        here = (rows, slice(int(row["col0"]), int(row["col0"]) + SIZE))
+        there = (rows, slice(here[1].start - offset, here[1].stop - offset))
+        wanted = {"left": left["image"][here], "right": right["image"][there]}
+        if row["complete"] == "yes":
+            for end, window in (("", here), ("_right", there)):
+                disparity = labels_of["disparity"][window].astype(np.float64) - offset
+                wanted[f"disp{end}"] = np.where(np.isfinite(disparity), disparity, -999)
+                wanted[f"status{end}"] = labels_of["status"][window]
+        for kind, values in wanted.items():
+            found = PROGRAMS[program](of_both_views / row[kind])
+            if kind.startswith("disp"):
+                assert found.dtype == np.float32
+                assert np.abs(found - values).max() <= 1 / 2048
+                assert np.array_equal(found == -999, values == -999)
+            else:
+                assert found.dtype == values.dtype
+                assert np.array_equal(found, values)
+
+
+def test_the_papers_16_bits_can_be_chosen(scene: SceneFiles, tmp_path: Path) -> None:
+    run([scene], tmp_path / "T", disparity_dtype="float16")
+    row = rows_of(tmp_path / "T")[0]
+    with rasterio.open(tmp_path / "T" / row["disp"]) as dataset:
+        assert dataset.tags(1, ns="IMAGE_STRUCTURE")["NBITS"] == "16"
+    values = labels(tmp_path / "T" / row["disp"])
+    assert 1e-4 < float(row["disparity_rounding_px"]) <= 1 / 128
+    assert np.array_equal(values.astype(np.float16), values, equal_nan=True)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.dataset.scene_stores import SceneFiles
-from stereotruth.dataset.verify import defects, verify
+from stereotruth.dataset.verify import defects, foreign_files, verify
 from stereotruth.errors import InputError
 
 from ...synthetic.tiled_scene import run
@@ -37,3 +40,38 @@ def test_checksums_find_an_edited_file(scene: SceneFiles, tmp_path: Path) -> Non
     with pytest.raises(InputError, match=r"TN_disparity_3|TN_left_0"):
         assemble_dataset([folder], tmp_path / "dataset")
     assert not (tmp_path / "dataset").exists()
+
+
+def test_files_of_other_programs_are_named_and_left_alone(
+    exported: tuple[Path, dict], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "Town"
+    shutil.copytree(exported[0], folder)
+    tile = folder / "disp/TN_disparity_0.tiff"
+    foreign = [
+        "disp/TN_disparity_0.tiff.aux.xml",
+        "disp/TN_disparity_0.tiff.ovr",
+        "left/.DS_Store",
+        "left/Thumbs.db",
+        "map.qgz",
+    ]
+    for name in (*foreign, "right/.hidden"):
+        (folder / name).write_text("x")
+    assert foreign_files(folder) == foreign
+    with caplog.at_level(logging.INFO, logger="stereotruth"):
+        assert verify([folder])[str(folder)] > 60
+    (line,) = (m for m in caplog.messages if "other programs" in m)
+    assert line == f"{folder}: files of other programs, left alone: {', '.join(foreign)}"
+    assert all((folder / name).is_file() for name in foreign)
+
+    os.truncate(tile, tile.stat().st_size - 1)
+    (folder / "left/TN_left_0.tiff").unlink()
+    (folder / "left/TN_left_0.tiff.aux.xml").write_text("x")  # is no excuse for a missing tile
+    (folder / "left/TN_left_99.tiff").write_text("x")
+    assert sorted(defects(folder)) == [
+        "disp/TN_disparity_0.tiff: changed",
+        "left/TN_left_0.tiff: missing",
+        "left/TN_left_99.tiff: not in the manifest",
+    ]
+    with pytest.raises(InputError, match="3 files differ"):
+        verify([folder])

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.rasters import image_shape, read_disparity, read_image
+from stereotruth.products.rasters import image_shape, read_disparity, read_image, write_disparity
 
 from ...synthetic.images import write
+from ...synthetic.other_programs import PROGRAMS
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -43,3 +44,12 @@ def test_labels_are_nan_where_there_are_none(tmp_path, bits):
     found = read_disparity(write(tmp_path / "d.tif", values, nodata=-7, nbits=bits), -999)
     assert found.dtype == np.float32
     assert np.array_equal(found, [[1.5, np.nan], [np.nan, np.nan]], equal_nan=True)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_the_disparity_map_of_a_method(tmp_path, program):
+    values = np.linspace(-40, 60, 300 * 170, dtype=np.float32).reshape(300, 170)
+    values[::7, ::5] = np.nan
+    write_disparity(tmp_path / "d.tiff", values)
+    found = PROGRAMS[program](tmp_path / "d.tiff")
+    assert found.dtype == np.float32 and np.array_equal(found, values, equal_nan=True)

@@ -25,6 +25,7 @@ from stereotruth.products.grids import Layer, building, create_grid
 
 from ....synthetic.cameras import HEIGHT
 from ....synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
+from ....synthetic.other_programs import PROGRAMS
 from ....synthetic.stores import Killed
 
 
@@ -79,6 +80,19 @@ def test_the_model_of_a_plane_is_the_plane(model, of_plane, tmp_path):
     assert not known[~shown & ((x < -near) | (y < -near))].any()
     assert tags["vertical_datum"] == "WGS 84 ellipsoid"
     assert tags["profile"]["nodata"] == -9999.0
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_it(model, of_plane, tmp_path, program):
+    store = write_grid(tmp_path / "d.zarr", model, of_plane)
+    write_dsm(store, tmp_path / "dsm.tif", resolution_m=0.7)
+    _, raster, _ = read(tmp_path / "dsm.tif")
+    row, col = np.mgrid[: raster.shape[0], : raster.shape[1]].astype(float)
+    found = PROGRAMS[program](tmp_path / "dsm.tif")
+    assert found.dtype == np.float32 and found.shape == raster.shape
+    known = found != -9999
+    assert known.mean() > 0.5
+    assert np.abs(found - plane(*raster.ground(col, row)))[known].max() < 2e-3
 
 
 def test_a_block_of_buildings_has_its_roofs_and_open_edges(model, tmp_path):
