@@ -31,6 +31,7 @@ REACH = 12.0  # mean distances of points along an edge, to either side of a tria
 NEAR = 3.0  # within which points tell heights and the direction of a step
 BAND = 2.5  # and how far off the edge points still have a say
 BACK = 1.5  # before a corner the last points are left out: they may already lie beyond it
+ROUGH = 0.08  # with more points below the low and above the high surface, these are crowns
 GAP = 4.6  # points expected in an area that is empty with a chance of 1 %
 SLACK_CELLS = 0.12  # horizontal noise of points, in cells
 MARGIN_CELLS = 0.2  # added to either side of the feasible span
@@ -279,20 +280,20 @@ def _cuts(
         # which points are on either, and the direction of the step
         lx, ly, tx, ty = plane[low, 0], plane[low, 1], plane[top, 0], plane[top, 1]
         sum_lx = sum_ly = sum_tx = sum_ty = 0.0
-        near_l = near_t = 0
+        near_l = near_t = beyond = 0
         off_l = off_t = square_l = square_t = 0.0
         m = 0
         least_h, most_h = np.inf, -np.inf
         for k in range(n):
             w = which[k]
             least_h, most_h = min(least_h, float(h[w])), max(most_h, float(h[w]))
-            if np.isnan(plane[w, 0]):
-                continue
             at_l, at_t = low_h + lx * dx[k] + ly * dy[k], top_h + tx * dx[k] + ty * dy[k]
-            gap = at_t - at_l
-            if gap < 2.0 * step:
-                continue
             away = np.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
+            if away <= near and (float(h[w]) < at_l - step or float(h[w]) > at_t + step):
+                beyond += 1
+            gap = at_t - at_l
+            if gap < 2.0 * step or np.isnan(plane[w, 0]):
+                continue
             tolerance = min(step * (1.0 + away / (4.0 * distance)), gap / 3.0)
             is_low = abs(float(h[w]) - at_l) <= tolerance
             if not is_low and abs(float(h[w]) - at_t) > tolerance:
@@ -312,7 +313,7 @@ def _cuts(
                     sum_ty += dy[m - 1]
                     off_t += float(h[w]) - at_t
                     square_t += (float(h[w]) - at_t) ** 2
-        if near_l == 0 or near_t == 0:
+        if near_l == 0 or near_t == 0 or beyond > ROUGH * (near_l + near_t):
             continue
         nx, ny = sum_tx / near_t - sum_lx / near_l, sum_ty / near_t - sum_ly / near_l
         length = np.sqrt(nx * nx + ny * ny)
