@@ -6,7 +6,7 @@ from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    address = snakemake.config["dask"]["scheduler_address"]
+    address = snakemake.config.get("dask", {}).get("scheduler_address")
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),

@@ -6,7 +6,10 @@ from stereotruth.job import dask_scheduler, job
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
-    scene, address = snakemake.wildcards.scene, snakemake.config["dask"]["scheduler_address"]
+    scene, address = (
+        snakemake.wildcards.scene,
+        snakemake.config.get("dask", {}).get("scheduler_address"),
+    )
     with (
         job(snakemake.log[0], f"project {scene}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
