@@ -15,6 +15,7 @@ import rasterio
 
 from .images import pattern
 from .las import write_gtx, write_las
+from .rpc_texts import rpb_text, rpc_text
 from .surveyed_pair import RPCS, SIZES, make_gcps, write_gcps, write_image
 
 
@@ -133,32 +134,6 @@ def _tiff_cases(folder: Path) -> list[Case]:
             deflate = options.get("compress") == "deflate"
             made.append(Case(f"TIFF {name}", "TIFF", "image", file, checksums=deflate))
     return made
-
-
-def rpc_text(values: dict[str, Any]) -> str:
-    """``_RPC.TXT`` of an RPC's fields."""
-    lines = []
-    for name, value in values.items():
-        if isinstance(value, list):
-            lines += [f"{name.upper()}_{i}: {v:+.15E}" for i, v in enumerate(value, start=1)]
-        else:
-            lines.append(f"{name.upper()}: {value:+017.10f}")
-    return "\r\n".join(lines) + "\r\n"
-
-
-def rpb_text(values: dict[str, Any]) -> str:
-    """``.RPB`` of an RPC's fields."""
-    lines = ['satId = "GF7";', 'bandId = "PAN";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
-    for ours, theirs in (("line", "line"), ("samp", "samp"), ("lat", "lat"), ("long", "long")):
-        lines.append(f"\t{theirs}Offset = {values[f'{ours}_off']!r};")
-        lines.append(f"\t{theirs}Scale = {values[f'{ours}_scale']!r};")
-    lines.append(f"\theightOffset = {values['height_off']!r};")
-    lines.append(f"\theightScale = {values['height_scale']!r};")
-    for name in ("line_num", "line_den", "samp_num", "samp_den"):
-        kind, part = name.split("_")
-        body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
-        lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
-    return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
 
 
 def _text_cases(folder: Path) -> list[Case]:

@@ -12,6 +12,7 @@ from stereotruth.epipolar.rpc import RPC
 from stereotruth.epipolar.rpc_files import read_rpc, rpc_file
 from stereotruth.errors import InputError
 
+from ...synthetic import rpc_texts
 from ...synthetic.cameras import ground_points, make_rpc
 from ...synthetic.images import write_image
 
@@ -19,31 +20,11 @@ from ...synthetic.images import write_image
 
 
 def rpc_text(rpc: RPC) -> str:
-    units = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
-    lines = []
-    for name, value in rpc.to_dict().items():
-        if isinstance(value, list):
-            lines += [f"{name.upper()}_{i}: {v:+.15E}" for i, v in enumerate(value, start=1)]
-        else:
-            unit = units.get(name.split("_")[0], "meters")
-            lines.append(f"{name.upper()}: {value:+017.10f} {unit}")
-    return "\r\n".join(lines) + "\r\n"
+    return rpc_texts.rpc_text(rpc.to_dict(), units=True)
 
 
 def rpb_text(rpc: RPC, spec: str = "RPC00B") -> str:
-    values = rpc.to_dict()
-    lines = ['satId = "GF7";', 'bandId = "PAN";', f'SpecId = "{spec}";', "BEGIN_GROUP = IMAGE"]
-    lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
-    for ours, theirs in (("line", "line"), ("samp", "samp"), ("lat", "lat"), ("long", "long")):
-        lines.append(f"\t{theirs}Offset = {values[f'{ours}_off']!r};")
-        lines.append(f"\t{theirs}Scale = {values[f'{ours}_scale']!r};")
-    lines.append(f"\theightOffset = {values['height_off']!r};")
-    lines.append(f"\theightScale = {values['height_scale']!r};")
-    for name in ("line_num", "line_den", "samp_num", "samp_den"):
-        kind, part = name.split("_")
-        body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
-        lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
-    return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
+    return rpc_texts.rpb_text(rpc.to_dict(), spec, ("\terrBias = 0.0;", "\terrRand = 0.0;"))
 
 
 def assert_same(a: RPC, b: RPC) -> None:

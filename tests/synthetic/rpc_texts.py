@@ -1,0 +1,36 @@
+"""RPC files as text, from the fields that `rasterio.rpc.RPC.to_dict` gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
+
+
+def rpc_text(values: Mapping[str, Any], units: bool = False) -> str:
+    """``_RPC.TXT``, with or without units."""
+    lines = []
+    for name, value in values.items():
+        if isinstance(value, list):
+            lines += [f"{name.upper()}_{i}: {v:+.15E}" for i, v in enumerate(value, start=1)]
+        else:
+            unit = f" {UNITS.get(name.split('_')[0], 'meters')}" if units else ""
+            lines.append(f"{name.upper()}: {value:+017.10f}{unit}")
+    return "\r\n".join(lines) + "\r\n"
+
+
+def rpb_text(values: Mapping[str, Any], spec: str = "RPC00B", more: Sequence[str] = ()) -> str:
+    """``.RPB``; ``more`` lines at the beginning of its group."""
+    lines = ['satId = "GF7";', 'bandId = "PAN";', f'SpecId = "{spec}";', "BEGIN_GROUP = IMAGE"]
+    lines += more
+    for ours, theirs in (("line", "line"), ("samp", "samp"), ("lat", "lat"), ("long", "long")):
+        lines.append(f"\t{theirs}Offset = {values[f'{ours}_off']!r};")
+        lines.append(f"\t{theirs}Scale = {values[f'{ours}_scale']!r};")
+    lines.append(f"\theightOffset = {values['height_off']!r};")
+    lines.append(f"\theightScale = {values['height_scale']!r};")
+    for name in ("line_num", "line_den", "samp_num", "samp_den"):
+        kind, part = name.split("_")
+        body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
+        lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
+    return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
