@@ -167,11 +167,12 @@ def _by_images(
     shown = left.pixels[top : top + rows, side : side + cols].astype(np.float64)
     top = wide[0].start - right.row
     warped_from = right.pixels[top : top + rows].astype(np.float64)
+    known = is_labelled(status)
     is_open = between.outcome == STEP_IN_RIGHT
     is_open |= (between.outcome == STEP_IN_LEFT) & between.rough
     found = surfaces_by_images(
         is_open & (status != Status.CHANGED) & (status != Status.OUT_OF_FRAME),
-        np.where(is_labelled(status), labels.disparity, np.nan),
+        np.where(known, labels.disparity, np.nan),
         labels.slope,
         between.disparity,
         between.slope,
@@ -184,10 +185,10 @@ def _by_images(
     at, (y, x) = (found.row, found.col), found.source.T
     own = (found.row == y) & (found.col == x)
     told = {
-        "disparity": np.where(is_labelled(status), labels.disparity, between.disparity),
-        "variance": np.where(is_labelled(status), labels.variance, between.variance),
-        "height": np.where(is_labelled(status), pixels.highest, between.height),
-        "class": np.where(is_labelled(status), pixels.surface_class, between.surface_class),
+        "disparity": np.where(known, labels.disparity, between.disparity),
+        "variance": np.where(known, labels.variance, between.variance),
+        "height": np.where(known, pixels.highest, between.height),
+        "class": np.where(known, pixels.surface_class, between.surface_class),
     }
     dry = told["class"][y, x] != WATER_CLASS
     own, y, x = own[dry], y[dry], x[dry]

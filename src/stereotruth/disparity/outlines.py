@@ -197,8 +197,8 @@ def _cuts(
         area = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
         if area < 2.0 * SMALLEST * distance * distance:
             continue
-        ox = float(x[corner[t, 1]] - x[a] + x[corner[t, 2]] - x[a]) / 3.0
-        oy = float(y[corner[t, 1]] - y[a] + y[corner[t, 2]] - y[a]) / 3.0
+        ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
+        oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
         # surfaces of its own vertices, at the middle
         low, top, low_h, top_h, bare = -1, -1, np.inf, -np.inf, False
         for i in range(3):

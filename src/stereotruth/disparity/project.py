@@ -36,6 +36,7 @@ from .layers import layers
 from .overlap_check import apart, refuse_apart
 from .scene_inputs import SceneInputs
 from .settings import Settings
+from .status import is_labelled
 
 log = logging.getLogger("stereotruth")
 
@@ -223,8 +224,7 @@ def project_scene(
         if framed == 0:
             refuse_apart(tuple(bounds), images, heights, where)
         reached = sum(pixels.values()) - pixels["no_points"] - pixels["out_of_frame"]
-        labelled = pixels["labelled"] + pixels.get("labelled_between", 0)
-        labelled += pixels.get("labelled_by_images", 0)
+        labelled = sum(counts[status] for status in settings.statuses if is_labelled(status))
         summary = {
             "pixels": pixels,
             "points": {"in_grid": in_grid, "in_frame": framed, "used": used},
