@@ -10,7 +10,7 @@ import pickle
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -153,6 +153,11 @@ class BlockProgress(Callback):
         self.done += 1
         if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
             log.info("%s: %d of %d blocks", self.what, self.done, self.total)
+
+
+def scheduler_address(config: Mapping[str, Any]) -> str | None:
+    """Of a configuration as a user has it: ``dask.scheduler_address``, None where it has none."""
+    return config.get("dask", {}).get("scheduler_address")
 
 
 @contextmanager

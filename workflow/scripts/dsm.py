@@ -1,12 +1,12 @@
 """A scene's disparities to a surface model."""
 
-from stereotruth.job import dask_scheduler, job
+from stereotruth.job import dask_scheduler, job, scheduler_address
 from stereotruth.matching.scenes.surface_model import write_dsm
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    address = snakemake.config.get("dask", {}).get("scheduler_address")
+    address = scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),

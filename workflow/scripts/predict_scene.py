@@ -1,13 +1,13 @@
 """A stereo method over a whole scene."""
 
-from stereotruth.job import dask_scheduler, job
+from stereotruth.job import dask_scheduler, job, scheduler_address
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    address = snakemake.config.get("dask", {}).get("scheduler_address")
+    address = scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),

@@ -2,14 +2,11 @@
 
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.settings import Settings
-from stereotruth.job import dask_scheduler, job
+from stereotruth.job import dask_scheduler, job, scheduler_address
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
-    scene, address = (
-        snakemake.wildcards.scene,
-        snakemake.config.get("dask", {}).get("scheduler_address"),
-    )
+    scene, address = snakemake.wildcards.scene, scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"project {scene}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
