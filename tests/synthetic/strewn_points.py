@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stereotruth.disparity.hidden_pixels import Rays
-from stereotruth.disparity.point_triangles import VertexBuilder
 from stereotruth.disparity.smooth_triangles import GroundSurface, Scale, ground_surface
+from stereotruth.disparity.vertices import VertexBuilder
 from stereotruth.lidar.lattice import LATTICE_M
 
 Array = np.ndarray

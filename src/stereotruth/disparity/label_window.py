@@ -38,7 +38,6 @@ from .open_pixels import surfaces_by_images
 from .paper_correlation import correlate
 from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
 from .pixel_points import Collection, PixelPoints
-from .point_triangles import VertexBuilder, Vertices
 from .point_windows import Box, Reach
 from .scene_inputs import SceneInputs
 from .seen_surface import seen_surface
@@ -52,12 +51,14 @@ from .surface_between import (
     between_labels,
     surface_between,
 )
+from .vertices import VertexBuilder, Vertices
 
 Floats = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
+DENSE = 2.0  # points in a pixel, that miss nothing of a pixel's size
 USUAL_SHARE = 0.8  # of the correlation around: with less, a pixel between points disagrees
 
 
@@ -317,7 +318,7 @@ def _test_agreement(
     surface = labels.disparity, labels.slope
     found = surface_correlation(shown, warped, *surface, settings.window)
     changed = outvoted(found, *surface, settings.correlation_threshold)
-    if settings.fills:
+    if settings.fills and scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
         share = 1.0 - (1.0 - USUAL_SHARE) * scene.scale.trust
         limits = settings.correlation_threshold, share, settings.window // 2

@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .feasible_lines import CORNERS, clip, line_between
-from .point_triangles import PART, PART_BITS
+from .vertices import PART, PART_BITS
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

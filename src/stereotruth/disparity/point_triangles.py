@@ -1,13 +1,9 @@
-"""The points of a window as triangles over the ground: vertices on a lattice, exact Delaunay.
+"""Exact Delaunay triangles of vertices over the ground.
 
 The surface between points (:mod:`.surface_between`) needs triangles that are the same
 whatever window, block, file or order the points come in. So
 
-- a ground cell (:class:`.hidden_pixels.Rays`, half a pixel) gives one vertex at most: the
-  mean of its top surface. This bounds memory at any density, averages noise where points are dense,
-  and no two vertices coincide;
-- plan places are integers (``PART`` parts of a cell) counted on the global lattice, and every test
-  is exact in 64-bit integers;
+- vertices lie at integer places (:mod:`.vertices`), and every test is exact in 64-bit integers;
 - cocircular vertices, as a gridded cloud has them everywhere, are told apart by a symbolic
   perturbation: each vertex is lifted off the paraboloid by an infinitesimal that grows with its
   rank, south to north, then west to east (Devillers and Teillaud 2011). The Delaunay triangulation
@@ -17,156 +13,24 @@ whatever window, block, file or order the points come in. So
   knows the points of a halo around what it needs (:class:`.smooth_triangles.Scale`).
 
 Why not Qhull (scipy.spatial.Delaunay): it joggles or merges cocircular points as their order has
-it, and took 13 us a vertex where the insertion here takes 1.3 us.
+it, and took 13 us a vertex where the insertion here takes 0.7 us.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..lidar.lattice import LATTICE_M
-from .hidden_pixels import SURFACE_PX, Rays
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 
-PART_BITS = 5
-PART = 1 << PART_BITS  # parts of a cell along each axis: 1 cm at pixels of 0.65 m
 # Beyond this width (parts of a cell) the sums of the exact tests could leave 64 bits: 8000 px.
 MAX_PARTS = 1 << 19
 _SPLIT = 20  # bits; see _in_circle
-_LOWEST = np.iinfo(np.int32).min
-
-
-@dataclass(frozen=True, eq=False)
-class Vertices:
-    """Vertices [n] of a window, in the order of their cells: south to north, then west to east.
-
-    ``lon_q``, ``lat_q``, ``h_q`` int64: global lattice steps; ``x``, ``y`` int64: plan place in
-    parts of a cell from the window's first cell; ``surface_class`` ASPRS class of the highest point
-    of the cell; ``count`` of points that the vertex is the mean of.
-    """
-
-    lon_q: Ints
-    lat_q: Ints
-    h_q: Ints
-    x: Ints
-    y: Ints
-    surface_class: NDArray[np.uint8]
-    count: Steps
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _raise_tops(
-    lon_q: Ints,
-    lat_q: Ints,
-    h_q: Ints,
-    classes: NDArray[np.uint8],
-    first: tuple[int, int],
-    cell: tuple[int, int],
-    top: Steps,
-    top_class: NDArray[np.uint8],
-    index: Steps,
-    place: Steps,
-) -> None:
-    """Takes points into the greatest height of each cell, of equals the greater class.
-
-    Fills ``index`` (cell) and ``place`` [n, 3] (steps from the cell's corner, height).
-    """
-    cols = top.shape[1]
-    for k in range(lon_q.size):
-        i, j = lon_q[k] // cell[0] - first[0], lat_q[k] // cell[1] - first[1]
-        index[k] = j * cols + i
-        place[k, 0] = lon_q[k] % cell[0]
-        place[k, 1] = lat_q[k] % cell[1]
-        place[k, 2] = h = np.int32(h_q[k])
-        if h > top[j, i]:
-            top[j, i] = h
-            top_class[j, i] = classes[k]
-        elif h == top[j, i]:
-            top_class[j, i] = max(top_class[j, i], classes[k])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sum_tops(
-    index: Steps, place: Steps, top: Steps, number: Steps, tolerance: int, sums: Ints
-) -> None:
-    """Per vertex, of the points at most ``tolerance`` below the cell's top: count, sums."""
-    for k in range(index.size):
-        if top[index[k]] - place[k, 2] <= tolerance:
-            n = number[index[k]]
-            sums[n, 0] += 1
-            sums[n, 1] += place[k, 0]
-            sums[n, 2] += place[k, 1]
-            sums[n, 3] += place[k, 2]
-
-
-@dataclass(eq=False)
-class VertexBuilder:
-    """Takes points, block by block, into the vertices of a box of the ground.
-
-    ``low``, ``high``: corners (lattice lon, lat), both included; no point lies beyond.
-    """
-
-    rays: Rays
-    low: tuple[int, int]
-    high: tuple[int, int]
-    parts: list[tuple[Steps, Steps]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.first = tuple(int(q // side) for q, side in zip(self.low, self.rays.cell))
-        last = [q // side for q, side in zip(self.high, self.rays.cell)]
-        shape = last[1] - self.first[1] + 1, last[0] - self.first[0] + 1
-        self.top = np.full(shape, _LOWEST, dtype=np.int32)
-        self.top_class = np.zeros(shape, dtype=np.uint8)
-
-    def add(self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8]) -> None:
-        """Points by lattice coordinates and class."""
-        index, place = np.empty(lon_q.size, np.int32), np.empty((lon_q.size, 3), np.int32)
-        _raise_tops(
-            lon_q,
-            lat_q,
-            h_q,
-            surface_class,
-            self.first,
-            self.rays.cell,
-            self.top,
-            self.top_class,
-            index,
-            place,
-        )
-        self.parts.append((index, place))
-
-    def built(self) -> Vertices:
-        """The vertices of all that was taken."""
-        top = self.top.reshape(-1)
-        cells = np.flatnonzero(top > _LOWEST)
-        number = np.full(top.size, -1, np.int32)
-        number[cells] = np.arange(cells.size, dtype=np.int32)
-        sums = np.zeros((cells.size, 4), np.int64)
-        tolerance = int(SURFACE_PX / self.rays.px_per_m / LATTICE_M)
-        for index, place in self.parts:
-            _sum_tops(index, place, top, number, tolerance, sums)
-        self.parts = []
-        n, lon, lat, height = sums.T
-        n = np.maximum(n, 1)
-        row, col = np.divmod(cells, self.top.shape[1])
-        side = self.rays.cell
-        within = lon // n, lat // n
-        return Vertices(
-            lon_q=(col + self.first[0]) * side[0] + within[0],
-            lat_q=(row + self.first[1]) * side[1] + within[1],
-            h_q=height // n,
-            x=(col << PART_BITS) + within[0] * PART // side[0],
-            y=(row << PART_BITS) + within[1] * PART // side[1],
-            surface_class=self.top_class.reshape(-1)[cells],
-            count=n.astype(np.int32),
-        )
 
 
 # ---------------------------------------------------------------------------------- exact tests

@@ -18,10 +18,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..lidar.lattice import CELL_BITS, LATTICE_M
+from .even_squares import REACH as EVEN_REACH
 from .hidden_pixels import CELL_PX
 from .outlines import REACH, Pieces, cut_at_outlines
 from .pixel_labels import FEW_NOISE_M, HEIGHT_NOISE_M
-from .point_triangles import PART, Vertices, triangulate
+from .point_triangles import triangulate
+from .vertices import PART, Vertices
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -58,7 +60,8 @@ class Scale:
     in its circumcircle. A label follows from its triangle, the neighbours of that and theirs
     (noise), the neighbours of these (support), the triangles that share a vertex with them
     (planes), and again (gradients): six steps of two radii. Where it is cut follows from the points
-    up to REACH around it and the planes there (two radii more).
+    up to REACH around it and the planes there (two radii more). Which vertices there are follows
+    from the squares around (:mod:`.even_squares`).
     """
 
     distance: float
@@ -93,7 +96,7 @@ class Scale:
         smooth = SMOOTH_RADIUS * distance
         swept = max(SWEPT_RADIUS * smooth, float(SWEPT_CELLS * PART))
         halo = max(12 * smooth, 2 * swept) + REACH * distance + 2 * smooth
-        return cls(distance, smooth, swept, int(np.ceil(halo / PART)) + 2)
+        return cls(distance, smooth, swept, int(np.ceil(halo / PART)) + EVEN_REACH + 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -209,11 +212,11 @@ def _joined(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _squares(
-    x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, smooth: Bools
+    x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
     """Per triangle, of its smooth neighbours: squared misfits of their far vertices, number.
 
-    A misfit is divided by what it amounts to where all heights have a variance of one.
+    A misfit is divided by what it amounts to where all points have a variance of one.
     """
     total, number = np.zeros(len(corner)), np.zeros(len(corner))
     for t in range(len(corner)):
@@ -231,7 +234,8 @@ def _squares(
             wb = ((x[c] - x[far]) * (y[a] - y[far]) - (y[c] - y[far]) * (x[a] - x[far])) / area
             wc = 1.0 - wa - wb
             off = _misfit(x, y, h, a, far, gx, gy)
-            total[t] += off * off / (1.0 + wa * wa + wb * wb + wc * wc)
+            scale = wa * wa / count[a] + wb * wb / count[b] + wc * wc / count[c]
+            total[t] += off * off / (1.0 / count[far] + scale)
             number[t] += 1.0
     return total, number
 
@@ -240,7 +244,7 @@ def _squares(
 def _variances(
     neighbour: Steps, smooth: Bools, total: Floats, number: Floats, few: float, least: float
 ) -> Floats:
-    """Variance of a vertex's height at each smooth triangle, pooled with its neighbours.
+    """Variance of a point's height at each smooth triangle, pooled with its neighbours.
 
     ``few`` counts as one misfit more, ``least`` is the floor (steps²).
     """
@@ -263,7 +267,7 @@ class GroundSurface:
     """The surface of a window's points, and where it steps.
 
     ``vertices``, and triangles of them: ``smooth`` [m, 3] on the surface, with the variance
-    ``noise`` [m] of their vertices' heights (lattice steps²); ``steps`` [k, 3] that may hold any
+    ``noise`` [m] of their points' heights (lattice steps²); ``steps`` [k, 3] that may hold any
     surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
     nobody knows which surfaces they hold, the others lie between two known ones.
     """
@@ -292,7 +296,7 @@ def ground_surface(
     smooth = _joined(x, y, h, corner, radius, firm, start, around, scale.smooth, step)
     beside = triangles.neighbour
     smooth &= np.where(beside >= 0, smooth[beside], False).sum(axis=1) >= SUPPORT
-    total, number = _squares(x, y, h, corner, triangles.neighbour, smooth)
+    total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
     plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)

@@ -213,8 +213,8 @@ def _prisms_in_right(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _at_pixels(
-    xy: Floats, h: Ints, classes: NDArray[np.uint8], corner: Steps, noise: Floats, shown: Steps,
-    first: tuple[int, int], slope: Floats, variance: Floats, height: Floats,
+    xy: Floats, h: Ints, classes: NDArray[np.uint8], count: Steps, corner: Steps, noise: Floats,
+    shown: Steps, first: tuple[int, int], slope: Floats, variance: Floats, height: Floats,
     surface_class: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """What the triangle that each pixel shows has at its centre; ``variance`` in height steps²."""
@@ -235,7 +235,9 @@ def _at_pixels(
             b = min(max(bx * u + by * w, 0.0), 1.0)
             c = min(max(cx * u + cy * w, 0.0), 1.0 - b)
             a = 1.0 - b - c
-            variance[j, i] = noise[t] * (a * a + b * b + c * c)
+            variance[j, i] = noise[t] * (
+                a * a / count[v[0]] + b * b / count[v[1]] + c * c / count[v[2]]
+            )
             height[j, i] = h[v[0]] + b * float(h[v[1]] - h[v[0]]) + c * float(h[v[2]] - h[v[0]])
             surface_class[j, i] = classes[v[0] if a >= b and a >= c else v[1] if b >= c else v[2]]
 
@@ -347,8 +349,8 @@ def surface_between(
     slope, variance, height = np.zeros((2, *shape)), np.zeros(shape), np.full(shape, np.nan)
     classes = np.zeros(shape, np.uint8)
     _at_pixels(
-        xy, vertices.h_q, vertices.surface_class, corner, surface.noise, shown, first, slope,
-        variance, height, classes,
+        xy, vertices.h_q, vertices.surface_class, vertices.count, corner, surface.noise, shown,
+        first, slope, variance, height, classes,
     )  # fmt: skip
     outcome[(outcome == SHOWN) & (1.0 - slope[0] < LEAST_WIDTH)] = BEHIND_IN_RIGHT
     return Between(

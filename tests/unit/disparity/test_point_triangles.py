@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from stereotruth.disparity.hidden_pixels import Rays
-from stereotruth.disparity.point_triangles import MAX_PARTS, PART, VertexBuilder, triangulate
+from stereotruth.disparity.point_triangles import MAX_PARTS, triangulate
+from stereotruth.disparity.vertices import PART
 
 
 def places(n: int, side: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -96,26 +96,3 @@ def test_too_wide_a_window_is_refused() -> None:
     x = np.array([0, MAX_PARTS], dtype=np.int64)
     with pytest.raises(ValueError, match="exact"):
         triangulate(x, x, 50.0)
-
-
-def test_vertices_are_means_of_the_tops_of_cells() -> None:
-    rays = Rays(np.zeros((2, 2, 3)), (3000, 2500), 1.0)
-    lon = np.array([6010, 6030, 6020, 9001])
-    lat = np.array([2600, 2700, 2650, 2510])
-    height = np.array([100_000, 100_200, 60_000, 50_000])  # the third lies 4 m below
-    classes = np.array([6, 5, 2, 2], np.uint8)
-    whole = VertexBuilder(rays, (0, 0), (20_000, 20_000))
-    whole.add(lon, lat, height, classes)
-    found = whole.built()
-    assert found.lon_q.tolist() == [6020, 9001]
-    assert found.lat_q.tolist() == [2650, 2510]
-    assert found.h_q.tolist() == [100_100, 50_000]
-    assert found.count.tolist() == [2, 1]
-    assert found.surface_class.tolist() == [5, 2]  # that of the highest
-    other = VertexBuilder(rays, (3000, 2500), (20_000, 20_000))
-    for k in (3, 1, 2, 0):
-        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes)))
-    again = other.built()
-    for name in ("lon_q", "lat_q", "h_q", "surface_class", "count"):
-        assert getattr(again, name).tolist() == getattr(found, name).tolist()
-    assert (found.x - again.x).tolist() == [PART, PART]
