@@ -396,7 +396,9 @@ def between_labels(
     status[row[~inside], col[~inside]] = Status.OUT_OF_FRAME
     with np.errstate(invalid="ignore"):
         measured = np.abs(own.disparity - between.disparity) <= STEP_PX
-    measured &= status == Status.LABELLED_BETWEEN
+    between_points = status == Status.LABELLED_BETWEEN
+    status[between_points & np.isfinite(own.disparity)] = Status.EDGE_IN_PIXEL
+    measured &= between_points
     status[measured] = Status.LABELLED
     surer = measured & (own.variance <= between.variance)
     return Labels(
