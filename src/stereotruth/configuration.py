@@ -19,7 +19,7 @@ from pydantic import Field
 
 from .alignment.settings import Settings as Alignment
 from .dataset.settings import Evaluation, Limits, Tiles
-from .disparity.settings import Occlusion, Project, check_fill
+from .disparity.settings import Occlusion, Project
 from .evaluation.audit.settings import Settings as Audit
 from .lidar.settings import Settings as Ingest
 from .matching.benchmark.settings import Settings as Benchmark
@@ -85,9 +85,6 @@ class Configuration:
 
     predict: Predict = field(default_factory=Predict)
     audit: Audit = field(default_factory=Audit)
-
-    def __post_init__(self) -> None:
-        check_fill(self.occlusion, self.project)
 
     @classmethod
     def of(cls, config: Mapping[str, Any], file: str | Path = "config") -> Configuration:

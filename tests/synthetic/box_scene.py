@@ -94,7 +94,9 @@ def points_on(box: bool, noise: float = 0.0, spacing: float = 0.4) -> np.ndarray
 def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path:
     to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
     folder.mkdir(exist_ok=True)
-    write_las(folder / f"{name}.las", xyz=np.column_stack(to_utm.transform(*points.T)))
+    xyz = np.column_stack(to_utm.transform(*points.T))
+    first = np.ones(len(xyz), np.uint8)  # returns: no order of points tells another surface
+    write_las(folder / f"{name}.las", xyz=xyz, return_number=first)
     ingest(folder / f"{name}.las", folder / f"{name}.zarr")
     return folder / f"{name}.zarr"
 

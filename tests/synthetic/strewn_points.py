@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereotruth.disparity.hidden_pixels import Rays
+from stereotruth.disparity.rays import Rays
 from stereotruth.disparity.smooth_triangles import GroundSurface, Scale, ground_surface
 from stereotruth.disparity.vertices import VertexBuilder
 from stereotruth.lidar.lattice import LATTICE_M

@@ -10,9 +10,7 @@ one surface only:
 - :func:`outvoted`: whether most pixels of the same surface around a pixel fail the threshold. A
   building that only the LiDAR or only the images have fails as a whole; single failures among
   agreeing pixels, by noise or in shadow, do not;
-- :func:`outvoted_nearby`: the same for what is smaller, by what is usual around it;
-- :func:`supported`: whether enough of the eight neighbours carry the same surface. Which surface
-  the centre of a pixel sees is least certain where neighbours differ.
+- :func:`outvoted_nearby`: the same for what is smaller, by what is usual around it.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
 depend on blocks.
@@ -24,7 +22,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
 from ..epipolar.warping import warp_rows
 from .image_patches import Patch
@@ -36,7 +33,6 @@ Bools = NDArray[np.bool_]
 
 VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
-SUPPORT = 0.6  # share of the neighbours with points that must carry the surface
 
 
 def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
@@ -147,32 +143,3 @@ def outvoted_nearby(
     least = np.fmax(share * surface_mean(correlation, disparity, slope), threshold)
     against = np.where(np.isfinite(correlation), correlation < least, np.nan)
     return surface_mean(against, disparity, slope, reach, 1) > 0.5
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _supported(disparity: Floats, with_points: Bools, share: float, out: Bools) -> None:
-    rows, cols = disparity.shape
-    for y in range(rows):
-        for x in range(cols):
-            out[y, x] = False
-            here = disparity[y, x]
-            if not np.isfinite(here):
-                continue
-            others = 0
-            same = 0
-            for b in range(max(y - 1, 0), min(y + 2, rows)):
-                for a in range(max(x - 1, 0), min(x + 2, cols)):
-                    if (a != x or b != y) and with_points[b, a]:
-                        others += 1
-                        same += abs(disparity[b, a] - here) <= SURFACE_PX
-            out[y, x] = same >= share * others
-
-
-def supported(disparity: Floats, with_points: Bools) -> Bools:
-    """Pixels [h, w] of whose neighbours with points a share of SUPPORT has the same surface.
-
-    ``disparity`` (px) is NaN where a pixel carries no label.
-    """
-    out = np.empty(disparity.shape, dtype=np.bool_)
-    _supported(disparity, with_points, SUPPORT, out)
-    return out

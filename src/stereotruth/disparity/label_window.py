@@ -1,23 +1,16 @@
 """The labels of one window of the left epipolar grid, and why its other pixels have none.
 
-What is tested, in this order; a pixel has the status of the first test that leaves it nothing, that
-of its point that got furthest:
+With the methods ``both`` and ``geometric``, the surface of the points tells what each pixel's
+centre shows and what hides it in either view (:mod:`.surface_between`); a pixel whose own points on
+the surface that its centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured,
+others are between points (``fill``). Then (``both``): do the images agree with what the LiDAR has
+there, and is it no water (:func:`.image_agreement.outvoted`)? The images may tell the surface of
+pixels that stay open (:mod:`.open_pixels`).
 
-1. of each point: does it lie in both frames; is it on the surface that its pixel's centre sees
-   (:func:`.seen_surface.seen_surface`; with the representative ``top`` or geometric
-   visibility); do the image windows around it correlate (method ``correlation``: the paper's
-   filter, :func:`.paper_correlation.correlate`);
-2. of each pixel: do both cameras see it past the other surfaces
-   (:func:`.hidden_pixels.hidden_pixels`; ``geometric``, ``both``); is an edge of its surface
-   near its centre (``top``); do the images agree with what the LiDAR has there, and is it no water
-   (:func:`.image_agreement.outvoted`; ``both``); do its neighbours carry its surface
-   (:func:`.image_agreement.supported`; ``geometric``, ``both``); are there ``min_points``.
-
-So the method ``correlation`` is the paper's filter, ``geometric`` is visibility in both views from
-the points, ``both`` is geometric, and what the images contradict is changed; ``none`` is neither.
-With ``fill`` the surface between the points takes the place of 2. in all but the agreement of the
-images, and gives labels where no point falls (:mod:`.surface_between`); the images may tell the
-surface of pixels that it leaves open (:mod:`.open_pixels`).
+With ``correlation`` (the paper's filter, :func:`.paper_correlation.correlate`) and ``none`` a pixel
+has the status of that of its points that got furthest: does it lie in both frames; is it on the
+surface that the centre sees (representative ``top``); do the image windows around it correlate;
+is an edge of its surface near the centre (``top``); are there ``min_points``.
 """
 
 from __future__ import annotations
@@ -30,8 +23,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from .hidden_pixels import Surface, SurfaceBuilder, hidden_pixels
-from .image_agreement import outvoted, outvoted_nearby, supported, warp_to_left
+from .image_agreement import outvoted, outvoted_nearby, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .open_pixels import surfaces_by_images
@@ -81,9 +73,9 @@ def label_window(
     found = _collect(scene, scene.windows.strips(rows, cols, reach), wide, left, right)
     if found is None:
         return None
-    points, local, surface = found
-    if isinstance(surface, Vertices):
-        return _between_points(scene, points, local, surface, left, right, wide)
+    points, local, vertices = found
+    if vertices is not None:
+        return _on_surface(scene, points, local, vertices, left, right, wide)
     use, edge = np.ones(points.points.size, dtype=np.bool_), None
     if settings.uses_seen_surface:
         use, edge = seen_surface(points, settings.edge_margin_px)
@@ -93,27 +85,16 @@ def label_window(
         use = use & (correlation >= settings.correlation_threshold)
     pixels = condense(scene.pair.model, local, points, use, correlation, settings.representative)
     status = _test_points(settings, points, seen, pixels)
-    if surface is not None:
-        hidden = hidden_pixels(surface, scene.rays, pixels.sums, *wide).reshape(status.shape)
-        status[hidden == 1] = Status.HIDDEN_IN_LEFT
-        status[hidden == 2] = Status.HIDDEN_IN_RIGHT
     if edge is not None and settings.representative == "top":
         status[(status == Status.LABELLED) & edge] = Status.EDGE_IN_PIXEL
     labels = _labels(scene, pixels, status == Status.LABELLED, wide)
-    agreement = pixels.correlation
-    if settings.method == "both":
-        agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
-    if settings.uses_geometry:
-        known = np.where(status == Status.LABELLED, labels.disparity, np.nan)
-        alone = np.isfinite(known) & ~supported(known, status != Status.NO_POINTS)
-        status[alone] = Status.EDGE_IN_PIXEL
     few = (status == Status.LABELLED) & (pixels.count < settings.min_points)
     status[few] = Status.BELOW_MINIMUM_COUNT
-    layers = _layers(scene, pixels, labels, agreement, status, wide)
+    layers = _layers(scene, pixels, labels, pixels.correlation, status, wide)
     return layers, _counts(points, pixels, status, margin)
 
 
-def _between_points(
+def _on_surface(
     scene: SceneInputs,
     points: PixelPoints,
     local: LocalProjection,
@@ -122,20 +103,29 @@ def _between_points(
     right: Patch,
     wide: Window,
 ) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
-    """As :func:`label_window`, with labels between the points, too."""
+    """As :func:`label_window`, by the surface of the points."""
     settings, px_per_m = scene.settings, scene.rays.px_per_m
     first = wide[0].start, wide[1].start
-    use, _ = seen_surface(points, settings.edge_margin_px)
+    use, edge = seen_surface(points, settings.edge_margin_px)
     pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
-    own = _labels(scene, pixels, pixels.count >= max(settings.min_points, 1), wide)
+    enough = pixels.count >= max(settings.min_points, 1)
+    own = _labels(scene, pixels, enough, wide)
     surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell)
     between = surface_between(surface, local, first, points.shape, px_per_m)
-    labels, status = between_labels(between, own, left, right, first)
+    paper = settings.representative == "paper"
+    labels, status = between_labels(between, own, left, right, first, keep_own=paper)
     status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
+    if settings.edge_margin_px > 0.0:
+        status[is_labelled(status) & edge] = Status.EDGE_IN_PIXEL
+    if not settings.fills:
+        bare = status == Status.LABELLED_BETWEEN
+        status[bare] = Status.NO_POINTS
+        status[bare & (points.count > 0)] = Status.HIDDEN_IN_LEFT
+        status[bare & (pixels.count > 0) & ~enough] = Status.BELOW_MINIMUM_COUNT
     measured = status == Status.LABELLED
     pixels = replace(
         pixels,
-        count=np.where(measured, pixels.count, 0),
+        count=np.where(measured | (status == Status.BELOW_MINIMUM_COUNT), pixels.count, 0),
         highest=np.where(measured, pixels.highest, between.height),
         surface_class=np.where(measured, pixels.surface_class, between.surface_class),
     )
@@ -235,11 +225,8 @@ def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Pat
 
 def _collect(
     scene: SceneInputs, strips: Sequence[Box], wide: Window, left: Patch, right: Patch
-) -> tuple[PixelPoints, LocalProjection, Surface | Vertices | None] | None:
-    """The points of a window by pixel, and the surface of all points around; None if none.
-
-    With ``fill``, the vertices of that surface.
-    """
+) -> tuple[PixelPoints, LocalProjection, Vertices | None] | None:
+    """The points of a window by pixel, and the vertices of the surface around; None if none."""
     if not strips:
         return None
     box = [step(strip[k] for strip in strips) for k, step in enumerate((min, min, max, max))]
@@ -253,11 +240,9 @@ def _collect(
     local = LocalProjection.of(scene.pair.model, (*low, low_h), (*high, high_h))
     first = wide[0].start, wide[1].start
     collection = Collection(shape, first, (low[0], low[1]), left, right)
-    builder = vertices = None
-    if scene.settings.fills:
+    vertices = None
+    if scene.settings.uses_geometry:
         vertices = VertexBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
-    elif scene.settings.uses_geometry:
-        builder = SurfaceBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
     for strip in strips:
         for store in scene.stores:
             points = store.query(*strip)
@@ -265,19 +250,15 @@ def _collect(
                 where = slice(start, start + BLOCK)
                 lattice = points.lon_q[where], points.lat_q[where], points.h_q[where]
                 collection.add(*lattice, points.classification[where], local.at_points(*lattice))
-                if builder is not None:
-                    builder.add(*lattice)
                 if vertices is not None:
                     # Later returns of a pulse lie below what the cameras see.
                     top = points.return_number[where] <= 1
                     classes = points.classification[where][top]
                     vertices.add(*(values[top] for values in lattice), classes)
-    made = builder or vertices
-    surface = None if made is None else made.built()
     points = collection.sorted()
     if points.points.size == 0 and not points.outside.any():
         return None
-    return points, local, surface
+    return points, local, None if vertices is None else vertices.built()
 
 
 def _test_points(
@@ -318,7 +299,7 @@ def _test_agreement(
     surface = labels.disparity, labels.slope
     found = surface_correlation(shown, warped, *surface, settings.window)
     changed = outvoted(found, *surface, settings.correlation_threshold)
-    if settings.fills and scene.scale.points_per_px < DENSE:
+    if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
         share = 1.0 - (1.0 - USUAL_SHARE) * scene.scale.trust
         limits = settings.correlation_threshold, share, settings.window // 2

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG
 from ..lidar.point_store import PointStore
-from .hidden_pixels import Rays
+from .rays import Rays
 from .settings import Settings
 from .view_geometry import ViewGeometry
 

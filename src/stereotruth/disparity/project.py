@@ -30,10 +30,10 @@ from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import describe, digest
 from ..products.resumable_grids import BlockStore, making
-from .hidden_pixels import CELL_PX
 from .label_window import label_window
 from .layers import layers
 from .overlap_check import apart, refuse_apart
+from .rays import CELL_PX
 from .scene_inputs import SceneInputs
 from .settings import Settings
 from .status import is_labelled
@@ -191,7 +191,8 @@ def project_scene(
             "images": [_identity(require_complete(p).attrs) for p in (left_store, right_store)],
             "epipolar": left_attrs["epipolar"],
             "uncertainty": inputs.pair.uncertainty.to_attrs(),
-            "parameters": parameters | ({"scale": asdict(inputs.scale)} if settings.fills else {}),
+            "parameters": parameters
+            | ({"scale": asdict(inputs.scale)} if settings.uses_geometry else {}),
             "code": code,
         }
     )

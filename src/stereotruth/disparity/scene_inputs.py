@@ -13,8 +13,8 @@ from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
-from .hidden_pixels import FILL_RADII, Rays
 from .point_windows import PointWindows
+from .rays import Rays
 from .right_view import Pair, seen_from
 from .settings import Settings
 from .smooth_triangles import Scale
@@ -71,7 +71,7 @@ class SceneInputs:
     @property
     def halo(self) -> int:
         """Cells around all that a window shows and what hides it, whose points have a say."""
-        return self.scale.halo if self.settings.fills else sum(FILL_RADII)
+        return self.scale.halo if self.settings.uses_geometry else 0
 
     @cached_property
     def windows(self) -> PointWindows:

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ..errors import InputError
 from ..settings import Flag, Number, Odd, Unit, Whole, settings
 from .status import Status
 
@@ -18,9 +17,9 @@ class Occlusion:
 
     method: Literal["correlation", "geometric", "both", "none"] = "both"
     """how hidden and changed points are found: by the paper's filter, which compares the images
-    around each point; by the rays to both cameras, which run into other points; by the rays, and
-    where the images contradict the LiDAR over most of a surface (25 px around a pixel) it counts as
-    changed; not at all"""
+    around each point; by the surface of the points, drawn into both views; by that, and where the
+    images contradict the LiDAR over most of a surface (25 px around a pixel) it counts as changed;
+    not at all"""
 
     window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
     """side of the correlation window; with `both`, of the pixels in it only those of the same
@@ -46,17 +45,18 @@ class Representative:
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
     """a pixel with fewer stays unlabelled"""
 
-    fill: Literal["none", "surface", "surface_and_images"] = "none"
-    """`none`: a pixel has a label if points fall into it. `surface`: also between points, for LiDAR
-    from 0.25 points/m² on. The points are triangles over the ground; those that go on the plane of
-    their neighbours give labels; those between two surfaces are cut at the outline that the points
-    on both sides of it tell; all others are swept vertically as what may hide a pixel in either
-    view. Such labels have the status `labelled_between` (9) and an `uncertainty` of their own;
-    pixels with points on the surface keep `labelled` (1). Where a step lies between points, pixels
-    are `edge_in_pixel`. `surface_and_images`: of these, pixels that only one of the surfaces around
-    explains in both images are on that surface, `labelled_by_images` (10): more labels in crowns
-    and behind roofs, and more of the hidden pixels. A value is always the LiDAR's. Needs
-    `occlusion.method` both (or geometric, without images), and `representative` top"""
+    fill: Literal["none", "surface", "surface_and_images"] = "surface"
+    """where labels are, with `occlusion.method` both or geometric and the representative top. The
+    points are triangles over the ground: those that go on the plane of their neighbours give
+    labels; those between two surfaces are cut at the outline that the points on both sides of it
+    tell; all others are swept vertically as what may hide a pixel in either view. `surface`: all
+    pixels on it have a label, those with points on it the status `labelled` (1), those between
+    points `labelled_between` (9) and an `uncertainty` of their own. Where a step lies between
+    points, pixels are `edge_in_pixel`. `none`: pixels with points alone. `surface_and_images`: of
+    the pixels that the surface leaves open, those that only one of the surfaces around explains in
+    both images are on that surface, `labelled_by_images` (10): more labels in crowns and behind
+    roofs, and more of the hidden pixels (with the method both alone). A value is always the
+    LiDAR's"""
 
 
 @settings
@@ -66,24 +66,6 @@ class Project(Representative):
     right_view: Flag = False
     """also the labels of the right images: `results/project/<City>/<scene>_right.zarr`, and
     `disp_right`, `status_right` of the tiles"""
-
-
-def check_fill(occlusion: Occlusion, project: Representative) -> None:
-    """Raises InputError if labels between points cannot be had with the other keys."""
-    methods = {
-        "none": ("correlation", "geometric", "both", "none"),
-        "surface": ("geometric", "both"),
-        "surface_and_images": ("both",),
-    }[project.fill]
-    fits = project.fill == "none" or project.representative == "top"
-    if occlusion.method in methods and fits:
-        return
-    raise InputError(
-        f"project.fill: {project.fill!r} with occlusion.method {occlusion.method!r} and "
-        f"project.representative {project.representative!r}",
-        remedy="what lies between points is hidden by geometry, and judged by the images: take the "
-        "method both (geometric does for surface), and the representative top",
-    )
 
 
 @settings
@@ -96,18 +78,15 @@ class Settings(Representative, Occlusion):
         project = {k: v for k, v in config.get("project", {}).items() if k != "right_view"}
         return cls(**config.get("occlusion", {}), **project)
 
-    def __post_init__(self) -> None:
-        check_fill(self, self)
-
     @property
     def fills(self) -> bool:
         """Whether there are labels between points."""
-        return self.fill != "none"
+        return self.fill != "none" and self.uses_geometry and self.representative == "top"
 
     @property
     def asks_images(self) -> bool:
         """Whether images tell the surface of pixels that points leave open."""
-        return self.fill == "surface_and_images"
+        return self.fill == "surface_and_images" and self.fills and self.method == "both"
 
     @property
     def statuses(self) -> list[Status]:
@@ -126,7 +105,7 @@ class Settings(Representative, Occlusion):
 
     @property
     def uses_geometry(self) -> bool:
-        """Whether rays are tested against the surface of the points."""
+        """Whether the surface of the points tells what is seen."""
         return self.method in ("geometric", "both")
 
     @property
@@ -147,5 +126,5 @@ class Settings(Representative, Occlusion):
         if self.method != "both":
             return reach
         # windows, votes about them, and what is asked of the votes nearby
-        reach += VOTE_PX + self.window // 2 * (2 if self.fills else 1)
+        reach += VOTE_PX + self.window // 2 * 2
         return reach + (MARGIN if self.asks_images else 0)

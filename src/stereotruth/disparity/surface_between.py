@@ -24,7 +24,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..lidar.lattice import LATTICE_M
-from .hidden_pixels import TOLERANCE_PX
 from .image_patches import Patch
 from .local_projection import LocalProjection
 from .pixel_labels import Labels
@@ -38,6 +37,8 @@ Bools = NDArray[np.bool_]
 # A surface that turns away from the right camera is hidden. So obliquely that a pixel shrinks to
 # this width there, points and their noise do not tell (crowns, 4 points/m²: 0.5 instead of 1.0 %).
 LEAST_WIDTH = 0.4
+# What lies in front of a surface by less is the surface itself.
+TOLERANCE_PX = 0.25
 NOTHING, SHOWN, STEP_IN_LEFT, STEP_IN_RIGHT, BEHIND_IN_RIGHT = range(5)
 _STATUS = np.array(
     [
@@ -379,13 +380,18 @@ def _prisms(
 
 
 def between_labels(
-    between: Between, own: Labels, left: Patch, right: Patch, first: tuple[int, int]
+    between: Between,
+    own: Labels,
+    left: Patch,
+    right: Patch,
+    first: tuple[int, int],
+    keep_own: bool = False,
 ) -> tuple[Labels, NDArray[np.uint8]]:
     """Labels of a window whose first pixel is (row, col) ``first``, and the status of its pixels.
 
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
-    keep the label that these give if it is the surer one: one point is less than three around it.
-    ``left``, ``right``: patches that tell the frames.
+    keep the label that these give if it is the surer one (one point is less than three around it),
+    or if ``keep_own``. ``left``, ``right``: patches that tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN
@@ -400,7 +406,7 @@ def between_labels(
     status[between_points & np.isfinite(own.disparity)] = Status.EDGE_IN_PIXEL
     measured &= between_points
     status[measured] = Status.LABELLED
-    surer = measured & (own.variance <= between.variance)
+    surer = measured & (keep_own | (own.variance <= between.variance))
     return Labels(
         np.where(surer, own.disparity, np.where(is_labelled(status), between.disparity, np.nan)),
         np.where(surer, own.slope, between.slope),

@@ -1,6 +1,6 @@
 """The points of a window as vertices over the ground, at places on a lattice.
 
-- a ground cell (:class:`.hidden_pixels.Rays`, half a pixel) gives one vertex at most: the
+- a ground cell (:class:`.rays.Rays`, half a pixel) gives one vertex at most: the
   mean of its top surface; a square of even ground gives one (:mod:`.even_squares`). This bounds
   memory at any density, averages noise where points are dense, and no two vertices coincide;
 - plan places are integers (``PART`` parts of a cell) counted on the global lattice.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..epipolar.one_surface import SURFACE_PX
 from ..lidar.lattice import LATTICE_M
 from .even_squares import EVEN_PX, SIDE, even_squares
-from .hidden_pixels import Rays
+from .rays import Rays
 
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]

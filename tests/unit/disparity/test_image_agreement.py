@@ -8,7 +8,6 @@ import pytest
 from stereotruth.disparity.image_agreement import (
     outvoted,
     outvoted_nearby,
-    supported,
     surface_mean,
     warp_to_left,
 )
@@ -82,21 +81,6 @@ def test_single_failures_are_not_change_but_a_region_is() -> None:
     assert changed.sum() == 400
     disparity[40, 40] = np.nan
     assert not outvoted(correlation, disparity, LEVEL, 0.5)[40, 40]
-
-
-def test_support_counts_neighbours_with_points() -> None:
-    disparity = np.zeros((20, 20))
-    disparity[:, 10:] = 8.0
-    points = np.ones((20, 20), dtype=bool)
-    assert supported(disparity, points).all()  # a straight edge: five of eight
-    disparity[5, 5] = 8.0
-    disparity[12, 10] = 0.0
-    found = supported(disparity, points)
-    assert not found[5, 5] and not found[12, 10]
-    # Sparse points: neighbours without any have no say.
-    lonely = np.full((20, 20), np.nan)
-    lonely[::3, ::3] = 1.0
-    assert supported(lonely, np.isfinite(lonely))[::3, ::3].all()
 
 
 def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:

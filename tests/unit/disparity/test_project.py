@@ -15,7 +15,7 @@ from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.pixel_labels import RIDGE
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status
+from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
@@ -59,7 +59,7 @@ def test_disparity_of_a_plane(plane, method, representative) -> None:
     """Within 1e-3 px at every pixel's centre; all labelled but a frame of half a window."""
     grid = plane.project(method=method, representative=representative)
     disparity, status = grid["disparity"].values, grid["status"].values
-    labelled = status == Status.LABELLED
+    labelled = is_labelled(status)
     assert np.array_equal(labelled, np.isfinite(disparity))
     assert np.abs(disparity - plane.truth)[labelled].max() < 1e-3
     has_points = status != Status.NO_POINTS
@@ -158,10 +158,11 @@ def test_box_hides_a_run_of_the_ground(box, method) -> None:
     hidden = hidden_truth(box)
     assert 800 < hidden.sum() < 20_000
     sure = hidden & ~dilated(~hidden, 2)
-    labelled = status == Status.LABELLED
+    labelled = is_labelled(status)
     assert not labelled[sure].any()
-    with_points = sure & (status != Status.NO_POINTS)
-    assert (status[with_points] == Status.HIDDEN_IN_RIGHT).mean() > 0.99
+    with_points = status[sure & (status != Status.NO_POINTS)]
+    assert np.isin(with_points, (Status.HIDDEN_IN_RIGHT, Status.EDGE_IN_PIXEL)).all()
+    assert (with_points == Status.HIDDEN_IN_RIGHT).mean() > 0.85  # others: behind the wall's strip
     wall = (box.surface[2] > HEIGHT) & (box.surface[2] < ROOF)
     clear = ~dilated(hidden | wall) & (status != Status.NO_POINTS)
     assert (status == Status.HIDDEN_IN_RIGHT)[clear].mean() < 1e-3
@@ -368,8 +369,8 @@ def test_attributes_and_summary(plane) -> None:
         assert grid[name].dims == ("y", "x")
         assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
     status = grid["status"]
-    assert status.attrs["flag_values"] == list(range(9))
-    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Settings().statuses]
+    assert status.attrs["flag_values"] == list(range(9))  # none between points, by this method
+    assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status][:9]
     assert grid.attrs["provenance"]["code"] == "abc"
     assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}
     assert EpipolarModel.from_dict(grid.attrs["epipolar"]).shape == plane.model.shape

@@ -9,7 +9,6 @@ from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
-from stereotruth.errors import InputError
 
 from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
@@ -48,7 +47,7 @@ def test_a_plane_is_labelled_between_its_points(plane, method) -> None:
 
 
 def test_without_fill_nothing_tells_of_it_but_sparse_points_do(plane, caplog) -> None:
-    grid = plane.project(method="geometric")
+    grid = plane.project(method="geometric", fill="none")
     assert "LiDAR points per m², pixels of 0.65 m: a point falls into" in caplog.text
     assert "project.fill: surface" in caplog.text
     assert 0.0 < grid.attrs["points_per_px"] < 0.1  # one in 15 pixels
@@ -123,13 +122,28 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view, fill) -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "fills", "asks"),
     [
-        {"method": "correlation"},
-        {"representative": "paper"},
-        {"method": "geometric", "fill": "surface_and_images"},
+        ({}, True, False),
+        ({"fill": "none"}, False, False),
+        ({"fill": "surface_and_images"}, True, True),
+        ({"fill": "surface_and_images", "method": "geometric"}, True, False),
+        ({"method": "correlation"}, False, False),  # the paper's ways know no surface
+        ({"representative": "paper"}, False, False),
     ],
 )
-def test_fill_needs_geometry(options) -> None:
-    with pytest.raises(InputError, match="fill"):
-        Settings(**({"method": "both", "fill": "surface"} | options))
+def test_labels_between_points_need_the_surface(options, fills, asks) -> None:
+    found = Settings(**options)
+    assert (found.fills, found.asks_images) == (fills, asks)
+    assert (Status.LABELLED_BETWEEN in found.statuses) == fills
+
+
+def test_without_fill_labels_are_those_of_pixels_with_points(box) -> None:
+    filled = box.project("filled.zarr", method="both")
+    bare = box.project("bare.zarr", method="both", fill="none")
+    measured = filled["status"].values == Status.LABELLED
+    assert measured.sum() > 2_000
+    assert np.array_equal(bare["status"].values == Status.LABELLED, measured)
+    for name in ("disparity", "uncertainty", "height", "point_count"):
+        assert np.array_equal(bare[name].values[measured], filled[name].values[measured])
+    assert np.isnan(bare["disparity"].values[~measured]).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.even_squares import REACH, SIDE
-from stereotruth.disparity.hidden_pixels import Rays
+from stereotruth.disparity.rays import Rays
 from stereotruth.disparity.vertices import PART, PART_BITS, VertexBuilder, Vertices
 from stereotruth.lidar.lattice import LATTICE_M
 

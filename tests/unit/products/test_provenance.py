@@ -81,7 +81,7 @@ def test_a_stage_depends_on_no_later_stage_and_on_no_simulation():
 
 def test_the_simulator_shares_no_code_with_the_pipeline():
     modules = set(provenance.source_modules("simulate.render", "simulate.lidar", "simulate.truth"))
-    assert not modules & {*STAGES, "epipolar.rpc", "epipolar.model", "disparity.hidden_pixels"}
+    assert not modules & {*STAGES, "epipolar.rpc", "epipolar.model", "disparity.rays"}
 
 
 def test_records_hold_checksums_and_are_equal_for_equal_work(tmp_path):
