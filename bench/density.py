@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.project import MAX_POINTS, SHARD
@@ -149,6 +150,9 @@ class Block:
         }
         kinds = {name: visible & (found["status"] == kind) for name, kind in kinds.items()}
         edge = visible & np.isin(self.truth.kind, (ROOF_EDGE, TREE_EDGE))
+        steps = np.abs(np.diff(self.truth.disparity, axis=1, prepend=np.nan)) > 1.0
+        steps |= np.abs(np.diff(self.truth.disparity, axis=0, prepend=np.nan)) > 1.0
+        near = visible & known & binary_dilation(steps, np.ones((7, 7)))
         sigma = found["uncertainty"].astype(np.float64)
 
         def share(part: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
@@ -166,6 +170,7 @@ class Block:
             | {
                 "edges": share(known, edge),
                 "edges > 1 px": share(off, edge & known),
+                "within 3 px of a step > 1 px": share(off, near),
             }
         )
         for name, part in kinds.items():

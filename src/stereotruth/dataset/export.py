@@ -72,7 +72,7 @@ def _refuse_empty(
     if sparse:
         sparse = (
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
-            "project.fill: surface labels pixels between them"
+            "project.fill: surface, the default, labels pixels between them"
         )
     raise InputError(
         f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)})",
