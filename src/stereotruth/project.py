@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ _PACKAGE = Path(__file__).parent
 # wheel.
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
 SYNTHETIC_FOLDER = "data/synthetic"
+CONFIG = "config.yaml"  # of a user's own project
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -36,6 +37,39 @@ def with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration over the package's ``config/config.yaml``."""
     defaults = (FILES / "config" / "config.yaml").read_text(encoding="utf-8")
     return merged(yaml.safe_load(defaults), config)
+
+
+def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration, str]:
+    """The configuration of this folder as a run reads it, and the names of the files it is from.
+
+    ``files`` stand in the place of the folder's ``config.yaml``. Raises InputError that names file
+    and key.
+    """
+    own = [Path(CONFIG)] if Path(CONFIG).is_file() else []
+    shared = Path("config") / CONFIG  # read by the Snakefile itself
+    read = [*([shared] if shared.is_file() else []), *(map(Path, files) if files else own)]
+    values: dict[str, Any] = {}
+    for file in read:
+        values = merged(values, _mapping(file))
+    names = ", ".join(map(str, read)) or "the defaults"
+    return Configuration.of(with_defaults(values), names), names
+
+
+def _mapping(file: Path) -> dict[str, Any]:
+    try:
+        found = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError("no such file", file=file, remedy="correct its path") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        problem = " ".join(str(error).split())
+        raise InputError(
+            f"cannot be read as YAML ({problem})", file=file, remedy="correct what it names"
+        ) from None
+    if found is not None and not isinstance(found, dict):
+        raise InputError(
+            "is no mapping of keys to values", file=file, remedy="write it as key: value"
+        )
+    return found or {}
 
 
 def is_synthetic(scene: sheets.Scene) -> bool:

@@ -1,0 +1,256 @@
+"""One scene before its run: images, RPCs, control points, LiDAR headers, and all against another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..alignment.align import align, from_rpcs
+from ..alignment.aligned_pair import Alignment
+from ..alignment.control_points import ControlPoints, read_gcps
+from ..alignment.gcp_checks import open_view
+from ..configuration import Configuration
+from ..disparity.overlap_check import apart, refuse_apart
+from ..epipolar.fit import fit_epipolar
+from ..epipolar.image_reader import Source
+from ..epipolar.model import EpipolarModel
+from ..errors import InputError
+from ..lidar.lattice import DEGREE_M
+from ..lidar.survey import SurveyedFile
+from ..project import lidar_of
+from ..sheets import Scene
+from .check_lidar import check_lidar, expected_labels
+from .findings import Findings, Level
+
+WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
+NODES = 96  # of the grid on which LiDAR boxes and the images' ground are compared, a side
+
+
+@dataclass
+class SceneFacts:
+    """What the run's time and disk follow from."""
+
+    scene: str
+    pixels: int = 0  # of the epipolar grid
+    points: int = 0  # of the LiDAR
+    lidar_files: int = 0
+    covered: float = 1.0  # share of the grid
+
+
+def check_scene(scene: Scene, settings: Configuration, found: Findings) -> SceneFacts:
+    """Add what is found of a scene to ``found``; what one part refuses keeps no other from it."""
+    facts = SceneFacts(scene.scene)
+    files: dict[str, Path] = {}
+    with found.of("files"):
+        files = lidar_of(scene, settings)
+    images = _check_images(scene, found)
+    alignment, gcps = _check_alignment(scene, settings, images, found)
+    model = None
+    if alignment is not None:
+        with found.of("images"):
+            model = _check_pair(alignment, scene, settings, found)
+            facts.pixels = int(np.prod(model.shape))
+    surveyed = check_lidar(list(files.values()), scene, found) if files else []
+    facts.points, facts.lidar_files = sum(file.points for file in surveyed), len(surveyed)
+    if surveyed and gcps is not None:
+        _hold_against_gcps(surveyed, gcps, found)
+    if surveyed and alignment is not None and model is not None:
+        with found.of("LiDAR"):
+            facts.covered = _hold_against_images(surveyed, alignment, model, settings, found)
+    return facts
+
+
+def _check_images(scene: Scene, found: Findings) -> bool:
+    """Whether both images and their RPCs can be used."""
+    good = True
+    for view in ("left", "right"):
+        image = Path(getattr(scene, f"{view}_image"))
+        before = len(found)
+        if not image.is_file():
+            good = False  # the sheet's check names it, but only the first missing file
+            found.say(
+                "files",
+                Level.ERROR,
+                f"{image}: {view}_image does not exist",
+                "correct the path (relative to the working directory, or absolute)",
+            )
+            continue
+        with found.of("images"):
+            open_view(view, image, "")
+        with found.of("images"), Source(image) as source:
+            if image.stat().st_size <= WHOLE_BYTES:
+                source.check_blocks()
+        good &= not any(f.level is Level.ERROR for f in found[before:])
+    return good
+
+
+def _check_alignment(
+    scene: Scene, settings: Configuration, images: bool, found: Findings
+) -> tuple[Alignment | None, ControlPoints | None]:
+    """The alignment as rule align makes it, and the control points, if they can be read."""
+    alignment = gcps = None
+    if scene.gcps and Path(scene.gcps).is_file():
+        with found.of("GCPs"):
+            gcps = read_gcps(scene.gcps, scene.scene)
+    pair = scene.left_image, scene.right_image
+    model, name = settings.alignment.model, scene.scene
+    with found.of("GCPs"):
+        if images and gcps is not None:
+            alignment = align(
+                *pair, scene.gcps, model=model, scene=name, strict=settings.strict, provenance={}
+            )
+            used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]
+            sigma = max(fit.rms("after") for fit in alignment.fits)
+            text = f"{used[0]} and {used[1]} of {len(gcps.ids)} used, {sigma:.2f} px rms at most"
+            found.say("GCPs", Level.FACT, text)
+        elif images and not scene.gcps:
+            alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
+    if alignment is None and images:  # to hold the LiDAR against the images all the same
+        with Findings().of("images"):
+            alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
+    return alignment, gcps
+
+
+def _check_pair(
+    alignment: Alignment, scene: Scene, settings: Configuration, found: Findings
+) -> EpipolarModel:
+    """The epipolar model as rule rectify fits it. Raises InputError if a tile goes nowhere in."""
+    model = fit_epipolar(
+        alignment.left,
+        alignment.right,
+        alignment.left_fit.size,
+        alignment.right_fit.size,
+        alignment.reference_height,
+        names=(scene.left_image, scene.right_image),
+    )
+    rows, cols = model.shape
+    report = model.report
+    pixel = np.sqrt(_pixel_m2(model))
+    found.say(
+        "images",
+        Level.FACT,
+        f"{cols} x {rows} px of {pixel:.2f} m in common, convergence "
+        f"{report['convergence_angle_deg']:.1f} degrees, {report['view_order']}",
+    )
+    if report["view_order"] == "left looks forward":
+        found.say(
+            "images",
+            Level.DOUBT,
+            "the left image is the forward view; in the paper's data it is the backward one",
+            "exchange left_image and right_image if disparities should be as the paper's",
+        )
+    size = settings.tiles.size
+    if min(rows, cols) < size:
+        raise InputError(
+            f"not one tile of {size} px goes into the {cols} x {rows} px that both images see",
+            remedy=f"set tiles.size to {max(min(rows, cols) // 64 * 64, 16)} or less",
+        )
+    return model
+
+
+def _ground(model: EpipolarModel, height: float) -> tuple[NDArray[np.float64], ...]:
+    """lon, lat [NODES, NODES] of the grid's pixels at a height."""
+    rows, cols = model.shape
+    x, y = np.meshgrid(np.linspace(0, cols - 1, NODES), np.linspace(0, rows - 1, NODES))
+    lon, lat = model.epipolar_to_ground(x.ravel(), y.ravel(), height)
+    return np.asarray(lon).reshape(x.shape), np.asarray(lat).reshape(x.shape)
+
+
+def _pixel_m2(model: EpipolarModel) -> float:
+    """Ground that a pixel in the middle of the grid shows, m²."""
+    rows, cols = model.shape
+    x, y = cols / 2 + np.array([0.0, 1.0, 0.0]), rows / 2 + np.array([0.0, 0.0, 1.0])
+    lon, lat = map(np.asarray, model.epipolar_to_ground(x, y, model.reference_height))
+    sides = np.stack([(lon[1:] - lon[0]) * np.cos(np.radians(lat[0])), lat[1:] - lat[0]])
+    return float(abs(np.linalg.det(sides * DEGREE_M)))
+
+
+def _hold_against_gcps(
+    surveyed: Sequence[SurveyedFile], gcps: ControlPoints, found: Findings
+) -> None:
+    """Doubt heights: control points below or above every point of the files that they lie in."""
+    off, here = [], 0
+    for lon, lat, height in zip(gcps.lon, gcps.lat, gcps.height):
+        around = [
+            file.heights
+            for file in surveyed
+            if file.box and file.heights and not apart(file.box, (lon, lat, lon, lat))
+        ]
+        if not around:
+            continue
+        here += 1
+        low, high = min(h[0] for h in around), max(h[1] for h in around)
+        if height < low:
+            off.append(height - low)
+        elif height > high:
+            off.append(height - high)
+    if here and 2 * len(off) > here:
+        shift = float(np.median(off))
+        found.say(
+            "heights",
+            Level.DOUBT,
+            f"{len(off)} of {here} GCPs lie {'below' if shift < 0 else 'above'} every LiDAR point "
+            f"of their files, by {abs(shift):.1f} m in the middle",
+            "check the LiDAR's vertical datum and unit (geoid, feet), and that the GCPs' heights "
+            "are ellipsoidal metres",
+        )
+
+
+def _hold_against_images(
+    surveyed: Sequence[SurveyedFile],
+    alignment: Alignment,
+    model: EpipolarModel,
+    settings: Configuration,
+    found: Findings,
+) -> float:
+    """Share of the images that the LiDAR's boxes cover. Raises InputError if there is none."""
+    placed = [file for file in surveyed if file.box and file.heights]
+    if not placed:
+        return 1.0
+    boxes = np.array([file.box for file in placed])
+    heights = (min(f.heights[0] for f in placed), max(f.heights[1] for f in placed))
+    ends = [_ground(model, height) for height in heights]
+    lon, lat = (np.concatenate([end[k].ravel() for end in ends]) for k in (0, 1))
+    images = tuple(map(float, (np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat))))
+    whole = tuple(map(float, (*boxes[:, :2].min(0), *boxes[:, 2:].max(0))))
+    if apart(whole, images):
+        refuse_apart(whole, images, heights, placed[0].path.parent)
+    outside = [file.path.name for file in placed if apart(file.box, images)]
+    if outside and len(outside) < len(placed):
+        found.say(
+            "LiDAR",
+            Level.DOUBT,
+            f"{len(outside)} of {len(placed)} files lie outside the images ({outside[0]} …): they "
+            "are read in vain",
+            "leave them out, or check their coordinate system",
+        )
+    for sensor in (alignment.left, alignment.right):
+        low, high = sensor.rpc.ground_box[4:]
+        margin = (high - low) / 4
+        middle = np.median([np.mean(file.heights) for file in placed])
+        if not low - margin <= middle <= high + margin:
+            found.say(
+                "heights",
+                Level.DOUBT,
+                f"the LiDAR, about {middle:.0f} m, is outside the {low:.0f} to {high:.0f} m of the "
+                "RPC",
+                "check that its heights are ellipsoidal metres",
+            )
+            break
+    lon, lat = _ground(model, float(np.mean(heights)))
+    density = np.zeros(lon.shape)  # points a m², of the boxes that a node lies in
+    for file in placed:
+        west, south, east, north = file.box
+        inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
+        density[inside] += file.points / max(file.area_m2, 1.0)
+    covered = density > 0
+    share = float(covered.mean())
+    if not share:
+        refuse_apart(whole, images, heights, placed[0].path.parent)
+    per_m2 = float(density[covered].mean())
+    expected_labels(per_m2, _pixel_m2(model), share, settings, found)
+    return share
