@@ -77,9 +77,7 @@ def add_scene(
 
 
 def in_order(pair: tuple[Image, Image]) -> tuple[tuple[Image, Image], list[str]]:
-    """Backward view first, by names that say it or else by the RPCs; and how it is known."""
-    if pair[0].view and pair[1].view:
-        return pair, [f"left (backward): {pair[0].path}", f"right (forward): {pair[1].path}"]
+    """Left first: as it is said, or else the backward view by the RPCs; and how it is known."""
     one, other = pair
     model = fit_epipolar(
         one.sensor,
@@ -89,16 +87,14 @@ def in_order(pair: tuple[Image, Image]) -> tuple[tuple[Image, Image], list[str]]
         float(one.sensor.rpc.height_off + other.sensor.rpc.height_off) / 2,
         names=(str(one.path), str(other.path)),
     )
-    order = model.report["view_order"]
-    if order == "left looks forward":
+    order, angle = model.report["view_order"], model.report["convergence_angle_deg"]
+    forward = order == "left looks forward"
+    if forward and not (one.view and other.view):
         one, other = other, one
-    how = {
-        "across track": "the pair looks across the track, so that either may be left",
-        "left looks backward": "by the RPCs, the first looks backward",
-        "left looks forward": "by the RPCs, the second looks backward",
-    }[order]
-    angle = model.report["convergence_angle_deg"]
-    words = f"{how}; convergence {angle:.1f} degrees"
+        order = "left looks backward"
+    words = f"convergence {angle:.1f} degrees; by the RPCs, {order}"
+    if order == "left looks forward":
+        words += " (the backward view is left in the paper's data)"
     return (one, other), [f"left: {one.path}", f"right: {other.path}", words]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rasterio.errors import RasterioError
@@ -30,7 +30,7 @@ OTHERS = re.compile(
 
 @dataclass(frozen=True)
 class Image:
-    """An image with a usable RPC; ``view`` is what its name says: left, right, or nothing."""
+    """An image with a usable RPC; ``view`` is what is said of it: left, right, or nothing."""
 
     path: Path
     view: str
@@ -45,7 +45,7 @@ def _view(file: Path) -> str:
 def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
     """The two images of a delivery's folder, or those that are named; and remarks.
 
-    Left first where the names say it. Raises InputError if there are not two, or one of them has
+    Left first where the names of the files say it, or who names them one by one. Raises InputError if there are not two, or one of them has
     no RPC that can be read, naming what there is.
     """
     given = [Path(path) for path in given]
@@ -65,8 +65,8 @@ def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
     images = [_open(file) for file in files]
     if {image.view for image in images} == {"left", "right"}:
         images.sort(key=lambda image: image.view)
-    elif len(given) == 2 and files == given and images[0].view == images[1].view:
-        images = [Image(i.path, "", i.sensor, i.size) for i in images]
+    elif files == given:  # named one by one: left, right
+        images = [replace(image, view=view) for image, view in zip(images, ("left", "right"))]
     for image in images:
         source = rpc_file(image.path)
         told = "its own metadata" if source == image.path else source.name
