@@ -56,7 +56,9 @@ def add_scene(
     }
     scene = sheets.check(cells, sheets.Scene, f"scene {name}")
     if name in scenes:
-        raise InputError(f"scene {name!r} is there already", file=rows, remedy="take another --name")
+        raise InputError(
+            f"scene {name!r} is there already", file=rows, remedy="take another --name"
+        )
     sheets.require_files(scene, rows, ["left_image", "right_image", "gcps", "geoid"])
     found = Findings(name)
     files = sheets.find_lidar(scene, rows)

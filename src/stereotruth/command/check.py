@@ -25,10 +25,9 @@ def chosen(
     names, cities = list(names), set(cities)
     unknown = [name for name in names if name not in scenes and name not in cities]
     if unknown:
+        known = ", ".join([*scenes, *sorted(cities)]) or "none, as the sheets are empty"
         raise InputError(
-            f"no scene or city {unknown[0]!r}",
-            file=rows,
-            remedy=f"take of {', '.join([*scenes, *sorted(cities)]) or 'none: the sheets are empty'}",
+            f"no scene or city {unknown[0]!r}", file=rows, remedy=f"take of these: {known}"
         )
     return {
         name: scene
@@ -51,14 +50,15 @@ def check_project(
     if settings is None:
         return [project]
     with project.of("sheets"):
-        cities, scenes = read_scenes(settings)
+        cities, every_scene = read_scenes(settings)
         rows = sheet(settings, "scenes")
-        scenes = chosen(names, scenes, cities, rows)
-        check_fixed(settings, scenes if not names else read_scenes(settings)[1])
-        if not scenes:
+        check_fixed(settings, every_scene)
+        found = chosen(names, every_scene, cities, rows)
+        if not found:
             raise InputError(
                 "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
             )
+        scenes = found
         project.say("sheets", Level.FACT, _counted(scenes))
     if scenes is None:
         return [project]

@@ -1,4 +1,4 @@
-"""The LiDAR of a scene by its headers, and the labels that its density lets one expect."""
+"""The LiDAR of a scene by its headers."""
 
 from __future__ import annotations
 
@@ -7,22 +7,10 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
-
-from ..configuration import Configuration
 from ..errors import InputError
 from ..lidar.survey import SurveyedFile, survey
 from ..sheets import Scene
 from .findings import Findings, Level
-
-# Measured with bench/density.py: share of visible pixels with a label by points a pixel.
-POINTS_PER_PX = (0.0, 0.105, 0.21, 0.42, 0.85, 1.7, 2.6)
-LABELLED = {
-    "none": (0.0, 0.099, 0.188, 0.347, 0.598, 0.871, 0.95),
-    "surface": (0.0, 0.799, 0.852, 0.895, 0.927, 0.947, 0.956),
-    "surface_and_images": (0.0, 0.860, 0.884, 0.909, 0.932, 0.949, 0.957),
-}
-BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
 
 def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[SurveyedFile]:
@@ -75,41 +63,3 @@ def _by_text(errors: Sequence[InputError]) -> dict[str, tuple[InputError, int]]:
         problem: (next(e for e in errors if e.problem == problem), count)
         for problem, count in counts.items()
     }
-
-
-def expected_labels(
-    per_m2: float, pixel_m2: float, covered: float, settings: Configuration, found: Findings
-) -> None:
-    """Say what share of the pixels will carry a label, and doubt it where tiles need more."""
-    per_px = per_m2 * pixel_m2
-
-    def share(points: float, fill: str) -> float:
-        return float(np.interp(points, POINTS_PER_PX, LABELLED[fill]))
-
-    fill, needed = settings.project.fill, settings.tiles.min_labelled
-    expected = share(per_px, fill)
-    found.say(
-        "labels",
-        Level.FACT,
-        f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel; LiDAR on {covered:.0%} of "
-        f"the images: some {expected:.0%} of the pixels that both views see of it labelled "
-        f"(fill: {fill})",
-    )
-    if expected >= needed:
-        return
-    better = [
-        name
-        for name in LABELLED
-        if LABELLED[name] > LABELLED[fill] and share(per_px, name) >= needed
-    ]
-    remedy = f"set tiles.min_labelled below {expected:.2g}"
-    if better:
-        remedy = f"set project.fill to {better[0]} ({share(per_px, better[0]):.0%}), or {remedy}"
-    dense = share(BOX_SLACK * per_px, fill)
-    found.say(
-        "labels",
-        Level.DOUBT if dense >= needed else Level.ERROR,
-        f"some {expected:.0%} of the pixels will have a label, tiles.min_labelled asks for "
-        f"{needed:.0%} of a tile",
-        remedy,
-    )

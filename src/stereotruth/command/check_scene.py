@@ -1,4 +1,4 @@
-"""One scene before its run: images, RPCs, control points, LiDAR headers, and all against another."""
+"""One scene before its run: images, RPCs, control points and LiDAR headers, each and together."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..alignment.align import align, from_rpcs
 from ..alignment.aligned_pair import Alignment
@@ -18,16 +17,14 @@ from ..disparity.overlap_check import apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import Source
 from ..epipolar.model import EpipolarModel
-from ..errors import InputError
-from ..lidar.lattice import DEGREE_M
 from ..lidar.survey import SurveyedFile
 from ..project import lidar_of
 from ..sheets import Scene
-from .check_lidar import check_lidar, expected_labels
+from .check_lidar import check_lidar
+from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
 from .findings import Findings, Level
 
 WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
-NODES = 96  # of the grid on which LiDAR boxes and the images' ground are compared, a side
 
 
 @dataclass
@@ -52,8 +49,9 @@ def check_scene(scene: Scene, settings: Configuration, found: Findings) -> Scene
     model = None
     if alignment is not None:
         with found.of("images"):
-            model = _check_pair(alignment, scene, settings, found)
+            model = _check_pair(alignment, scene, found)
             facts.pixels = int(np.prod(model.shape))
+            check_frame(Nodes.of(model), settings, found)
     surveyed = check_lidar(list(files.values()), scene, found) if files else []
     facts.points, facts.lidar_files = sum(file.points for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
@@ -115,10 +113,8 @@ def _check_alignment(
     return alignment, gcps
 
 
-def _check_pair(
-    alignment: Alignment, scene: Scene, settings: Configuration, found: Findings
-) -> EpipolarModel:
-    """The epipolar model as rule rectify fits it. Raises InputError if a tile goes nowhere in."""
+def _check_pair(alignment: Alignment, scene: Scene, found: Findings) -> EpipolarModel:
+    """The epipolar model as rule rectify fits it. Raises InputError as it does."""
     model = fit_epipolar(
         alignment.left,
         alignment.right,
@@ -129,7 +125,7 @@ def _check_pair(
     )
     rows, cols = model.shape
     report = model.report
-    pixel = np.sqrt(_pixel_m2(model))
+    pixel = np.sqrt(pixel_m2(model))
     found.say(
         "images",
         Level.FACT,
@@ -143,30 +139,7 @@ def _check_pair(
             "the left image is the forward view; in the paper's data it is the backward one",
             "exchange left_image and right_image if disparities should be as the paper's",
         )
-    size = settings.tiles.size
-    if min(rows, cols) < size:
-        raise InputError(
-            f"not one tile of {size} px goes into the {cols} x {rows} px that both images see",
-            remedy=f"set tiles.size to {max(min(rows, cols) // 64 * 64, 16)} or less",
-        )
     return model
-
-
-def _ground(model: EpipolarModel, height: float) -> tuple[NDArray[np.float64], ...]:
-    """lon, lat [NODES, NODES] of the grid's pixels at a height."""
-    rows, cols = model.shape
-    x, y = np.meshgrid(np.linspace(0, cols - 1, NODES), np.linspace(0, rows - 1, NODES))
-    lon, lat = model.epipolar_to_ground(x.ravel(), y.ravel(), height)
-    return np.asarray(lon).reshape(x.shape), np.asarray(lat).reshape(x.shape)
-
-
-def _pixel_m2(model: EpipolarModel) -> float:
-    """Ground that a pixel in the middle of the grid shows, m²."""
-    rows, cols = model.shape
-    x, y = cols / 2 + np.array([0.0, 1.0, 0.0]), rows / 2 + np.array([0.0, 0.0, 1.0])
-    lon, lat = map(np.asarray, model.epipolar_to_ground(x, y, model.reference_height))
-    sides = np.stack([(lon[1:] - lon[0]) * np.cos(np.radians(lat[0])), lat[1:] - lat[0]])
-    return float(abs(np.linalg.det(sides * DEGREE_M)))
 
 
 def _hold_against_gcps(
@@ -213,7 +186,8 @@ def _hold_against_images(
         return 1.0
     boxes = np.array([file.box for file in placed])
     heights = (min(f.heights[0] for f in placed), max(f.heights[1] for f in placed))
-    ends = [_ground(model, height) for height in heights]
+    nodes = Nodes.of(model)
+    ends = [nodes.ground(height) for height in heights]
     lon, lat = (np.concatenate([end[k].ravel() for end in ends]) for k in (0, 1))
     images = tuple(map(float, (np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat))))
     whole = tuple(map(float, (*boxes[:, :2].min(0), *boxes[:, 2:].max(0))))
@@ -241,16 +215,7 @@ def _hold_against_images(
                 "check that its heights are ellipsoidal metres",
             )
             break
-    lon, lat = _ground(model, float(np.mean(heights)))
-    density = np.zeros(lon.shape)  # points a m², of the boxes that a node lies in
-    for file in placed:
-        west, south, east, north = file.box
-        inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
-        density[inside] += file.points / max(file.area_m2, 1.0)
-    covered = density > 0
-    share = float(covered.mean())
+    share = check_labels(nodes, placed, settings, found)
     if not share:
         refuse_apart(whole, images, heights, placed[0].path.parent)
-    per_m2 = float(density[covered].mean())
-    expected_labels(per_m2, _pixel_m2(model), share, settings, found)
     return share

@@ -45,8 +45,8 @@ def _view(file: Path) -> str:
 def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
     """The two images of a delivery's folder, or those that are named; and remarks.
 
-    Left first where the names of the files say it, or who names them one by one. Raises InputError if there are not two, or one of them has
-    no RPC that can be read, naming what there is.
+    Left first where the names of the files say it, or who names them one by one. Raises
+    InputError, naming what there is, if there are not two, or one has no RPC that can be read.
     """
     given = [Path(path) for path in given]
     for path in given:

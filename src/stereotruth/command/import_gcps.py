@@ -32,7 +32,10 @@ NAMES = {  # column: what others call it
     **{
         f"{view}_{axis}": tuple(f"{v}_{a}" for v in (view, view[0]) for a in names)
         for view in ("left", "right")
-        for axis, names in (("col", ("col", "column", "x", "sample")), ("row", ("row", "y", "line")))
+        for axis, names in (
+            ("col", ("col", "column", "x", "sample")),
+            ("row", ("row", "y", "line")),
+        )
     },
 }
 
@@ -135,9 +138,7 @@ def _number(text: str, what: str, line: int, file: Path) -> float:
         ) from None
 
 
-def to_degrees(
-    x: np.ndarray, y: np.ndarray, crs: str, file: Path
-) -> tuple[np.ndarray, np.ndarray]:
+def to_degrees(x: np.ndarray, y: np.ndarray, crs: str, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """lon, lat of coordinates of a system (EPSG code or WKT; empty: they are degrees)."""
     if not crs:
         if (np.abs(x) > 360).any() or (np.abs(y) > 90).any():

@@ -58,9 +58,7 @@ def _callback(
     del version
 
 
-@app.command(
-    epilog=examples("stereotruth init my-project", "stereotruth init --example demo")
-)
+@app.command(epilog=examples("stereotruth init my-project", "stereotruth init --example demo"))
 def init(
     folder: Annotated[Path, typer.Argument(help="Folder to be made, or an empty one.")],
     example: Annotated[
@@ -127,7 +125,7 @@ def gcps_import(
     to: Annotated[Path, typer.Option(help="The CSV to be written.")],
     heights: Annotated[
         Path | None,
-        typer.Option(help="For .points: CSV with id or lon,lat and height, or a raster of heights."),
+        typer.Option(help="For .points: CSV (id or lon,lat; height) or a raster of heights."),
     ] = None,
     crs: Annotated[str, typer.Option(help="Of the ground coordinates, if the file has none.")] = "",
     geoid: Annotated[
@@ -194,7 +192,7 @@ def run(
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
 def status(
-    cities: Annotated[list[str] | None, typer.Argument(help="Cities; all if none is named.")] = None,
+    cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
     configfile: Configured = None,
 ) -> None:
     """What is made of each city, and what is out of date and why."""

@@ -31,9 +31,7 @@ SPARE = 1.2
 MEMORY = 4.0e9  # of the largest job
 
 
-def check_resources(
-    facts: Sequence[SceneFacts], settings: Configuration, found: Findings
-) -> None:
+def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found: Findings) -> None:
     """Say what a run from nothing takes, and refuse a disk that is too small for it."""
     if not facts:
         return

@@ -143,7 +143,7 @@ def _made(city: str) -> str:
 
 
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
-    """The status of cities, all of the sheet if none is named. Raises InputError for unknown ones."""
+    """The status of cities, all of the sheet if none is named. Raises InputError for others."""
     settings, _ = configured(configfiles)
     known, scenes = read_scenes(settings)
     with_scenes = [city for city in known if any(s.city == city for s in scenes.values())]
