@@ -215,7 +215,7 @@ FAULTS = [
     Fault("RPC cut short", "malformed RPC", lambda f: (_rpb("left")(f), _cut("left.rpb")(f))),
     Fault("RPC of other ground", "the other image and the GCPs are elsewhere",
           _rpb("right", long_off=LON + 6)),
-    Fault("RPC of another size", "px", _rpb("right", samp_scale=9e6, line_scale=9e6)),
+    Fault("RPC of another size", "pixels would be", _rpb("right", samp_scale=9e6, line_scale=9e6)),
     Fault("one view twice", "one direction",
           lambda f: (write_image(f / "right.tif", RPCS["left"], SIZES["left"]),
                      write_sheet(f, gcps=""))),

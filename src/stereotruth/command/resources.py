@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 # Seconds of one core (bench/README.md: throughput.py, scale.py, density.py).
 INGEST_POINT = 0.49e-6
 PROJECT_POINT = 0.47e-6
-RECTIFY_PX = 2 * 0.15e-6  # both images
-PROJECT_PX = {"none": 0.2e-6, "surface": 8e-6, "surface_and_images": 12e-6}  # of covered ones
-EXPORT_PX = 0.4e-6
+RECTIFY_PX = 0.3e-6  # both images
+PROJECT_PX = {"none": 0.4e-6, "surface": 8e-6, "surface_and_images": 12e-6}  # of covered ones
+EXPORT_PX = 0.9e-6
 TILE = 4.0  # a labelled tile of 1024 px: SIFT matches, warping
 SCENE = 60.0  # refinement
-JOB = 3.0  # start of a job
+JOB = 8.0  # start of a job, and what Snakemake does around it
 # Bytes on the disk.
 POINT_BYTES = 7.0
 PX_BYTES = 4.0 + 12.0 + 8.0  # rectified pair, disparity grid, tiles

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import time
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -17,13 +15,7 @@ from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 
-from ...synthetic.broken_scenes import DOUBTS, FAULTS, Fault, good_project, write_settings
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory) -> Path:
-    return good_project(tmp_path_factory.mktemp("check") / "good")
-
+from ...synthetic.broken_scenes import DOUBTS, FAULTS, Fault, write_settings
 
 MODELS: dict[str, EpipolarModel] = {}
 
@@ -37,12 +29,9 @@ def fit_once(left, right, *arguments, **options) -> EpipolarModel:
     return MODELS[key]
 
 
-@pytest.fixture
-def folder(good, tmp_path, monkeypatch) -> Path:
+@pytest.fixture(autouse=True)
+def one_fit(monkeypatch) -> None:
     monkeypatch.setattr(check_scene, "fit_epipolar", fit_once)
-    shutil.copytree(good, tmp_path / "project")
-    monkeypatch.chdir(tmp_path / "project")
-    return tmp_path / "project"
 
 
 def texts(level: Level) -> list[str]:
