@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -220,6 +221,8 @@ def open_pages(
 
 def main() -> None:
     """Entry point: an error of the input is one line, and exit status 1."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # ? for what LC_ALL=C cannot show
+        sys.stdout.reconfigure(errors="replace")
     try:
         app()
     except InputError as error:

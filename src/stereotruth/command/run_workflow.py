@@ -33,6 +33,7 @@ SECONDS = {
     "train": 3600,
 }
 USUAL_SECONDS = 5.0
+TRUSTED = 20.0  # seconds of jobs by which the table above counts beside the jobs that are done
 STATS = re.compile(r"^(\w+) +(\d+)$")
 FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+)\)")
 STEPS = re.compile(r"^(\d+) of (\d+) steps")
@@ -78,22 +79,19 @@ class Progress:
     def _weight(jobs: dict[str, int]) -> float:
         return sum(SECONDS.get(rule, USUAL_SECONDS) * count for rule, count in jobs.items())
 
-    def seconds_left(self, now: float | None = None) -> float | None:
-        """By the jobs that are done; None before the first."""
+    def seconds_left(self, now: float | None = None) -> float:
+        """By the jobs that are done, and while these are few by the table of usual seconds."""
         done, planned = self._weight(self.done), self._weight(self.planned)
-        if not done:
-            return None
         elapsed = (time.monotonic() if now is None else now) - self.begun
-        return max(planned - done, 0.0) * elapsed / done
+        return max(planned - done, 0.0) * (elapsed + TRUSTED) / (done + TRUSTED)
 
     def line(self, now: float | None = None) -> str:
         """The status line."""
         done, total = self.steps
         if not total:
             return "planning"
-        left = self.seconds_left(now)
-        when = "" if left is None else f", about {duration(left)} left"
-        return f"{done} of {total} jobs done{when}"
+        left = f", about {duration(self.seconds_left(now))} left" if done < total else ""
+        return f"{done} of {total} jobs done{left}"
 
 
 def duration(seconds: float) -> str:
@@ -113,7 +111,7 @@ def watch(lines: Iterable[str]) -> None:
 
     console = Console(stderr=True, highlight=False)
     progress = Progress()
-    spinner = Spinner("dots", progress.line())
+    spinner = Spinner("line", progress.line())
     with Live(spinner, console=console, refresh_per_second=4, transient=True):
         for line in lines:
             line = line.rstrip("\n")

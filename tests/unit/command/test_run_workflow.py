@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.command.run_workflow import Progress, arguments_for, duration
+from stereotruth.command.run_workflow import TRUSTED, Progress, arguments_for, duration
 from stereotruth.project import FILES
 
 SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
@@ -54,15 +54,19 @@ Finished jobid: 2 (Rule: project)
 def test_time_left_follows_from_the_jobs_that_are_done():
     progress = Progress(begun=100.0)
     assert progress.line(100.0) == "planning"
+    planned = 3 + 3 * 15  # SECONDS of align and project
     lines = RUN.splitlines()
     for line in lines[:7]:
         progress.read(line)
-    assert progress.line(105.0) == "0 of 4 jobs done"
+    assert progress.line(100.0) == f"0 of 4 jobs done, about {planned} s left"
     for line in lines[7:]:
         progress.read(line)
-    done, planned = 3 + 15, 3 + 3 * 15  # SECONDS of align and project
-    assert progress.seconds_left(136.0) == pytest.approx((planned - done) * 36 / done)
-    assert progress.line(136.0) == "2 of 4 jobs done, about 60 s left"
+    done = 3 + 15
+    left = (planned - done) * (36 + TRUSTED) / (done + TRUSTED)
+    assert progress.seconds_left(136.0) == pytest.approx(left)
+    assert progress.line(136.0) == f"2 of 4 jobs done, about {left:.0f} s left"
+    progress.read("4 of 4 steps (100%) done")
+    assert progress.line() == "4 of 4 jobs done"
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(5, "5 s"), (600, "10 min"), (7200, "2.0 h")])
