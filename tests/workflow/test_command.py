@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -53,17 +55,7 @@ def test_the_example_is_checked_and_made(demo):
     assert "no page" in call("open", folder=demo).text
 
 
-MODULE = """
-configfile: "config.yaml"
-
-module stereotruth:
-    snakefile:
-        "{snakefile}"
-    config:
-        config
-
-use rule * from stereotruth
-
+OWN_RULE = """
 rule mine:
     default_target: True
     input:
@@ -71,13 +63,20 @@ rule mine:
     output:
         "mine.txt",
     shell:
-        "ls {{input}}/disp > {{output}}"
+        "ls {input}/disp > {output}"
 """
+
+
+def module() -> str:
+    """The Snakefile that config/README.md shows, and a rule after it."""
+    guide = (ROOT / "config/README.md").read_text(encoding="utf-8")
+    block = re.search(r"## In other workflows\n\n((?: {4}.*\n|\n)+)", guide)[1]
+    return textwrap.dedent(block) + OWN_RULE
 
 
 def test_a_module_of_another_workflow_makes_the_same(demo):
     """What the command has made stays; the other workflow's own rule goes on from it."""
-    (demo / "Snakefile").write_text(MODULE.format(snakefile=ROOT / "Snakefile"))
+    (demo / "Snakefile").write_text(module())
     project = Project(demo)
     assert project.plan() == {"mine": 1}
     run = project.snakemake()
@@ -87,7 +86,7 @@ def test_a_module_of_another_workflow_makes_the_same(demo):
 
 
 def test_a_module_without_settings_has_the_defaults(tmp_path):
-    text = MODULE.format(snakefile=ROOT / "Snakefile").replace("Demo", "Qichun")
+    text = module().replace("Demo", "Qichun")
     (tmp_path / "Snakefile").write_text(text)
     (tmp_path / "config.yaml").write_text("tiles: {size: 512}\n")
     jobs = Project(tmp_path).plan()

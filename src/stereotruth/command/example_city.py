@@ -30,7 +30,7 @@ DEMO = CitySpec(
         zone_m=150.0,
     ),
     scenes=(
-        SceneSpec("Demo-1", (0.0, 0.0), 640, 640, 5, lidar_grid=(2, 1), ragged_m=(20.0, 20.0)),
+        SceneSpec("Demo-1", (0.0, 0.0), 640, 640, 5, lidar_grid=(1, 1), ragged_m=(20.0, 20.0)),
     ),
 )
 SPACING_M = 0.4

@@ -7,31 +7,12 @@ import time
 import pytest
 from rich.console import Console
 
-from stereotruth.command import check_scene
 from stereotruth.command.check import check_project
 from stereotruth.command.check_table import show
 from stereotruth.command.findings import Level
-from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 
 from ...synthetic.broken_scenes import DOUBTS, FAULTS, Fault, write_settings
-
-MODELS: dict[str, EpipolarModel] = {}
-
-
-def fit_once(left, right, *arguments, **options) -> EpipolarModel:
-    """The fit of the stage, once for all projects of the same sensors: most of a check's time."""
-    sensors = [[sensor.rpc.to_dict(), sensor.affine.tolist()] for sensor in (left, right)]
-    key = repr([sensors, arguments])
-    if key not in MODELS:
-        MODELS[key] = fit_epipolar(left, right, *arguments, **options)
-    return MODELS[key]
-
-
-@pytest.fixture(autouse=True)
-def one_fit(monkeypatch) -> None:
-    monkeypatch.setattr(check_scene, "fit_epipolar", fit_once)
 
 
 def texts(level: Level) -> list[str]:
