@@ -183,7 +183,7 @@ def test_the_wheel_brings_the_workflow_to_an_empty_environment(tmp_path):
         assert done.returncode == 0, done.stdout
         return done.stdout
 
-    quiet = ("--quiet", "--no-deps", "--disable-pip-version-check")
+    quiet = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
     pip = (sys.executable, "-m", "pip")
     do(*pip, "wheel", *quiet, "--no-build-isolation", "-w", tmp_path / "wheel", source)
     (wheel,) = (tmp_path / "wheel").glob("*.whl")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..errors import InputError
@@ -22,8 +21,7 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
         except InputError as error:
             return error
 
-    with found.of("LiDAR"), ThreadPoolExecutor(4) as pool:
-        looked = list(pool.map(look, files))
+    looked = [look(file) for file in files]
     surveyed = [item for item in looked if isinstance(item, SurveyedFile)]
     errors = [item for item in looked if isinstance(item, InputError)]
     for problem, (error, count) in _by_text(errors).items():
