@@ -27,6 +27,9 @@ class WithWorkflow(build_py):
         for folder in FOLDERS:
             ignored = shutil.ignore_patterns("__pycache__", "requirements.lock", "check_lock.py")
             shutil.copytree(folder, shipped / folder, ignore=ignored)
+        environment = shipped / "envs" / "workflow.yaml"  # names the clone around it
+        named = f"- stereotruth=={self.distribution.get_version()}"
+        environment.write_text(environment.read_text("utf-8").replace("- ..", named), "utf-8")
 
 
 setup(cmdclass={"build_py": WithWorkflow})

@@ -8,11 +8,15 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
+import numpy as np
+
 from .. import sheets
 from ..epipolar.fit import fit_epipolar
+from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..project import configured, sheet
 from .check_lidar import check_lidar
+from .check_tiles import Nodes, check_frame
 from .deliveries import Image, find_pair
 from .findings import Findings, Level
 
@@ -40,10 +44,12 @@ def add_scene(
     cities = sheets.read_cities(towns)
     scenes = sheets.read_scenes(rows, cities)
     pair, lines = find_pair(delivery)
-    pair, words = in_order(pair)
-    lines += words
     city = city or _word(_folder_name(delivery))
     name = name or _unused(city, scenes)
+    if name in scenes:
+        raise InputError(
+            f"scene {name!r} is there already", file=rows, remedy="take another --name"
+        )
     cells = {
         "scene": name,
         "city": city,
@@ -55,18 +61,20 @@ def add_scene(
         "gcps": gcps,
     }
     scene = sheets.check(cells, sheets.Scene, f"scene {name}")
-    if name in scenes:
-        raise InputError(
-            f"scene {name!r} is there already", file=rows, remedy="take another --name"
-        )
     sheets.require_files(scene, rows, ["left_image", "right_image", "gcps", "geoid"])
     found = Findings(name)
-    files = sheets.find_lidar(scene, rows)
-    check_lidar(files, scene, found)
+    surveyed = check_lidar(sheets.find_lidar(scene, rows), scene, found)
     for finding in found:
         if finding.level is Level.ERROR:
             raise InputError(finding.text, remedy=_as_options(finding.remedy))
-        lines.append(f"{finding.about}: {finding.text}")
+    heights = [height for file in surveyed for height in file.heights or ()]
+    pair, model, words = in_order(pair, float(np.mean(heights)) if heights else None)
+    cells |= {"left_image": str(pair[0].path), "right_image": str(pair[1].path)}
+    check_frame(Nodes.of(model), settings, found)
+    lines += words
+    for finding in found:
+        remedy = f". Remedy: {finding.remedy}" if finding.remedy else ""
+        lines.append(f"{finding.about}: {finding.text}{remedy}")
     if city not in cities:
         made = sheets.check(
             {"city": city, "prefix": _prefix(city, cities), **SPLITS}, sheets.City, f"city {city}"
@@ -78,15 +86,23 @@ def add_scene(
     return lines
 
 
-def in_order(pair: tuple[Image, Image]) -> tuple[tuple[Image, Image], list[str]]:
-    """Left first: as it is said, or else the backward view by the RPCs; and how it is known."""
+def in_order(
+    pair: tuple[Image, Image], height: float | None
+) -> tuple[tuple[Image, Image], EpipolarModel, list[str]]:
+    """Left first: as it is said, or else the backward view by the RPCs; and how it is known.
+
+    ``height`` of the ground, m; None: the middle of the RPCs' own. The model is that of the RPCs as
+    they are, of the images as given.
+    """
     one, other = pair
+    if height is None:
+        height = float(one.sensor.rpc.height_off + other.sensor.rpc.height_off) / 2
     model = fit_epipolar(
         one.sensor,
         other.sensor,
         one.size,
         other.size,
-        float(one.sensor.rpc.height_off + other.sensor.rpc.height_off) / 2,
+        height,
         names=(str(one.path), str(other.path)),
     )
     order, angle = model.report["view_order"], model.report["convergence_angle_deg"]
@@ -97,7 +113,7 @@ def in_order(pair: tuple[Image, Image]) -> tuple[tuple[Image, Image], list[str]]
     words = f"convergence {angle:.1f} degrees; by the RPCs, {order}"
     if order == "left looks forward":
         words += " (the backward view is left in the paper's data)"
-    return (one, other), [f"left: {one.path}", f"right: {other.path}", words]
+    return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
 
 
 def _folder_name(delivery: Sequence[Path]) -> str:

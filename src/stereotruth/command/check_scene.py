@@ -69,13 +69,14 @@ def _check_images(scene: Scene, found: Findings) -> bool:
         image = Path(getattr(scene, f"{view}_image"))
         before = len(found)
         if not image.is_file():
-            good = False  # the sheet's check names it, but only the first missing file
-            found.say(
-                "files",
-                Level.ERROR,
-                f"{image}: {view}_image does not exist",
-                "correct the path (relative to the working directory, or absolute)",
-            )
+            good = False
+            if not any(f"{view}_image" in finding.text for finding in found):  # said already
+                found.say(
+                    "files",
+                    Level.ERROR,
+                    f"{image}: {view}_image does not exist",
+                    "correct the path (relative to the working directory, or absolute)",
+                )
             continue
         with found.of("images"):
             open_view(view, image, "")
@@ -97,7 +98,9 @@ def _check_alignment(
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"):
-        if images and gcps is not None:
+        if name in settings.alignment.fixed:
+            alignment = Alignment.load(settings.alignment.fixed[name])
+        elif images and gcps is not None:
             alignment = align(
                 *pair, scene.gcps, model=model, scene=name, strict=settings.strict, provenance={}
             )
