@@ -136,10 +136,10 @@ def _replaced(file: str, old: str, new: str) -> Callable[[Path], object]:
 def _pixels(dtype: str, **options: object) -> Callable[[Path], object]:
     def plant(folder: Path) -> None:
         cols, rows = SIZES["left"]
-        (folder / "left.rpb").write_text(rpb_text(RPCS["left"].to_dict()))
         shape = {"width": cols, "height": rows, "count": 1, "dtype": dtype}
         with rasterio.open(folder / "left.tif", "w", driver="GTiff", **shape, **options) as ds:
             ds.write(np.ones((rows, cols), dtype), 1)
+        (folder / "left.rpb").write_text(rpb_text(RPCS["left"].to_dict()))
 
     return plant
 
@@ -211,7 +211,7 @@ FAULTS = [
     Fault("complex image", "complex image", _pixels("complex64", compress="deflate")),
     Fault("damaged block", "is damaged", _flipped),
     Fault("no RPC", "no RPC metadata",
-          lambda f: (_pixels("uint8")(f), (f / "left.rpb").unlink(missing_ok=True))),
+          lambda f: (_pixels("uint8")(f), (f / "left.rpb").unlink())),
     Fault("RPC cut short", "malformed RPC", lambda f: (_rpb("left")(f), _cut("left.rpb")(f))),
     Fault("RPC of other ground", "the other image and the GCPs are elsewhere",
           _rpb("right", long_off=LON + 6)),

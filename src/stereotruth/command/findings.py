@@ -39,9 +39,8 @@ class Findings(list[Finding]):
 
     def say(self, about: str, level: Level, text: str, remedy: str = "") -> None:
         """Add a finding, once."""
-        finding = Finding(self.scene, about, level, text, remedy)
-        if finding not in self:
-            self.append(finding)
+        if not any((f.about, f.level, f.text) == (about, level, text) for f in self):
+            self.append(Finding(self.scene, about, level, text, remedy))
 
     def error(self, about: str, error: InputError) -> None:
         """Add what a stage refuses."""
