@@ -41,14 +41,16 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
     if surveyed:
         points = sum(file.points for file in surveyed)
         placed = [file.heights for file in surveyed if file.heights]
-        reach = ""
+        reach = dense = ""
+        if area := sum(file.area_m2 for file in surveyed):
+            dense = f", {points / area:.2g} points/m² by their headers"
         if placed:
             reach = f", {min(h[0] for h in placed):.0f} to {max(h[1] for h in placed):.0f} m"
         found.say(
             "LiDAR",
             Level.FACT,
             f"{points / 1e6:.1f} M points in {len(surveyed)} "
-            f"file{'s' * (len(surveyed) > 1)}, {next(iter(systems))}; heights "
+            f"file{'s' * (len(surveyed) > 1)}{dense}, {next(iter(systems))}; heights "
             f"{next(iter(surfaces))}{reach}",
         )
     return surveyed

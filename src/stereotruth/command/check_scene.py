@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rasterio.errors import RasterioError
 
 from ..alignment.align import align, from_rpcs
 from ..alignment.aligned_pair import Alignment
@@ -18,6 +19,7 @@ from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import Source
 from ..epipolar.model import EpipolarModel
 from ..lidar.survey import SurveyedFile
+from ..products.ungeoreferenced import open_raster
 from ..project import lidar_of
 from ..sheets import Scene
 from .check_lidar import check_lidar
@@ -80,11 +82,30 @@ def _check_images(scene: Scene, found: Findings) -> bool:
             continue
         with found.of("images"):
             open_view(view, image, "")
-        with found.of("images"), Source(image) as source:
-            if image.stat().st_size <= WHOLE_BYTES:
-                source.check_blocks()
+        with found.of("images"):
+            _check_pixels(image)
         good &= not any(f.level is Level.ERROR for f in found[before:])
     return good
+
+
+def _check_pixels(image: Path) -> None:
+    """Raise InputError as rule rectify does; what would take long to read is left to it."""
+    small = image.stat().st_size <= WHOLE_BYTES
+    if not small and _is_sampled(image):
+        return
+    with Source(image) as source:
+        if small:
+            source.check_blocks()
+
+
+def _is_sampled(image: Path) -> bool:
+    """Whether opening the image as a source reads all over it, to scale its values."""
+    try:
+        with open_raster(image) as dataset:
+            dtype = dataset.dtypes[0]
+    except RasterioError:
+        return False
+    return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
 
 
 def _check_alignment(

@@ -103,14 +103,13 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def watch(lines: Iterable[str]) -> None:
+def watch(lines: Iterable[str], progress: Progress) -> None:
     """Print the lines of a run, and below them its status line with time left."""
     from rich.console import Console
     from rich.live import Live
     from rich.spinner import Spinner
 
     console = Console(stderr=True, highlight=False)
-    progress = Progress()
     spinner = Spinner("line", progress.line())
     with Live(spinner, console=console, refresh_per_second=4, transient=True):
         for line in lines:
@@ -139,9 +138,10 @@ def run_workflow(given: Sequence[str]) -> int:
         errors="replace",
     )
     signal.signal(signal.SIGTERM, lambda number, _: process.send_signal(number))
+    progress = Progress()
     while True:
         try:
-            watch(process.stdout)
+            watch(process.stdout, progress)
             return process.wait()
         except KeyboardInterrupt:  # reached Snakemake too, which ends its jobs
             continue
