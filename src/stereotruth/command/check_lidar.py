@@ -11,6 +11,11 @@ from ..lidar.survey import SurveyedFile, survey
 from ..sheets import Scene
 from .findings import Findings, Level
 
+NO_DATUM = (
+    "declares no vertical datum",
+    "if they are orthometric, set geoid to a grid of their datum for this scene",
+)
+
 
 def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[SurveyedFile]:
     """The files that can be read, after what is to be said of all of them was added."""
@@ -31,7 +36,8 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
     notes = Counter(note for file in surveyed for note in file.notes)
     for note, count in notes.items():
         of = "" if count == len(files) == 1 else f"{count} of {len(files)} files: "
-        found.say("LiDAR", Level.DOUBT, f"{of}{note}")
+        remedy = NO_DATUM[1] if NO_DATUM[0] in note else ""
+        found.say("LiDAR", Level.DOUBT, f"{of}{note}", remedy)
     surfaces = Counter(file.surface for file in surveyed)
     systems = Counter(file.system for file in surveyed)
     for what, kinds in (("heights", surfaces), ("systems", systems)):
