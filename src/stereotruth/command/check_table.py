@@ -22,7 +22,7 @@ def show(every: Sequence[Findings], console: Console | None = None) -> bool:
     table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
     for heading in ("scene", "about", "", "finding"):
         table.add_column(heading, overflow="fold", no_wrap=heading in ("scene", ""))
-    counts = {level: 0 for level in Level}
+    counts = dict.fromkeys((Level.ERROR, Level.DOUBT, Level.FACT), 0)
     for findings in every:
         for k, found in enumerate(findings):
             counts[found.level] += 1
@@ -35,8 +35,13 @@ def show(every: Sequence[Findings], console: Console | None = None) -> bool:
     console.print(table)
     failed = any(findings.failed for findings in every)
     verdict = "a run would fail" if failed else "a run can begin"
+    numbers = ", ".join(
+        f"{n} {level.value}{'s' * (n != 1)}"
+        for level, n in counts.items()
+        if level is not Level.FACT
+    )
     console.print(
-        f"{counts[Level.ERROR]} errors, {counts[Level.DOUBT]} doubts: {verdict}",
+        f"{numbers}: {verdict}",
         style="bold red" if failed else "bold green",
     )
     return failed

@@ -168,6 +168,10 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
 
 @app.command(
     context_settings=PASSED_ON,
+    options_metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
+    help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
+    "tiles of all cities. Any option goes to Snakemake as it is; where none says how many cores, "
+    "it takes all.",
     epilog=examples(
         "stereotruth run tiles/Marseille",
         "stereotruth run tiles/Marseille report --cores 8 --dry-run",
@@ -178,11 +182,7 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
 def run(
     context: typer.Context,
 ) -> None:
-    """Run the workflow in this folder, with its config.yaml and any option of Snakemake.
-
-    Without a target: the tiles of all cities. Options and targets go to Snakemake as they are; with
-    no number of cores it takes all of the machine.
-    """
+    """Run the workflow; see ``help`` above."""
     from .run_workflow import run_workflow
 
     if context.args in (["--help"], ["-h"]):

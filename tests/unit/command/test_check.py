@@ -80,7 +80,7 @@ def test_the_table_has_a_line_a_problem_with_its_remedy(folder, capsys):
     out = capsys.readouterr().out
     assert "no coordinate reference system" in out
     assert "Remedy: set lidar_crs" in out
-    assert "1 errors" in out and "a run would fail" in out
+    assert "1 error, " in out and "a run would fail" in out
 
 
 def test_input_errors_name_the_file():
