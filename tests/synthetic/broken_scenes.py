@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 import rasterio
 import yaml
+from rasterio.windows import Window
 
 from .las import write_gtx, write_las
 from .project import SHEET_COLUMNS
@@ -63,11 +64,18 @@ def write_lidar(
     return file
 
 
+def with_pixels(image: Path) -> Path:
+    """The image, of which some blocks have a value."""
+    with rasterio.open(image, "r+") as dataset:
+        dataset.write(np.full((256, 256), 500, "uint16"), 1, window=Window(1024, 1024, 256, 256))
+    return image
+
+
 def good_project(folder: Path) -> Path:
     """A project that a check has nothing to say against."""
     folder.mkdir(parents=True, exist_ok=True)
     for view in ("left", "right"):
-        write_image(folder / f"{view}.tif", RPCS[view], SIZES[view])
+        with_pixels(write_image(folder / f"{view}.tif", RPCS[view], SIZES[view]))
     write_gcps(folder / "gcps.csv", make_gcps())
     write_lidar(folder)
     write_sheet(folder)
@@ -210,6 +218,8 @@ FAULTS = [
     Fault("no image", "left.tif", lambda f: (f / "left.tif").write_text("<html>404</html>")),
     Fault("complex image", "complex image", _pixels("complex64", compress="deflate")),
     Fault("damaged block", "is damaged", _flipped),
+    Fault("nothing but nodata", "no pixel but nodata",
+          lambda f: write_image(f / "left.tif", RPCS["left"], SIZES["left"])),
     Fault("no RPC", "no RPC metadata",
           lambda f: (_pixels("uint8")(f), (f / "left.rpb").unlink())),
     Fault("RPC cut short", "malformed RPC", lambda f: (_rpb("left")(f), _cut("left.rpb")(f))),
@@ -217,7 +227,7 @@ FAULTS = [
           _rpb("right", long_off=LON + 6)),
     Fault("RPC of another size", "pixels would be", _rpb("right", samp_scale=9e6, line_scale=9e6)),
     Fault("one view twice", "one direction",
-          lambda f: (write_image(f / "right.tif", RPCS["left"], SIZES["left"]),
+          lambda f: (with_pixels(write_image(f / "right.tif", RPCS["left"], SIZES["left"])),
                      write_sheet(f, gcps=""))),
     Fault("GCP column", "column 'left_row' is missing",
           _replaced("gcps.csv", "left_row", "leftrow")),

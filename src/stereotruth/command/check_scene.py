@@ -18,6 +18,7 @@ from ..disparity.overlap_check import apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import Source
 from ..epipolar.model import EpipolarModel
+from ..errors import InputError
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
 from ..project import lidar_of
@@ -26,6 +27,7 @@ from .check_lidar import check_lidar
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
 from .findings import Findings, Level
 
+STRIP_ROWS = 256
 WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
 
 
@@ -96,6 +98,20 @@ def _check_pixels(image: Path) -> None:
     with Source(image) as source:
         if small:
             source.check_blocks()
+        _refuse_empty(source)
+
+
+def _refuse_empty(source: Source) -> None:
+    """Raise InputError if no pixel has a value; reads on until one has."""
+    cols, rows = source.size
+    for row in range(0, rows, STRIP_ROWS):
+        if np.isfinite(source.read(0, row, cols, min(STRIP_ROWS, rows - row))).any():
+            return
+    raise InputError(
+        f"no pixel but nodata ({source.nodata:g})",
+        file=source.path,
+        remedy="check the image and its nodata value",
+    )
 
 
 def _is_sampled(image: Path) -> bool:

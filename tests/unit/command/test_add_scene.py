@@ -14,7 +14,7 @@ from stereotruth.command.check import check_project
 from stereotruth.errors import InputError
 from stereotruth.sheets import read_cities, read_scenes
 
-from ...synthetic.broken_scenes import write_lidar
+from ...synthetic.broken_scenes import with_pixels, write_lidar
 from ...synthetic.rpc_texts import dimap_text, rpb_text
 from ...synthetic.surveyed_pair import RPCS, SIZES
 
@@ -28,7 +28,7 @@ def plain(path, view, count=1):
     shape = {"width": cols, "height": rows, "count": count, "dtype": "uint16"}
     with rasterio.open(path, "w", driver="GTiff", **shape, sparse_ok=True, tiled=True):
         pass
-    return path
+    return with_pixels(path)
 
 
 def row():
