@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 from ..errors import InputError
@@ -53,7 +53,7 @@ def begin(folder: str | Path) -> None:
     (folder / "gcps").mkdir(parents=True)
     (folder / "config.yaml").write_text(configuration_text(), encoding="utf-8")
     for name, columns in (("scenes", Scene), ("cities", City)):
-        header = "\t".join(field.name for field in fields(columns))
+        header = "\t".join(f.name for f in fields(columns) if f.default is MISSING)
         (folder / f"{name}.tsv").write_text(f"{header}\n", encoding="utf-8")
 
 
