@@ -1,16 +1,27 @@
+# make                set up: .venv with all that is needed; then `. .venv/bin/activate`
+# make help           these lines
 # make tiles/<City>   set up, then make the tiles of a city of config/cities.tsv
+# make dataset        set up, then make the tiles of all cities in the layout of the published dataset
+# make verify         hold all tiles against the checksums of their manifests
 # make test           set up, then pass the tests that every change needs
 # make test-all       set up, then pass all: kills and restarts, browsers, benchmarks, real scenes too
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
+# make networks       set up with PyTorch
+# make lint           format, lint, lock file
+# make lock           resolve the pins again (needs uv)
+# make clean          remove all that runs have made
 PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup help networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
+
+help:
+	@sed -n 's/^# \(make\)/\1/p' $(firstword $(MAKEFILE_LIST))
 
 $(READY): envs/requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("Python 3.11 or later is needed, this is %d.%d: set PYTHON=/path/to/python3.11" % v[:2])'

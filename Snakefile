@@ -1,11 +1,15 @@
 """Satellite pairs + LiDAR + GCPs -> epipolar image pairs with ground-truth disparity."""
 
+from pathlib import Path
+
 from snakemake.utils import min_version
 
 min_version("9.10")
 
 
-configfile: "config/config.yaml"
+if Path("config/config.yaml").is_file():  # of the working directory; see common.smk
+
+    configfile: "config/config.yaml"
 
 
 include: "workflow/rules/common.smk"

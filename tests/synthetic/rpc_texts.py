@@ -34,3 +34,25 @@ def rpb_text(values: Mapping[str, Any], spec: str = "RPC00B", more: Sequence[str
         body = ",\n".join(f"\t\t\t{v:+.15E}" for v in values[f"{name}_coeff"])
         lines.append(f"\t{kind}{part.capitalize()}Coef = (\n{body});")
     return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
+
+
+def dimap_text(values: Mapping[str, Any]) -> str:
+    """``RPC_….XML`` of Pléiades and SPOT (DIMAP 2), whose pixels count from 1."""
+    names = [name for name in values if not name.startswith("err")]
+    inverse = "".join(
+        f"<{name.upper()}_{i}>{v!r}</{name.upper()}_{i}>"
+        for name in names
+        if isinstance(values[name], list)
+        for i, v in enumerate(values[name], start=1)
+    )
+    first = {"samp_off": 1, "line_off": 1}
+    validity = "".join(
+        f"<{name.upper()}>{values[name] + first.get(name, 0)!r}</{name.upper()}>"
+        for name in names
+        if not isinstance(values[name], list)
+    )
+    return (
+        "<Dimap_Document><Rational_Function_Model><Global_RFM>"
+        f"<Inverse_Model>{inverse}</Inverse_Model><RFM_Validity>{validity}</RFM_Validity>"
+        "</Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )

@@ -26,6 +26,8 @@ ORDER = (
     {"disparity", "report"},
     {"evaluation", "matching"},
     {"configuration"},
+    {"project"},
+    {"command"},  # asks all stages what they think of the input, and nothing asks it
 )
 FLOOR = {package: floor for floor, packages in enumerate(ORDER) for package in packages}
 

@@ -15,6 +15,9 @@ import rioxarray
 import xarray as xr
 import zarr
 
+from stereotruth.command.check import check_project
+from stereotruth.command.findings import Level
+
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
 STAGES = {"align", "refine", "rectify", "project", "export"}
@@ -319,8 +322,8 @@ def name_of(mistake) -> str:
 
 
 @pytest.fixture(scope="module")
-def mistaken(data, tmp_path_factory):
-    """One run of a scene for each mistake; a failing one does not stop the others."""
+def wrong(data, tmp_path_factory):
+    """A project with a scene, and a city, for each mistake; config in wrong.yaml."""
     top = tmp_path_factory.mktemp("mistaken")
     rows = []
     for mistake in MISTAKES:
@@ -332,7 +335,25 @@ def mistaken(data, tmp_path_factory):
         rows.append(row_of(folder, scene=name, city=name, **mistake(folder)))
     project = copy_project(top / "project")
     project.add_scene("wrong", rows, **SIZE)
-    targets = [f"tiles/{row['city']}" for row in rows]
+    return project
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=name_of)
+def test_a_mistake_is_found_before_a_run(wrong, mistake, monkeypatch):
+    monkeypatch.chdir(wrong.folder)
+    *_, found, run = check_project([Path("wrong.yaml")], [name_of(mistake)])
+    errors = [finding.text + finding.remedy for finding in found if finding.level is Level.ERROR]
+    assert len(errors) == 1, errors
+    for word in MISTAKES[mistake]:
+        assert word in errors[0]
+    assert not run.failed
+
+
+@pytest.fixture(scope="module")
+def mistaken(wrong):
+    """One run of a scene for each mistake; a failing one does not stop the others."""
+    project = wrong
+    targets = [f"tiles/{name_of(mistake)}" for mistake in MISTAKES]
     return project, project.snakemake("--keep-going", *targets, "--configfile", "wrong.yaml")
 
 

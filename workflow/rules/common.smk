@@ -5,23 +5,23 @@ from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 
-from stereotruth import sheets
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.products.provenance import PACKAGE, file_sha256, source_digest
 from stereotruth.products.publication import made_of
-from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
+from stereotruth.project import (
+    FILES,
+    check_fixed,
+    is_synthetic,
+    lidar_of,
+    read_scenes,
+    with_defaults,
+)
 
-CONDA = Path(workflow.basedir) / "envs" / "workflow.yaml"
-SYNTHETIC_FOLDER = "data/synthetic"
+# of the defaults, what neither a file of this folder nor the command line says other
+config.update(with_defaults(config))
+CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
-
-
-def is_synthetic(scene):
-    """Whether the scene's input is made by the rules of simulate.smk."""
-    city = SYNTHETIC.get(scene.city)
-    made_here = f"{SYNTHETIC_FOLDER}/{scene.city}/{scene.scene}"
-    return city is not None and scene.left_image == f"{made_here}/left.tif"
 
 
 def synthetic_scenes(city):
@@ -29,41 +29,11 @@ def synthetic_scenes(city):
     return [s.scene for s in SCENES.values() if s.city == city and is_synthetic(s)]
 
 
-def read_sheets(settings):
-    """Cities and scenes by name, and the LiDAR files of each scene by store name."""
-    cities = sheets.read_cities(settings.cities)
-    scenes = sheets.read_scenes(settings.scenes, cities)
-    sheet, alignment = settings.scenes, settings.alignment
-    lidar = {}
-    for name, scene in scenes.items():
-        if not scene.gcps and not (alignment.refine or name in alignment.fixed):
-            raise InputError(
-                f"scene {name!r} has no GCPs, and alignment.refine is false",
-                file=sheet,
-                remedy="name its file of ground control points, or set alignment.refine to true",
-            )
-        if is_synthetic(scene):
-            sheets.require_files(scene, sheet, ["gcps"])
-            tiles = synthetic_lidar(SYNTHETIC[scene.city], name)
-            files = [Path(scene.lidar) / tile for tile in tiles]
-        else:
-            sheets.require_files(scene, sheet, ["left_image", "right_image", "gcps", "geoid"])
-            files = sheets.find_lidar(scene, sheet)
-        lidar[name] = sheets.store_names(files)
-    for name, file in alignment.fixed.items():
-        if name not in scenes or not Path(file).is_file():
-            raise InputError(
-                f"alignment.fixed: {name}: {file}: "
-                + ("no such file" if name in scenes else "no such scene"),
-                file=sheet,
-                remedy="take a scene of the sheet, and the path of its alignment.json",
-            )
-    return cities, scenes, lidar
-
-
 try:
     SETTINGS = Configuration.of(config)
-    CITIES, SCENES, LIDAR = read_sheets(SETTINGS)
+    CITIES, SCENES = read_scenes(SETTINGS)
+    LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
+    check_fixed(SETTINGS, SCENES)
 except InputError as error:
     raise WorkflowError(str(error))
 
@@ -83,7 +53,8 @@ def no_scenes(sheet, what, remedy):
     given = [str(f.relative_to(here) if f.is_relative_to(here) else f) for f in given]
     if not given:
         remedy = f"add --configfile FILE if it was forgotten; or else {remedy}"
-    read = ", ".join(["config/config.yaml", *given])
+    own = "config/config.yaml" if Path("config/config.yaml").is_file() else "the defaults"
+    read = ", ".join([own, *given])
     return WorkflowError(f"{sheet}: no {what} (configuration: {read}). Remedy: {remedy}")
 
 

@@ -6,6 +6,7 @@ def with_rpc_files(image):
     image = Path(image)
     beside = [image.with_suffix(s) for s in (".RPB", ".rpb")]
     beside += [image.with_name(f"{image.stem}{s}") for s in ("_RPC.TXT", "_rpc.txt", "_RPC.txt")]
+    beside += sorted(image.parent.glob("RPC_*.XML"))  # of DIMAP, both views'
     return [str(image), *(str(file) for file in beside if file.is_file())]
 
 

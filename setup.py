@@ -1,0 +1,35 @@
+"""Puts the workflow into the wheel, where :data:`stereotruth.project.FILES` finds it.
+
+In a clone, and in an editable installation, it stays at the top.
+"""
+
+import shutil
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+FOLDERS = ("workflow", "config", "profiles", "envs")
+
+
+class WithWorkflow(build_py):
+    """Copies the Snakefile and the folders that belong to it into ``stereotruth/shipped``."""
+
+    def run(self):
+        """Build the package, and put the files of the workflow beside its modules."""
+        super().run()
+        if self.editable_mode:
+            return
+        shipped = Path(self.build_lib, "stereotruth", "shipped")
+        shutil.rmtree(shipped, ignore_errors=True)
+        shipped.mkdir(parents=True)
+        shutil.copy("Snakefile", shipped)
+        for folder in FOLDERS:
+            ignored = shutil.ignore_patterns("__pycache__", "requirements.lock", "check_lock.py")
+            shutil.copytree(folder, shipped / folder, ignore=ignored)
+        environment = shipped / "envs" / "workflow.yaml"  # names the clone around it
+        named = f"- stereotruth=={self.distribution.get_version()}"
+        environment.write_text(environment.read_text("utf-8").replace("- ..", named), "utf-8")
+
+
+setup(cmdclass={"build_py": WithWorkflow})

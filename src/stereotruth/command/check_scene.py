@@ -1,0 +1,261 @@
+"""One scene before its run: images, RPCs, control points and LiDAR headers, each and together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rasterio.errors import RasterioError
+
+from ..alignment.align import align, from_rpcs
+from ..alignment.aligned_pair import Alignment
+from ..alignment.control_points import ControlPoints, read_gcps
+from ..alignment.gcp_checks import open_view
+from ..configuration import Configuration
+from ..disparity.overlap_check import apart, refuse_apart
+from ..epipolar.fit import fit_epipolar
+from ..epipolar.image_reader import Source
+from ..epipolar.model import EpipolarModel
+from ..errors import InputError
+from ..lidar.survey import SurveyedFile
+from ..products.ungeoreferenced import open_raster
+from ..project import lidar_of
+from ..sheets import Scene
+from .check_lidar import check_lidar
+from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
+from .findings import Findings, Level
+
+STRIP_ROWS = 256
+WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
+
+
+@dataclass
+class SceneFacts:
+    """What the run's time and disk follow from."""
+
+    scene: str
+    pixels: int = 0  # of the epipolar grid
+    points: int = 0  # of the LiDAR
+    lidar_files: int = 0
+    covered: float = 1.0  # share of the grid
+
+
+def check_scene(scene: Scene, settings: Configuration, found: Findings) -> SceneFacts:
+    """Add what is found of a scene to ``found``; what one part refuses keeps no other from it."""
+    facts = SceneFacts(scene.scene)
+    files: dict[str, Path] = {}
+    with found.of("files"):
+        files = lidar_of(scene, settings)
+    images = _check_images(scene, found)
+    alignment, gcps = _check_alignment(scene, settings, images, found)
+    model = None
+    if alignment is not None:
+        with found.of("images"):
+            model = _check_pair(alignment, scene, found)
+            facts.pixels = int(np.prod(model.shape))
+            check_frame(Nodes.of(model), settings, found)
+    surveyed = check_lidar(list(files.values()), scene, found) if files else []
+    facts.points, facts.lidar_files = sum(file.points for file in surveyed), len(surveyed)
+    if surveyed and gcps is not None:
+        _hold_against_gcps(surveyed, gcps, found)
+    if surveyed and alignment is not None and model is not None:
+        with found.of("LiDAR"):
+            facts.covered = _hold_against_images(surveyed, alignment, model, settings, found)
+    return facts
+
+
+def _check_images(scene: Scene, found: Findings) -> bool:
+    """Whether both images and their RPCs can be used."""
+    good = True
+    for view in ("left", "right"):
+        image = Path(getattr(scene, f"{view}_image"))
+        before = len(found)
+        if not image.is_file():
+            good = False
+            if not any(f"{view}_image" in finding.text for finding in found):  # said already
+                found.say(
+                    "files",
+                    Level.ERROR,
+                    f"{image}: {view}_image does not exist",
+                    "correct the path (relative to the working directory, or absolute)",
+                )
+            continue
+        with found.of("images"):
+            open_view(view, image, "")
+        with found.of("images"):
+            _check_pixels(image)
+        good &= not any(f.level is Level.ERROR for f in found[before:])
+    return good
+
+
+def _check_pixels(image: Path) -> None:
+    """Raise InputError as rule rectify does; what would take long to read is left to it."""
+    small = image.stat().st_size <= WHOLE_BYTES
+    if not small and _is_sampled(image):
+        return
+    with Source(image) as source:
+        if small:
+            source.check_blocks()
+        _refuse_empty(source)
+
+
+def _refuse_empty(source: Source) -> None:
+    """Raise InputError if no pixel has a value; reads on until one has."""
+    cols, rows = source.size
+    for row in range(0, rows, STRIP_ROWS):
+        if np.isfinite(source.read(0, row, cols, min(STRIP_ROWS, rows - row))).any():
+            return
+    raise InputError(
+        f"no pixel but nodata ({source.nodata:g})",
+        file=source.path,
+        remedy="check the image and its nodata value",
+    )
+
+
+def _is_sampled(image: Path) -> bool:
+    """Whether opening the image as a source reads all over it, to scale its values."""
+    try:
+        with open_raster(image) as dataset:
+            dtype = dataset.dtypes[0]
+    except RasterioError:
+        return False
+    return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
+
+
+def _check_alignment(
+    scene: Scene, settings: Configuration, images: bool, found: Findings
+) -> tuple[Alignment | None, ControlPoints | None]:
+    """The alignment as rule align makes it, and the control points, if they can be read."""
+    alignment = gcps = None
+    if scene.gcps and Path(scene.gcps).is_file():
+        with found.of("GCPs"):
+            gcps = read_gcps(scene.gcps, scene.scene)
+    pair = scene.left_image, scene.right_image
+    model, name = settings.alignment.model, scene.scene
+    with found.of("GCPs"):
+        if name in settings.alignment.fixed:
+            alignment = Alignment.load(settings.alignment.fixed[name])
+        elif images and gcps is not None:
+            alignment = align(
+                *pair, scene.gcps, model=model, scene=name, strict=settings.strict, provenance={}
+            )
+            used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]
+            sigma = max(fit.rms("after") for fit in alignment.fits)
+            text = f"{used[0]} and {used[1]} of {len(gcps.ids)} used, {sigma:.2f} px rms at most"
+            found.say("GCPs", Level.FACT, text)
+        elif images and not scene.gcps:
+            alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
+    if alignment is None and images:  # to hold the LiDAR against the images all the same
+        with Findings().of("images"):
+            alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
+    return alignment, gcps
+
+
+def _check_pair(alignment: Alignment, scene: Scene, found: Findings) -> EpipolarModel:
+    """The epipolar model as rule rectify fits it. Raises InputError as it does."""
+    model = fit_epipolar(
+        alignment.left,
+        alignment.right,
+        alignment.left_fit.size,
+        alignment.right_fit.size,
+        alignment.reference_height,
+        names=(scene.left_image, scene.right_image),
+    )
+    rows, cols = model.shape
+    report = model.report
+    pixel = np.sqrt(pixel_m2(model))
+    found.say(
+        "images",
+        Level.FACT,
+        f"{cols} x {rows} px of {pixel:.2f} m in common, convergence "
+        f"{report['convergence_angle_deg']:.1f} degrees, {report['view_order']}",
+    )
+    if report["view_order"] == "left looks forward":
+        found.say(
+            "images",
+            Level.DOUBT,
+            "the left image is the forward view; in the paper's data it is the backward one",
+            "exchange left_image and right_image if disparities should be as the paper's",
+        )
+    return model
+
+
+def _hold_against_gcps(
+    surveyed: Sequence[SurveyedFile], gcps: ControlPoints, found: Findings
+) -> None:
+    """Doubt heights: control points below or above every point of the files that they lie in."""
+    off, here = [], 0
+    for lon, lat, height in zip(gcps.lon, gcps.lat, gcps.height):
+        around = [
+            file.heights
+            for file in surveyed
+            if file.box and file.heights and not apart(file.box, (lon, lat, lon, lat))
+        ]
+        if not around:
+            continue
+        here += 1
+        low, high = min(h[0] for h in around), max(h[1] for h in around)
+        if height < low:
+            off.append(height - low)
+        elif height > high:
+            off.append(height - high)
+    if here and 2 * len(off) > here:
+        shift = float(np.median(off))
+        found.say(
+            "heights",
+            Level.DOUBT,
+            f"{len(off)} of {here} GCPs lie {'below' if shift < 0 else 'above'} every LiDAR point "
+            f"of their files, by {abs(shift):.1f} m in the middle",
+            "check the LiDAR's vertical datum and unit (geoid, feet), and that the GCPs' heights "
+            "are ellipsoidal metres",
+        )
+
+
+def _hold_against_images(
+    surveyed: Sequence[SurveyedFile],
+    alignment: Alignment,
+    model: EpipolarModel,
+    settings: Configuration,
+    found: Findings,
+) -> float:
+    """Share of the images that the LiDAR's boxes cover. Raises InputError if there is none."""
+    placed = [file for file in surveyed if file.box and file.heights]
+    if not placed:
+        return 1.0
+    boxes = np.array([file.box for file in placed])
+    heights = (min(f.heights[0] for f in placed), max(f.heights[1] for f in placed))
+    nodes = Nodes.of(model)
+    ends = [nodes.ground(height) for height in heights]
+    lon, lat = (np.concatenate([end[k].ravel() for end in ends]) for k in (0, 1))
+    images = tuple(map(float, (np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat))))
+    whole = tuple(map(float, (*boxes[:, :2].min(0), *boxes[:, 2:].max(0))))
+    if apart(whole, images):
+        refuse_apart(whole, images, heights, placed[0].path.parent)
+    outside = [file.path.name for file in placed if apart(file.box, images)]
+    if outside and len(outside) < len(placed):
+        found.say(
+            "LiDAR",
+            Level.DOUBT,
+            f"{len(outside)} of {len(placed)} files lie outside the images ({outside[0]} …): they "
+            "are read in vain",
+            "leave them out, or check their coordinate system",
+        )
+    for sensor in (alignment.left, alignment.right):
+        low, high = sensor.rpc.ground_box[4:]
+        margin = (high - low) / 4
+        middle = np.median([np.mean(file.heights) for file in placed])
+        if not low - margin <= middle <= high + margin:
+            found.say(
+                "heights",
+                Level.DOUBT,
+                f"the LiDAR, about {middle:.0f} m, is outside the {low:.0f} to {high:.0f} m of the "
+                "RPC",
+                "check that its heights are ellipsoidal metres",
+            )
+            break
+    share = check_labels(nodes, placed, settings, found)
+    if not share:
+        refuse_apart(whole, images, heights, placed[0].path.parent)
+    return share

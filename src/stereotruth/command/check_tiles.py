@@ -1,0 +1,175 @@
+"""Which tiles go into what both images show, and what share of their pixels will have a label."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..configuration import Configuration
+from ..epipolar.model import EpipolarModel
+from ..lidar.lattice import DEGREE_M
+from ..lidar.survey import SurveyedFile
+from .findings import Findings, Level
+
+NODES = 128  # along the longer side of the grid
+# Measured with bench/density.py: share of visible pixels with a label by points a pixel.
+POINTS_PER_PX = (0.0, 0.105, 0.21, 0.42, 0.85, 1.7, 2.6)
+LABELLED = {
+    "none": (0.0, 0.099, 0.188, 0.347, 0.598, 0.871, 0.95),
+    "surface": (0.0, 0.799, 0.852, 0.895, 0.927, 0.947, 0.956),
+    "surface_and_images": (0.0, 0.860, 0.884, 0.909, 0.932, 0.949, 0.957),
+}
+BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Places of the epipolar grid, ``step`` px apart: ``seen`` where both images show ground.
+
+    ``x``, ``y`` [rows, cols] px; the right image is taken as at the reference height.
+    """
+
+    model: EpipolarModel
+    step: float
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    seen: Bools
+
+    @classmethod
+    def of(cls, model: EpipolarModel) -> Nodes:
+        """Of a whole grid."""
+        rows, cols = model.shape
+        step = max(rows, cols) / NODES
+        axes = [np.arange(step / 2, side, step) - 0.5 for side in (cols, rows)]
+        x, y = np.meshgrid(*axes)
+        seen = np.ones(x.shape, bool)
+        for inverse, size in (
+            (model.epipolar_to_left, model.left_size),
+            (model.epipolar_to_right, model.right_size),
+        ):
+            place = inverse(x.ravel(), y.ravel())
+            for values, side in zip(place, size):
+                values = np.asarray(values).reshape(x.shape)
+                seen &= (values >= 0) & (values <= side - 1)
+        return cls(model, step, x, y, seen)
+
+    def ground(self, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """lon, lat [rows, cols] of the nodes at an ellipsoidal height in m."""
+        lon, lat = self.model.epipolar_to_ground(self.x.ravel(), self.y.ravel(), height)
+        return np.asarray(lon).reshape(self.x.shape), np.asarray(lat).reshape(self.x.shape)
+
+    def windows(self, values: NDArray, size: int) -> NDArray[np.float64]:
+        """Means of values over all squares of ``size`` px, [rows, cols] of their first nodes."""
+        n = max(round(size / self.step), 1)
+        if min(values.shape) < n:
+            return np.empty((0, 0))
+        sums = np.pad(values.astype(float).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+        return (sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]) / n**2
+
+    def fits(self, size: float) -> bool:
+        """Whether a square of that size lies in what both images show."""
+        means = self.windows(self.seen, int(size))
+        return bool(means.size and means.max() > 1 - 1e-9)
+
+    @property
+    def largest(self) -> int:
+        """Side of the largest square in px, a multiple of 32, 16 at least."""
+        fitting = [side for side in range(32, min(self.model.shape) + 1, 32) if self.fits(side)]
+        return fitting[-1] if fitting else 16
+
+
+def check_frame(nodes: Nodes, settings: Configuration, found: Findings) -> None:
+    """Refuse tiles that are larger than what both images show: all their pixels have to be seen."""
+    size, rows, cols = settings.tiles.size, *nodes.model.shape
+    if nodes.fits(size):
+        return
+    certain = not nodes.fits(size - 2 * nodes.step)
+    found.say(
+        "tiles",
+        Level.ERROR if certain else Level.DOUBT,
+        f"{'not one' if certain else 'maybe not one'} tile of {size} px lies wholly in what both "
+        f"images show of the {cols} x {rows} px grid",
+        f"set tiles.size to {nodes.largest} or less",
+    )
+
+
+def expected_share(points_per_px: float, fill: str) -> float:
+    """Share of the pixels which both views see that will have a label."""
+    return float(np.interp(points_per_px, POINTS_PER_PX, LABELLED[fill]))
+
+
+def pixel_m2(model: EpipolarModel) -> float:
+    """Ground that a pixel in the middle of the grid shows, m²."""
+    rows, cols = model.shape
+    x, y = cols / 2 + np.array([0.0, 1.0, 0.0]), rows / 2 + np.array([0.0, 0.0, 1.0])
+    lon, lat = map(np.asarray, model.epipolar_to_ground(x, y, model.reference_height))
+    sides = np.stack([(lon[1:] - lon[0]) * np.cos(np.radians(lat[0])), lat[1:] - lat[0]])
+    return float(abs(np.linalg.det(sides * DEGREE_M)))
+
+
+def check_labels(
+    nodes: Nodes, placed: Sequence[SurveyedFile], settings: Configuration, found: Findings
+) -> float:
+    """Say what share of the pixels will be labelled, by the headers' boxes and counts.
+
+    ``placed``: files with box and heights. Returns the share of the images with LiDAR.
+    """
+    lon, lat = nodes.ground(float(np.mean([file.heights for file in placed])))
+    density = np.zeros(lon.shape)  # points a m², of the boxes that a node lies in
+    for file in placed:
+        west, south, east, north = file.box
+        inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
+        density[inside] += file.points / max(file.area_m2, 1.0)
+    covered = nodes.seen & (density > 0)
+    share = float(covered.sum() / max(nodes.seen.sum(), 1))
+    if not share:
+        return 0.0
+    per_m2 = float(density[covered].mean())
+    per_px, fill = per_m2 * pixel_m2(nodes.model), settings.project.fill
+    expected = expected_share(per_px, fill)
+    found.say(
+        "labels",
+        Level.FACT,
+        f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {share:.0%} of what both "
+        f"images show: some {expected:.0%} of the visible pixels there will have a label "
+        f"(project.fill: {fill})",
+    )
+    _hold_against_tiles(nodes, covered, per_px, settings, found)
+    return share
+
+
+def _hold_against_tiles(
+    nodes: Nodes, covered: Bools, per_px: float, settings: Configuration, found: Findings
+) -> None:
+    """Doubt or refuse settings by which even the best tile has too few labels."""
+    size, needed, fill = settings.tiles.size, settings.tiles.min_labelled, settings.project.fill
+    means = nodes.windows(covered, size)
+    whole = nodes.windows(nodes.seen, size) > 1 - 1e-9 if means.size else means.astype(bool)
+    if not whole.any():  # said by check_frame
+        return
+    best = float(means[whole].max())
+    expected = best * expected_share(per_px, fill)
+    if expected >= needed:
+        return
+    better = [
+        name
+        for name in LABELLED
+        if LABELLED[name] > LABELLED[fill] and best * expected_share(per_px, name) >= needed
+    ]
+    remedy = f"set tiles.min_labelled below {expected:.2g}, or give more LiDAR"
+    if better:
+        share = best * expected_share(per_px, better[0])
+        remedy = f"set project.fill to {better[0]} ({share:.0%}), or {remedy}"
+    dense = best * expected_share(BOX_SLACK * per_px, fill)
+    found.say(
+        "labels",
+        Level.DOUBT if dense >= needed else Level.ERROR,
+        f"some {expected:.0%} of the best tile's pixels will have a label (LiDAR on {best:.0%} of "
+        f"it), tiles.min_labelled asks for {needed:.0%}",
+        remedy,
+    )

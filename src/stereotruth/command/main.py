@@ -1,0 +1,234 @@
+"""The command line of ``stereotruth``. Stages are imported by who needs them, to start quickly."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .. import __version__
+from ..errors import InputError
+
+
+def examples(*lines: str) -> str:
+    """What stands at the end of a command's help, one line each."""
+    return "\n\n".join(["[bold]Examples[/bold]", *(f"[cyan]{line}[/cyan]" for line in lines)])
+
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=examples(
+        "stereotruth init --example demo && cd demo",
+        "stereotruth check",
+        "stereotruth run tiles/Demo",
+        "stereotruth run report && stereotruth open",
+    ),
+    help="Satellite pairs, LiDAR and ground control points to epipolar pairs with ground-truth "
+    "disparity. Commands work in the folder of a project, where config.yaml lies.",
+)
+scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
+gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
+app.add_typer(scene_app, name="scene")
+app.add_typer(gcps_app, name="gcps")
+
+Text = Annotated[str, typer.Option()]
+Configured = Annotated[
+    list[Path] | None,
+    typer.Option("--configfile", help="Instead of config.yaml; may be given more than once."),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"stereotruth {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _callback(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Version, and end.")
+    ] = False,
+) -> None:
+    del version
+
+
+@app.command(epilog=examples("stereotruth init my-project", "stereotruth init --example demo"))
+def init(
+    folder: Annotated[Path, typer.Argument(help="Folder to be made, or an empty one.")],
+    example: Annotated[
+        bool, typer.Option("--example", help="With a small synthetic city to try, made here.")
+    ] = False,
+) -> None:
+    """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
+    from .new_project import begin, with_example
+
+    (with_example if example else begin)(folder)
+    next_step = "stereotruth check" if example else "stereotruth scene add DELIVERY --lidar FOLDER"
+    typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
+
+
+@scene_app.command(
+    "add",
+    epilog=examples(
+        "stereotruth scene add /data/GF7_DLC_E115.4_N30.2 --lidar /data/lidar --city Qichun",
+        "stereotruth scene add left.tif right.tif --lidar lidar --gcps gcps.csv --city Marseille",
+        "stereotruth scene add delivery --lidar lidar --lidar-crs EPSG:2154+5720 --geoid RAF20.tif",
+    ),
+)
+def scene_add(
+    delivery: Annotated[
+        list[Path], typer.Argument(help="Folder of the delivery, or left and right image.")
+    ],
+    lidar: Annotated[str, typer.Option(help="Folder or glob of LAS, LAZ, COPC files.")],
+    gcps: Annotated[str, typer.Option(help="CSV of ground control points, if there are any.")] = "",
+    city: Annotated[str, typer.Option(help="City, made if new; else the delivery's name.")] = "",
+    scene: Annotated[str, typer.Option("--name", help="Of the scene; else City-1, City-2 …")] = "",
+    lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
+    geoid: Annotated[str, typer.Option(help="Geoid grid, for orthometric heights.")] = "",
+    configfile: Configured = None,
+) -> None:
+    """Find images, RPCs and views in a delivery, look at the LiDAR, and write the scene's row."""
+    from .add_scene import add_scene
+
+    for line in add_scene(
+        delivery,
+        lidar=lidar,
+        gcps=gcps,
+        city=city,
+        name=scene,
+        lidar_crs=lidar_crs,
+        geoid=geoid,
+        configfiles=configfile,
+    ):
+        typer.echo(line)
+
+
+@gcps_app.command(
+    "import",
+    epilog=examples(
+        "stereotruth gcps import left.points right.points --heights heights.csv --to gcps/A-1.csv",
+        "stereotruth gcps import left.points right.points --heights dsm.tif --to gcps/A-1.csv",
+        "stereotruth gcps import points.gcp --left left.tif --right right.tif --to gcps/A-1.csv",
+        "stereotruth gcps import survey.csv --crs EPSG:32650 --to gcps/A-1.csv",
+    ),
+)
+def gcps_import(
+    files: Annotated[
+        list[Path], typer.Argument(help="Two .points (left, right), one .gcp, or one .csv.")
+    ],
+    to: Annotated[Path, typer.Option(help="The CSV to be written.")],
+    heights: Annotated[
+        Path | None,
+        typer.Option(help="For .points: CSV (id or lon,lat; height) or a raster of heights."),
+    ] = None,
+    crs: Annotated[str, typer.Option(help="Of the ground coordinates, if the file has none.")] = "",
+    geoid: Annotated[
+        Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
+    ] = None,
+    left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
+    right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
+) -> None:
+    """Bring control points of QGIS, Ames Stereo Pipeline or a CSV into the project's form."""
+    from .import_gcps import import_gcps
+
+    for line in import_gcps(
+        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right
+    ):
+        typer.echo(line)
+
+
+@app.command(
+    epilog=examples(
+        "stereotruth check", "stereotruth check Marseille-1", "stereotruth check && stereotruth run"
+    )
+)
+def check(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scenes or cities; all if none is named.")
+    ] = None,
+    configfile: Configured = None,
+) -> None:
+    """Say in seconds what a run would fail of, what to expect, and what it will take."""
+    from .check import check_project
+    from .check_table import show
+
+    if show(check_project(configfile, scenes or [])):
+        raise typer.Exit(1)
+
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command(
+    context_settings=PASSED_ON,
+    options_metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
+    help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
+    "tiles of all cities. Any option goes to Snakemake as it is; where none says how many cores, "
+    "it takes all.",
+    epilog=examples(
+        "stereotruth run tiles/Marseille",
+        "stereotruth run tiles/Marseille report --cores 8 --dry-run",
+        "stereotruth run --profile my-site dataset",
+        "stereotruth run benchmark/synthetic/sgm -- --keep-going",
+    ),
+)
+def run(
+    context: typer.Context,
+) -> None:
+    """Run the workflow; see ``help`` above."""
+    from .run_workflow import run_workflow
+
+    if context.args in (["--help"], ["-h"]):
+        typer.echo(context.get_help())
+        raise typer.Exit
+    raise typer.Exit(run_workflow(context.args))
+
+
+@app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
+def status(
+    cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
+    configfile: Configured = None,
+) -> None:
+    """What is made of each city, and what is out of date and why."""
+    from .status import show_status
+
+    show_status(cities or [], configfile)
+
+
+@app.command("open", epilog=examples("stereotruth open", "stereotruth open Marseille"))
+def open_pages(
+    words: Annotated[
+        list[str] | None, typer.Argument(help="Only pages with one of these in their path.")
+    ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Only say where they are.")] = False,
+) -> None:
+    """Open the pages that there are: reports of cities, benchmarks, audits."""
+    from .pages import pages
+
+    found = pages(words or [])
+    for page in found:
+        typer.echo(str(page))
+        if not listed:
+            typer.launch(page.absolute().as_uri())
+
+
+def main() -> None:
+    """Entry point: an error of the input is one line, and exit status 1."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # ? for what LC_ALL=C cannot show
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        app()
+    except InputError as error:
+        sys.stderr.write(f"error: {error}\n")
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()

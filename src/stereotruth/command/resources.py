@@ -1,0 +1,80 @@
+"""Time, disk and memory of a run, by rates that were measured."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..configuration import Configuration
+from .findings import Findings, Level
+from .run_workflow import duration
+
+if TYPE_CHECKING:
+    from .check_scene import SceneFacts
+
+# Seconds of one core (bench/README.md: throughput.py, scale.py, density.py).
+INGEST_POINT = 0.49e-6
+PROJECT_POINT = 0.47e-6
+RECTIFY_PX = 0.3e-6  # both images
+PROJECT_PX = {"none": 0.4e-6, "surface": 8e-6, "surface_and_images": 12e-6}  # of covered ones
+EXPORT_PX = 0.9e-6
+TILE = 4.0  # a labelled tile of 1024 px: SIFT matches, warping
+SCENE = 60.0  # refinement
+JOB = 8.0  # start of a job, and what Snakemake does around it
+# Bytes on the disk.
+POINT_BYTES = 7.0
+PX_BYTES = 4.0 + 12.0 + 8.0  # rectified pair, disparity grid, tiles
+SPARE = 1.2
+MEMORY = 4.0e9  # of the largest job
+
+
+def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found: Findings) -> None:
+    """Say what a run from nothing takes, and refuse a disk that is too small for it."""
+    if not facts:
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    points, pixels = (sum(getattr(f, name) for f in facts) for name in ("points", "pixels"))
+    covered = sum(fact.pixels * fact.covered for fact in facts)
+    seconds = (
+        (INGEST_POINT + PROJECT_POINT) * points
+        + RECTIFY_PX * pixels
+        + PROJECT_PX[settings.project.fill] * covered
+        + EXPORT_PX * pixels
+        + TILE * covered / 2**20
+        + SCENE * len(facts)
+        + JOB * sum(5 + fact.lidar_files for fact in facts)
+    )
+    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
+    free = shutil.disk_usage(Path.cwd()).free
+    found.say(
+        "time",
+        Level.FACT,
+        f"about {duration(seconds / max(cores or 1, 1))} on the {cores} cores of this machine, "
+        "from nothing to tiles",
+    )
+    if needed > free:
+        found.say(
+            "disk",
+            Level.ERROR,
+            f"{_gb(needed)} are needed in {Path.cwd()}, {_gb(free)} are free",
+            "make space, or work in a folder on a larger disk",
+        )
+    else:
+        found.say("disk", Level.FACT, f"{_gb(needed)} of the {_gb(free)} that are free")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if memory < MEMORY:
+        found.say(
+            "memory",
+            Level.DOUBT,
+            f"{_gb(memory)} in all, jobs ask for up to {_gb(MEMORY)}",
+            "run with --cores 1",
+        )
+    else:
+        found.say("memory", Level.FACT, f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def _gb(count: float) -> str:
+    return f"{count / 1e9:.1f} GB"

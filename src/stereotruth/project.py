@@ -1,0 +1,133 @@
+"""What a folder is worked with: configuration over the package's defaults, its sheets and LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from . import sheets
+from .configuration import Configuration
+from .errors import InputError
+from .simulate.cities import CITIES as SYNTHETIC
+from .simulate.cities import lidar_files
+
+_PACKAGE = Path(__file__).parent
+# Snakefile, workflow/, config/, profiles/ and envs/: of the clone, or what setup.py put into the
+# wheel.
+FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
+SYNTHETIC_FOLDER = "data/synthetic"
+CONFIG = "config.yaml"  # of a user's own project
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of both; where both have one, ``above``'s, unless both are mappings themselves."""
+    found = dict(below)
+    for key, value in above.items():
+        under = found.get(key)
+        both = isinstance(under, Mapping) and isinstance(value, Mapping)
+        found[key] = merged(under, value) if both else value
+    return found
+
+
+def with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration over the package's ``config/config.yaml``."""
+    defaults = (FILES / "config" / "config.yaml").read_text(encoding="utf-8")
+    return merged(yaml.safe_load(defaults), config)
+
+
+def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration, str]:
+    """The configuration of this folder as a run reads it, and the names of the files it is from.
+
+    ``files`` stand in the place of the folder's ``config.yaml``. Raises InputError that names file
+    and key.
+    """
+    own = [Path(CONFIG)] if Path(CONFIG).is_file() else []
+    shared = Path("config") / CONFIG  # read by the Snakefile itself
+    read = [*([shared] if shared.is_file() else []), *(map(Path, files) if files else own)]
+    values: dict[str, Any] = {}
+    for file in read:
+        values = merged(values, _mapping(file))
+    names = ", ".join(map(str, read)) or "the defaults"
+    return Configuration.of(with_defaults(values), names), names
+
+
+def _mapping(file: Path) -> dict[str, Any]:
+    try:
+        found = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError("no such file", file=file, remedy="correct its path") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        problem = " ".join(str(error).split())
+        raise InputError(
+            f"cannot be read as YAML ({problem})", file=file, remedy="correct what it names"
+        ) from None
+    if found is not None and not isinstance(found, dict):
+        raise InputError(
+            "is no mapping of keys to values", file=file, remedy="write it as key: value"
+        )
+    return found or {}
+
+
+def is_synthetic(scene: sheets.Scene) -> bool:
+    """Whether the scene's input is made by the rules of simulate.smk."""
+    city = SYNTHETIC.get(scene.city)
+    made_here = f"{SYNTHETIC_FOLDER}/{scene.city}/{scene.scene}"
+    return city is not None and scene.left_image == f"{made_here}/left.tif"
+
+
+def here_or_shipped(path: str) -> str:
+    """A path of the defaults: in this folder, or else where the package has it."""
+    return path if Path(path).exists() or not (FILES / path).exists() else str(FILES / path)
+
+
+def sheet(settings: Configuration, name: str) -> str:
+    """Path of the sheet ``name`` (scenes, cities); the package's own serves where none is named."""
+    path = getattr(settings, name)
+    return here_or_shipped(path) if path == getattr(Configuration, name) else path
+
+
+def read_scenes(settings: Configuration) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene]]:
+    """Cities and scenes by name. Raises InputError that names the sheet and the row."""
+    cities = sheets.read_cities(sheet(settings, "cities"))
+    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities)
+    for name, scene in scenes.items():
+        if is_synthetic(scene):
+            scenes[name] = replace(scene, gcps=here_or_shipped(scene.gcps))
+    return cities, scenes
+
+
+def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
+    """The LiDAR files of a scene by the names of their stores, after its files were found.
+
+    Raises InputError: a file that is missing, or no control points and no refinement.
+    """
+    rows = sheet(settings, "scenes")
+    alignment = settings.alignment
+    if not scene.gcps and not (alignment.refine or scene.scene in alignment.fixed):
+        raise InputError(
+            f"scene {scene.scene!r} has no GCPs, and alignment.refine is false",
+            file=rows,
+            remedy="name its file of ground control points, or set alignment.refine to true",
+        )
+    if is_synthetic(scene):
+        sheets.require_files(scene, rows, ["gcps"])
+        made = lidar_files(SYNTHETIC[scene.city], scene.scene)
+        return sheets.store_names([Path(scene.lidar) / file for file in made])
+    sheets.require_files(scene, rows, ["left_image", "right_image", "gcps", "geoid"])
+    return sheets.store_names(sheets.find_lidar(scene, rows))
+
+
+def check_fixed(settings: Configuration, scenes: Mapping[str, sheets.Scene]) -> None:
+    """Raise InputError if alignment.fixed names a scene or a file that does not exist."""
+    for name, file in settings.alignment.fixed.items():
+        if name not in scenes or not Path(file).is_file():
+            raise InputError(
+                f"alignment.fixed: {name}: {file}: "
+                + ("no such file" if name in scenes else "no such scene"),
+                file=sheet(settings, "scenes"),
+                remedy="take a scene of the sheet, and the path of its alignment.json",
+            )

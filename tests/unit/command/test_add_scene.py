@@ -1,0 +1,115 @@
+"""Rows from deliveries."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+import rasterio
+
+from stereotruth.command.add_scene import add_scene
+from stereotruth.command.check import check_project
+from stereotruth.errors import InputError
+from stereotruth.sheets import read_cities, read_scenes
+
+from ...synthetic.broken_scenes import with_pixels, write_lidar
+from ...synthetic.rpc_texts import dimap_text, rpb_text
+from ...synthetic.surveyed_pair import RPCS, SIZES
+
+GF7 = "GF7_DLC_E115.4_N30.2_20200909_L1A0000137600"
+
+
+def plain(path, view, count=1):
+    """An image without RPC in it."""
+    path.parent.mkdir(exist_ok=True, parents=True)
+    cols, rows = SIZES[view]
+    shape = {"width": cols, "height": rows, "count": count, "dtype": "uint16"}
+    with rasterio.open(path, "w", driver="GTiff", **shape, sparse_ok=True, tiled=True):
+        pass
+    return with_pixels(path)
+
+
+def row():
+    with Path("scenes.tsv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream, delimiter="\t"))[-1]
+
+
+def gaofen(folder):
+    for view, word in (("right", "FWD"), ("left", "BWD")):
+        image = plain(folder / f"{GF7}-{word}-PAN.tiff", view)
+        image.with_suffix(".rpb").write_text(rpb_text(RPCS[view].to_dict()))
+    plain(folder / f"{GF7}-BWD-MUX.tiff", "left", 4)
+    (folder / f"{GF7}-BWD-PAN.jpg").touch()
+    return folder
+
+
+def pleiades(folder):
+    for k, view in enumerate(("right", "left")):
+        image = plain(folder / f"view{k}" / f"IMG_PHR1A_P_00{k}_R1C1.TIF", view)
+        image.with_name(f"DIM_PHR1A_P_00{k}.XML").write_text("<Dimap_Document/>")
+        text = dimap_text(RPCS[view].to_dict())
+        image.with_name(f"RPC_PHR1A_P_00{k}.XML").write_text(text)
+    return folder
+
+
+def worldview(folder, parts=1):
+    for k, view in enumerate(("right", "left")):
+        stem = f"16FEB12-P1BS-50064_0{k}_P001"
+        plain(folder / f"{stem}.TIF", view)
+        (folder / f"{stem}.RPB").write_text(rpb_text(RPCS[view].to_dict()))
+        tiles = "".join(
+            f'filename = "{stem}{"" if parts == 1 else n}.TIF";\n' for n in range(parts)
+        )
+        (folder / f"{stem}.TIL").write_text(tiles)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("make", "left", "right"),
+    [(gaofen, f"{GF7}-BWD-PAN.tiff", f"{GF7}-FWD-PAN.tiff"),
+     (pleiades, "view1/IMG_PHR1A_P_001_R1C1.TIF", "view0/IMG_PHR1A_P_000_R1C1.TIF"),
+     (worldview, "16FEB12-P1BS-50064_01_P001.TIF", "16FEB12-P1BS-50064_00_P001.TIF")],
+    ids=["GaoFen-7", "DIMAP", "WorldView"],
+)  # fmt: skip
+def test_views_of_a_delivery(folder, make, left, right):
+    delivery = folder / "delivery"
+    delivery.mkdir()
+    make(delivery)
+    lines = "\n".join(add_scene([delivery], lidar="lidar", gcps="gcps.csv", city="Qichun"))
+    assert row()["left_image"] == str(delivery / left)
+    assert row()["right_image"] == str(delivery / right)
+    assert row()["scene"] == "Qichun-1" and row()["gcps"] == "gcps.csv"
+    assert "left looks backward" in lines and "EPSG:32650" in lines
+    cities = read_cities("cities.tsv")
+    assert cities["Qichun"].prefix == "QI"
+    assert list(read_scenes("scenes.tsv", cities)) == ["Good-1", "Qichun-1"]
+    assert not any(findings.failed for findings in check_project(names=["Qichun"]))
+
+
+def test_images_that_are_named_keep_their_order(folder):
+    lines = add_scene([folder / "right.tif", folder / "left.tif"], lidar="lidar", city="Good")
+    assert row()["left_image"].endswith("right.tif")
+    assert any("left looks forward" in line for line in lines)
+    assert row()["scene"] == "Good-2"
+
+
+@pytest.mark.parametrize(
+    ("break_it", "options", "words"),
+    [(lambda f: worldview(f / "d", 4), {}, "an image in 4 files"),
+     (lambda f: shutil.copy(f / "left.tif", f / "d" / "one.tif"), {}, "1 images that may be"),
+     (lambda f: plain(f / "d" / "a.tif", "left") and plain(f / "d" / "b.tif", "left"), {},
+      "no RPC metadata"),
+     (lambda f: gaofen(f / "d") and write_lidar(f, system=None), {}, "set --lidar-crs"),
+     (lambda f: gaofen(f / "d"), {"lidar": "none"}, "no LiDAR file"),
+     (lambda f: gaofen(f / "d"), {"gcps": "none.csv"}, "none.csv"),
+     (lambda f: gaofen(f / "d"), {"name": "Good-1"}, "is there already")],
+)  # fmt: skip
+def test_nothing_is_written_of_what_cannot_be_used(folder, break_it, options, words):
+    before = (folder / "scenes.tsv").read_text(), (folder / "cities.tsv").read_text()
+    (folder / "d").mkdir()
+    break_it(folder)
+    with pytest.raises(InputError, match=words):
+        add_scene([folder / "d"], **({"lidar": "lidar", "city": "New"} | options))
+    assert ((folder / "scenes.tsv").read_text(), (folder / "cities.tsv").read_text()) == before

@@ -1,0 +1,24 @@
+"""The pages of a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stereotruth.command.pages import pages
+from stereotruth.errors import InputError
+
+
+def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="stereotruth run report"):
+        pages()
+    there = [Path("audit/us3d/index.html"), Path("results/report/A/index.html")]
+    for page in there:
+        page.parent.mkdir(parents=True)
+        page.touch()
+    assert pages() == there
+    assert pages(["A"]) == there[1:]
+    with pytest.raises(InputError, match="no page of B"):
+        pages(["B"])

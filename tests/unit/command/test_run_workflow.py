@@ -1,0 +1,74 @@
+"""Arguments of Snakemake, and the status line."""
+
+from __future__ import annotations
+
+import pytest
+
+from stereotruth.command.run_workflow import TRUSTED, Progress, arguments_for, duration
+from stereotruth.project import FILES
+
+SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
+
+
+@pytest.mark.parametrize(
+    ("given", "passed"),
+    [
+        (["tiles/A"], ["tiles/A", "--configfile", "config.yaml", "--cores", "all"]),
+        (["tiles/A", "-c2"], ["tiles/A", "-c2", "--configfile", "config.yaml"]),
+        (["--jobs=3"], ["--jobs=3", "--configfile", "config.yaml"]),
+        (["--configfile", "b.yaml"], ["--configfile", "b.yaml", "--cores", "all"]),
+        (["--configfile=b.yaml"], ["--configfile=b.yaml", "--cores", "all"]),
+        (["a", "--", "-k"], ["a", "-k", "--configfile", "config.yaml", "--cores", "all"]),
+        (["--profile", "p"], ["--profile", "p", "--configfile", "config.yaml"]),
+        (["--config", "seed=1"],
+         ["--config", "seed=1", "--configfile", "config.yaml", "--cores", "all"]),
+    ],
+)  # fmt: skip
+def test_options_are_passed_on(tmp_path, monkeypatch, given, passed):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").touch()
+    assert arguments_for(given) == [*SNAKEFILE, *passed]
+
+
+def test_without_a_configuration_the_defaults_hold(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert arguments_for(["tiles/Qichun", "-j1"]) == [*SNAKEFILE, "tiles/Qichun", "-j1"]
+
+
+RUN = """\
+Job stats:
+job        count
+-------  -------
+align          1
+project        3
+total          4
+
+Select jobs to execute...
+Finished jobid: 3 (Rule: align)
+1 of 4 steps (25%) done
+Finished jobid: 2 (Rule: project)
+2 of 4 steps (50%) done
+"""
+
+
+def test_time_left_follows_from_the_jobs_that_are_done():
+    progress = Progress(begun=100.0)
+    assert progress.line(100.0) == "planning"
+    planned = 3 + 3 * 15  # SECONDS of align and project
+    lines = RUN.splitlines()
+    for line in lines[:7]:
+        progress.read(line)
+    assert progress.line(100.0) == f"0 of 4 jobs done, about {planned} s left"
+    for line in lines[7:]:
+        progress.read(line)
+    done = 3 + 15
+    left = (planned - done) * (36 + TRUSTED) / (done + TRUSTED)
+    assert progress.seconds_left(136.0) == pytest.approx(left)
+    assert progress.line(136.0) == f"2 of 4 jobs done, about {left:.0f} s left"
+    progress.read("4 of 4 steps (100%) done")
+    assert progress.line() == "4 of 4 jobs done"
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(5, "5 s"), (600, "10 min"), (7200, "2.0 h")])
+def test_durations(seconds, words):
+    assert duration(seconds) == words

@@ -1,0 +1,37 @@
+"""Causes in the reasons that Snakemake gives."""
+
+from __future__ import annotations
+
+from stereotruth.command.status import CityStatus, PlannedJob
+
+PARAMS = (
+    "Params have changed since last execution: Union of exclusive params before and now across all "
+    "output: before: 'affine' now: 'shift'"
+)
+FOLLOWS = "Input files updated by another job: results/align/A/A-1/alignment.json"
+JOBS = (
+    PlannedJob("align", "A", "A-1", PARAMS),
+    PlannedJob("align", "A", "A-2", PARAMS),
+    PlannedJob("align", "A", "A-3", PARAMS),
+    PlannedJob("refine", "A", "A-1", f"{FOLLOWS}; Code has changed since last execution"),
+    PlannedJob("project", "A", "A-1", FOLLOWS),
+)
+
+
+def test_causes_are_said_once_and_what_follows_from_them_not_at_all():
+    status = CityStatus("A", "4 tiles (4 train)", (), JOBS)
+    assert status.state == "out of date"
+    assert status.why() == [
+        "align 3, refine 1, project 1",
+        "align A-1, align A-2 and 1 more: settings before: 'affine' now: 'shift'",
+        "refine A-1: code has changed since last execution",
+    ]
+
+
+def test_what_was_never_made_needs_no_cause():
+    job = PlannedJob("align", "A", "A-1", "Missing output files: results/align/A/A-1/a.json")
+    assert CityStatus("A", "", (), (job,)).state == "not made"
+    assert CityStatus("A", "", (), (job,)).why() == ["align 1"]
+    assert CityStatus("A", "4 tiles", (), (job,)).why()[1].startswith("align A-1: Missing")
+    assert CityStatus("A", "4 tiles", (), ()).state == "up to date"
+    assert CityStatus("A", "4 tiles", (), ()).why() == []

@@ -1,0 +1,53 @@
+"""What a folder is worked with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stereotruth.configuration import Configuration
+from stereotruth.errors import InputError
+from stereotruth.project import FILES, configured, merged, read_scenes, with_defaults
+
+
+def test_a_mapping_is_laid_over_another():
+    below = {"a": {"b": 1, "c": {"d": 2}}, "e": [1], "f": {"g": 1}}
+    above = {"a": {"c": {"d": 3}, "h": 4}, "e": [2], "f": None}
+    assert merged(below, above) == {"a": {"b": 1, "c": {"d": 3}, "h": 4}, "e": [2], "f": None}
+    assert below["a"]["c"]["d"] == 2
+
+
+def test_the_defaults_are_those_of_the_classes():
+    assert Configuration.of(with_defaults({})) == Configuration()
+
+
+def test_files_of_the_folder_lie_over_the_defaults(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert configured()[1] == "the defaults"
+    Path("config").mkdir()
+    Path("config/config.yaml").write_text("seed: 1\nstrict: true\n")
+    Path("config.yaml").write_text("seed: 2\ntiles: {size: 512}\n")
+    settings, files = configured()
+    assert (settings.seed, settings.strict, settings.tiles.size) == (2, True, 512)
+    assert files == "config/config.yaml, config.yaml"
+    Path("other.yaml").write_text("seed: 3\n")
+    settings, _ = configured(["other.yaml"])
+    assert (settings.seed, settings.strict, settings.tiles.size) == (3, True, 1024)
+
+
+@pytest.mark.parametrize("text", ["a: [", "- a\n- b\n", "seed: x\n"])
+def test_a_wrong_file_is_named(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"config\.yaml"):
+        configured()
+
+
+def test_synthetic_cities_are_known_in_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cities, scenes = read_scenes(Configuration())
+    assert "Qichun" in cities
+    assert scenes["Qichun-1"].gcps == str(FILES / "config/gcps/Qichun-1.csv")
+    with pytest.raises(InputError, match=r"mine\.tsv"):
+        read_scenes(Configuration(cities="mine.tsv"))
