@@ -7,7 +7,8 @@ it at the same time, and of each city the job is disturbed by a KIND at a random
 run ends well or loses Snakemake alone, or all its processes (KILLS). Then runs follow until
 Snakemake has nothing to do, stopped jobs go on, and runs follow again. A round has left something
 stale if the product is not that of the input that is there, byte by byte, as an undisturbed run
-makes it. A line per round goes to rounds.jsonl in the folder, and at the end the table of them.
+makes it. A line per round goes to rounds.jsonl in the folder, and at the end the table of all that
+stand there.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import ast
 import hashlib
 import importlib
 import json
-import logging
 import os
 import random
 import re
@@ -122,6 +122,14 @@ def _content(file: Path, city: str) -> str:
 FORK_JOBS = False  # jobs are processes forked from Snakemake's, which spares them the imports, too
 
 
+OLD_STREAMS = []  # kept, since the end of one would close the file
+
+
+def _renew_streams() -> None:
+    OLD_STREAMS.extend((sys.stdout, sys.stderr))
+    sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
+
+
 def _fork_jobs() -> None:
     """Have this Snakemake fork its scripts; what they import is imported by then."""
     import snakemake.script
@@ -132,13 +140,13 @@ def _fork_jobs() -> None:
         if not pid:
             status = 1
             os.closerange(3, 4096)  # as another program would: the run's lock stays with the run
+            _renew_streams()  # another thread may have held their locks at the fork
             try:
                 runpy.run_path(fname, run_name="__main__")
                 status = 0
             except SystemExit as end:
                 status = int(bool(end.code))
             finally:
-                logging.shutdown()
                 os._exit(status)
         status = os.waitpid(pid, 0)[1]
         self.bench_record.running_time = time.monotonic() - begin
@@ -172,7 +180,7 @@ class Run:
             out = os.open(folder / "run.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(out, stream)
-            sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
+            _renew_streams()
             os.chdir(folder)
             sys.argv = ["snakemake", *arguments]
             if FORK_JOBS:
@@ -437,7 +445,8 @@ def main() -> None:
         with (given.folder / "rounds.jsonl").open("a") as stream:
             stream.write(json.dumps(one) + "\n")
         print(json.dumps(one), flush=True)
-    print(table(found))
+    rounds = [json.loads(line) for line in (given.folder / "rounds.jsonl").open()]
+    print(table(rounds))  # of earlier calls, too
     sys.exit(any(one["stale"] for one in found))
 
 
