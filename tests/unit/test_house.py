@@ -25,7 +25,7 @@ ORDER = (
     {"alignment", "dataset"},
     {"disparity", "report"},
     {"evaluation", "matching"},
-    {"configuration"},
+    {"configuration", "last_lines"},
 )
 FLOOR = {package: floor for floor, packages in enumerate(ORDER) for package in packages}
 

@@ -96,17 +96,17 @@ class Cities:
                 path.unlink(missing_ok=True)
 
     def hashes(self, city: str) -> dict[str, str]:
-        """Content of the city's products by name, the city's own name taken out."""
+        """Content of the city's products by name."""
         found = {}
         for path in self.products(city):
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
                 if file.is_file() and file.name != ".snakemake_timestamp":
-                    name = str(file.relative_to(self.folder)).replace(city, "{c}")
-                    found[name] = _content(file, city)
+                    name = str(file.relative_to(self.folder))
+                    found[name] = _content(file)
         return found
 
 
-def _content(file: Path, city: str) -> str:
+def _content(file: Path) -> str:
     if file.suffix == ".pt":
         import torch
 
@@ -114,8 +114,6 @@ def _content(file: Path, city: str) -> str:
         data = b"".join(t.numpy().tobytes() for t in weights.values())
     else:
         data = file.read_bytes()
-        if file.suffix in (".json", ".csv", ".html", ".txt"):
-            data = data.replace(city.encode(), b"{c}")
     return hashlib.sha256(data).hexdigest()
 
 
@@ -236,12 +234,11 @@ class Harness:
     def said(self) -> str:
         return (self.folder / "run.log").read_text()
 
-    def prepare(self, stage: Stage) -> tuple[Cities, dict[str, dict[str, str]]]:
-        """All cities with version A; what the stage makes of A and B, where names say nothing."""
+    def prepare(self, stage: Stage) -> tuple[Cities, dict[str, dict[str, dict[str, str]]]]:
+        """All cities with version A; what the stage makes of A and B, by city, where it is sure."""
         cities = Cities(self.folder, stage, self.names)
         targets = [str(cities.products(c)[0].relative_to(self.folder)) for c in self.names]
         self.settle(*targets, rest=False)
-        first = self.names[0]
         for city in self.names:
             cities.keep(city, "A")
         if stage.other is None:
@@ -252,22 +249,25 @@ class Harness:
                 place.mkdir(parents=True, exist_ok=True)
                 (place / "input").write_bytes(stage.other(cities.input(city).read_bytes()))
         self.settle(*targets, rest=False)
-        found = {"A": cities.hashes(first)}
-        others = [cities.hashes(city) for city in self.names[1:]]
-        cities.put(first, "B", "replace")
-        cities.remove_products(first)
+        found = [{city: cities.hashes(city) for city in self.names}]
         begin = time.monotonic()
-        self.settle(targets[0], rest=False)
-        self.seconds = (time.monotonic() - begin) / 2
-        found["B"] = cities.hashes(first)
-        cities.put(first, "A", "replace")
-        cities.remove_products(first)
-        self.settle(targets[0], rest=False)
-        others.append(cities.hashes(first))
-        same = {n for n, h in found["A"].items() if all(other.get(n) == h for other in others)}
-        found = {v: {n: h for n, h in of.items() if n in same} for v, of in found.items()}
-        assert found["A"] != found["B"], f"{stage.rule}: both versions give the same"
-        return cities, found
+        for version in "BA":
+            for city in self.names:
+                cities.put(city, version, "replace")
+                cities.remove_products(city)
+            self.settle(*targets, rest=False)
+            found.append({city: cities.hashes(city) for city in self.names})
+        self.seconds = (time.monotonic() - begin) / 4
+        made = {}
+        for city, first, other, again in ((c, *(of[c] for of in found)) for c in self.names):
+            sure = {name for name, of in first.items() if again.get(name) == of}
+            made[city] = {
+                version: {name: of for name, of in hashes.items() if name in sure}
+                for version, hashes in (("A", first), ("B", other))
+            }
+            same = made[city]["A"] == made[city]["B"]
+            assert not same, f"{stage.rule}: both versions give the same"
+        return cities, made
 
     def _other_folder(self, cities: Cities, of: Stage) -> None:
         """The product of stage ``of`` of the first city, made of its other input, for all."""
@@ -380,7 +380,7 @@ class Harness:
         runs += self.settle(*targets)
         for city in self.names:
             found = cities.hashes(city)
-            wanted = made[cities.version[city]]
+            wanted = made[city][cities.version[city]]
             stale = sorted(n for n, h in wanted.items() if found.get(n) != h)
             yield plan[city] | {"kill": victim, "runs": runs, "stale": stale}
 

@@ -8,10 +8,11 @@ from snakemake.exceptions import WorkflowError
 from stereotruth import sheets
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
-from stereotruth.products.provenance import PACKAGE, file_sha256, source_digest
+from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.products.publication import made_of
 from stereotruth.simulate.cities import CITIES as SYNTHETIC, lidar_files as synthetic_lidar
 
+RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = Path(workflow.basedir) / "envs" / "workflow.yaml"
 SYNTHETIC_FOLDER = "data/synthetic"
 VIEWS = ("left", "right")
@@ -101,3 +102,8 @@ def scenes_of(city):
 def making_of(rule, wildcards):
     """What the making of a job's products is called; other than it was if they are stale."""
     return made_of(rule.output[0].format(**wildcards))
+
+
+def content_of(script):
+    """Digest of a rule's script: the time of its file counts for nothing (profiles/default)."""
+    return script_digest(RULES / script)
