@@ -107,3 +107,12 @@ def test_deleted_results_are_made_again(cloned, tmp_path):
     jobs = plan(other)
     assert jobs["align"] == jobs["export"] == 1 and jobs["ingest"] == 2
     assert not (other.folder / "results").exists()  # a plan makes nothing
+
+
+def test_tiles_without_results_are_still_known(made, tmp_path):
+    """Whoever deletes the results for their size keeps tiles that follow the configuration."""
+    other = made.copy(tmp_path / "other")
+    shutil.rmtree(other.folder / "results")
+    assert plan(other) == {}
+    other.edit("tiny.yaml", "size: 128", "size: 96")
+    assert {"ingest", "align", "project", "export"} <= set(plan(other))

@@ -5,7 +5,7 @@ import sys
 
 from stereotruth.products.locks import FileLock
 from stereotruth.products.records import all_records
-from stereotruth.products.reruns import keep_metadata, settle_times
+from stereotruth.products.reruns import keep_metadata, save_metadata, settle_times
 from stereotruth.products.runs import Run, begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
@@ -73,8 +73,10 @@ def say(text):
 
 
 onsuccess:
+    save_metadata()
     say(made())
 
 
 onerror:
+    save_metadata()
     say(complaints(log))

@@ -17,8 +17,11 @@ from pathlib import Path
 
 from .inputs import NOT_CONTENT
 from .records import RECORDS, all_records, changed_inputs
+from .runs import KEPT
 
-METADATA = Path(".snakemake", "metadata")  # where Snakemake looks for its own
+METADATA = Path(".snakemake", "metadata")  # where Snakemake looks for its own records
+PLACE = RECORDS / "snakemake"  # where they lie
+SAVED = KEPT / "metadata"
 
 
 def _dated(path: str) -> Path:
@@ -72,27 +75,42 @@ def _date(file: Path, time_ns: int) -> None:
 def keep_metadata(*, begin: bool) -> None:
     """Have Snakemake keep its own records in ``results``; ``begin``: also if it has none yet.
 
-    Where the file system knows no links, they stay where they are.
+    If the results were deleted, what was saved of the records goes back to where Snakemake looks:
+    other products are still there. Where the file system knows no links, all stays there.
     """
-    place = RECORDS / "snakemake"
-    if not begin and not place.is_dir():
-        if METADATA.is_symlink():  # the results were deleted
+    if begin:
+        PLACE.mkdir(parents=True, exist_ok=True)
+    if not PLACE.is_dir():
+        if METADATA.is_symlink():
             METADATA.unlink()
+            if SAVED.is_dir():
+                shutil.copytree(SAVED, METADATA)
         return
-    place.mkdir(parents=True, exist_ok=True)
     if METADATA.is_symlink():
         return
     METADATA.with_name("incomplete").mkdir(parents=True, exist_ok=True)  # else they are "migrated"
     link = METADATA.with_name("metadata.link")
     try:
         link.unlink(missing_ok=True)
-        link.symlink_to(os.path.relpath(place, METADATA.parent))
+        link.symlink_to(os.path.relpath(PLACE, METADATA.parent))
     except OSError:
         return
-    for file in METADATA.rglob("*"):
-        target = place / file.relative_to(METADATA)
-        if file.is_file() and not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(file, target)
+    _copy_missing(METADATA, PLACE)
     shutil.rmtree(METADATA, ignore_errors=True)
     link.rename(METADATA)
+
+
+def save_metadata() -> None:
+    """Keep a copy of Snakemake's records, for when the results are deleted."""
+    if METADATA.is_symlink() and PLACE.is_dir():
+        shutil.rmtree(SAVED, ignore_errors=True)
+        with suppress(OSError):  # a full disk
+            shutil.copytree(PLACE, SAVED)
+
+
+def _copy_missing(source: Path, target: Path) -> None:
+    for file in source.rglob("*"):
+        other = target / file.relative_to(source)
+        if file.is_file() and not other.exists():
+            other.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(file, other)
