@@ -34,6 +34,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stereotruth.products.inputs import NOT_CONTENT
+
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
 from ..synthetic.project import ROOT, Project
 from .killing import family, kill
@@ -75,6 +77,7 @@ class Cities:
         scratch = target.with_name(f".{target.name}.new")
         if source.is_dir():
             shutil.copytree(source, scratch)
+            (scratch / NOT_CONTENT).touch()  # as new as a product that a job has just made
             if target.exists():
                 target.rename(target.with_name(f".{target.name}.away"))
             scratch.rename(target)
@@ -100,7 +103,7 @@ class Cities:
         found = {}
         for path in self.products(city):
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-                if file.is_file() and file.name != ".snakemake_timestamp":
+                if file.is_file() and file.name != NOT_CONTENT:
                     name = str(file.relative_to(self.folder))
                     found[name] = _content(file)
         return found
