@@ -55,6 +55,6 @@ lock:
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset logs benchmark audit bench/out
+	rm -rf data results tiles dataset logs benchmark audit report.html bench/out .snakemake
 
 FORCE:
