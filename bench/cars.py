@@ -316,7 +316,7 @@ def main() -> None:
         grid["disparity"][:], city, model.epipolar_to_left, model.right_to_epipolar, terrain
     )
     out = folder / "cars/out"
-    times = (made.parent / "benchmarks/project").rglob("*.tsv")
+    times = (made.parent / "logs/project").rglob("*.tsv")
     rows["this project"]["projecting one view, s"] = float(
         next(times).read_text().splitlines()[1].split("\t")[0]
     )

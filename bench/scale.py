@@ -254,11 +254,11 @@ def run_workflow(folder: Path, cores: int) -> tuple[list[tuple], float]:
 
 
 def stages(work: Path) -> dict[str, dict[str, float]]:
-    """Seconds and largest resident memory (MiB) of each stage's jobs, from their benchmarks."""
+    """Seconds and largest resident memory (MiB) of each stage's jobs, from their logs."""
     found = {}
     for stage in STAGES:
         rows = []
-        for folder in (work / "benchmarks").glob(f"{stage}*"):
+        for folder in (work / "logs").glob(f"{stage}*"):
             for file in folder.rglob("*.tsv"):
                 with file.open() as stream:
                     rows += list(csv.DictReader(stream, delimiter="\t"))

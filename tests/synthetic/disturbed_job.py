@@ -22,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from stereotruth.errors import InputError
-from stereotruth.products import publication as module
+from stereotruth.products import records
 from stereotruth.products.files import replacing, whole_folder
 from stereotruth.products.publication import made_of, publication
 from stereotruth.products.runs import begin_run, end_older_jobs
@@ -68,7 +68,7 @@ def _ended(pid: int) -> bool:
 
 
 def _plan() -> str:
-    for function in (made_of, module._checksum, module._checksums):
+    for function in (made_of, records._checksum, records._checksums):
         function.cache_clear()
     return made_of(str(FILE))
 

@@ -171,7 +171,7 @@ STAGES = {
     "audit": Stage(
         "audit",
         "logs/audit/{c}.log",
-        "{c}/pairs/val/left/QC_left_3.tiff",
+        "{c}/pairs/val/disp/QC_disparity_3.tiff",
         ("audit/{c}",),
         _edit_image,
     ),

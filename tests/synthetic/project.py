@@ -50,7 +50,7 @@ TINY = CitySpec(
         SceneSpec("Tiny-1", (0.0, 0.0), 560, 560, 5, lidar_grid=(2, 1), ragged_m=(20.0, 20.0)),
     ),
 )
-MADE = ("results", "tiles", "dataset", "logs", "benchmarks", ".snakemake")  # of a run
+MADE = ("results", "tiles", "dataset", "logs", ".snakemake")  # of a run
 SIZE = {"tiles": {"size": 128, "min_labelled": 0.5}}
 
 

@@ -25,7 +25,7 @@ ORDER = (
     {"alignment", "dataset"},
     {"disparity", "report"},
     {"evaluation", "matching"},
-    {"configuration"},
+    {"configuration", "last_lines"},
     {"project"},
     {"command"},  # asks all stages what they think of the input, and nothing asks it
 )

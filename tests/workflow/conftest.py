@@ -86,4 +86,14 @@ def later(tiled, tmp_path_factory) -> Project:
     )
     assert run.status == 0, run.text[-4000:]
     assert "Traceback" not in run.text
+    last = run.text[run.text.rindex("(100%) done") :]
+    for words in (
+        "Look at results/report/Tiny/index.html",
+        "SGM on synthetic: EPE 0.",
+        "look at benchmark/synthetic/sgm/cities.csv",
+        "Audit of synthetic: ",
+        "Look at results/predict/Tiny/Tiny-1/sgm_dsm.tif",
+    ):
+        assert words in last
+    assert "manifest.csv" not in last  # an earlier run has made the tiles
     return project

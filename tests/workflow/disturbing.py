@@ -7,7 +7,8 @@ it at the same time, and of each city the job is disturbed by a KIND at a random
 run ends well or loses Snakemake alone, or all its processes (KILLS). Then runs follow until
 Snakemake has nothing to do, stopped jobs go on, and runs follow again. A round has left something
 stale if the product is not that of the input that is there, byte by byte, as an undisturbed run
-makes it. A line per round goes to rounds.jsonl in the folder, and at the end the table of them.
+makes it. A line per round goes to rounds.jsonl in the folder, and at the end the table of all that
+stand there.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import ast
 import hashlib
 import importlib
 import json
-import logging
 import os
 import random
 import re
@@ -33,6 +33,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from stereotruth.products.inputs import NOT_CONTENT
 
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
 from ..synthetic.project import ROOT, Project
@@ -75,6 +77,7 @@ class Cities:
         scratch = target.with_name(f".{target.name}.new")
         if source.is_dir():
             shutil.copytree(source, scratch)
+            (scratch / NOT_CONTENT).touch()  # as new as a product that a job has just made
             if target.exists():
                 target.rename(target.with_name(f".{target.name}.away"))
             scratch.rename(target)
@@ -96,17 +99,17 @@ class Cities:
                 path.unlink(missing_ok=True)
 
     def hashes(self, city: str) -> dict[str, str]:
-        """Content of the city's products by name, the city's own name taken out."""
+        """Content of the city's products by name."""
         found = {}
         for path in self.products(city):
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-                if file.is_file() and file.name != ".snakemake_timestamp":
-                    name = str(file.relative_to(self.folder)).replace(city, "{c}")
-                    found[name] = _content(file, city)
+                if file.is_file() and file.name != NOT_CONTENT:
+                    name = str(file.relative_to(self.folder))
+                    found[name] = _content(file)
         return found
 
 
-def _content(file: Path, city: str) -> str:
+def _content(file: Path) -> str:
     if file.suffix == ".pt":
         import torch
 
@@ -114,12 +117,18 @@ def _content(file: Path, city: str) -> str:
         data = b"".join(t.numpy().tobytes() for t in weights.values())
     else:
         data = file.read_bytes()
-        if file.suffix in (".json", ".csv", ".html", ".txt"):
-            data = data.replace(city.encode(), b"{c}")
     return hashlib.sha256(data).hexdigest()
 
 
 FORK_JOBS = False  # jobs are processes forked from Snakemake's, which spares them the imports, too
+
+
+OLD_STREAMS = []  # kept, since the end of one would close the file
+
+
+def _renew_streams() -> None:
+    OLD_STREAMS.extend((sys.stdout, sys.stderr))
+    sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
 
 
 def _fork_jobs() -> None:
@@ -132,13 +141,13 @@ def _fork_jobs() -> None:
         if not pid:
             status = 1
             os.closerange(3, 4096)  # as another program would: the run's lock stays with the run
+            _renew_streams()  # another thread may have held their locks at the fork
             try:
                 runpy.run_path(fname, run_name="__main__")
                 status = 0
             except SystemExit as end:
                 status = int(bool(end.code))
             finally:
-                logging.shutdown()
                 os._exit(status)
         status = os.waitpid(pid, 0)[1]
         self.bench_record.running_time = time.monotonic() - begin
@@ -172,7 +181,7 @@ class Run:
             out = os.open(folder / "run.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(out, stream)
-            sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
+            _renew_streams()
             os.chdir(folder)
             sys.argv = ["snakemake", *arguments]
             if FORK_JOBS:
@@ -228,12 +237,11 @@ class Harness:
     def said(self) -> str:
         return (self.folder / "run.log").read_text()
 
-    def prepare(self, stage: Stage) -> tuple[Cities, dict[str, dict[str, str]]]:
-        """All cities with version A; what the stage makes of A and B, where names say nothing."""
+    def prepare(self, stage: Stage) -> tuple[Cities, dict[str, dict[str, dict[str, str]]]]:
+        """All cities with version A; what the stage makes of A and B, by city, where it is sure."""
         cities = Cities(self.folder, stage, self.names)
         targets = [str(cities.products(c)[0].relative_to(self.folder)) for c in self.names]
         self.settle(*targets, rest=False)
-        first = self.names[0]
         for city in self.names:
             cities.keep(city, "A")
         if stage.other is None:
@@ -244,22 +252,25 @@ class Harness:
                 place.mkdir(parents=True, exist_ok=True)
                 (place / "input").write_bytes(stage.other(cities.input(city).read_bytes()))
         self.settle(*targets, rest=False)
-        found = {"A": cities.hashes(first)}
-        others = [cities.hashes(city) for city in self.names[1:]]
-        cities.put(first, "B", "replace")
-        cities.remove_products(first)
+        found = [{city: cities.hashes(city) for city in self.names}]
         begin = time.monotonic()
-        self.settle(targets[0], rest=False)
-        self.seconds = (time.monotonic() - begin) / 2
-        found["B"] = cities.hashes(first)
-        cities.put(first, "A", "replace")
-        cities.remove_products(first)
-        self.settle(targets[0], rest=False)
-        others.append(cities.hashes(first))
-        same = {n for n, h in found["A"].items() if all(other.get(n) == h for other in others)}
-        found = {v: {n: h for n, h in of.items() if n in same} for v, of in found.items()}
-        assert found["A"] != found["B"], f"{stage.rule}: both versions give the same"
-        return cities, found
+        for version in "BA":
+            for city in self.names:
+                cities.put(city, version, "replace")
+                cities.remove_products(city)
+            self.settle(*targets, rest=False)
+            found.append({city: cities.hashes(city) for city in self.names})
+        self.seconds = (time.monotonic() - begin) / 4
+        made = {}
+        for city, first, other, again in ((c, *(of[c] for of in found)) for c in self.names):
+            sure = {name for name, of in first.items() if again.get(name) == of}
+            made[city] = {
+                version: {name: of for name, of in hashes.items() if name in sure}
+                for version, hashes in (("A", first), ("B", other))
+            }
+            same = made[city]["A"] == made[city]["B"]
+            assert not same, f"{stage.rule}: both versions give the same"
+        return cities, made
 
     def _other_folder(self, cities: Cities, of: Stage) -> None:
         """The product of stage ``of`` of the first city, made of its other input, for all."""
@@ -372,7 +383,7 @@ class Harness:
         runs += self.settle(*targets)
         for city in self.names:
             found = cities.hashes(city)
-            wanted = made[cities.version[city]]
+            wanted = made[city][cities.version[city]]
             stale = sorted(n for n, h in wanted.items() if found.get(n) != h)
             yield plan[city] | {"kill": victim, "runs": runs, "stale": stale}
 
@@ -437,7 +448,8 @@ def main() -> None:
         with (given.folder / "rounds.jsonl").open("a") as stream:
             stream.write(json.dumps(one) + "\n")
         print(json.dumps(one), flush=True)
-    print(table(found))
+    rounds = [json.loads(line) for line in (given.folder / "rounds.jsonl").open()]
+    print(table(rounds))  # of earlier calls, too
     sys.exit(any(one["stale"] for one in found))
 
 

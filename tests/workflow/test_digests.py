@@ -5,10 +5,12 @@ from __future__ import annotations
 import ast
 
 import pytest
+import yaml
 
 from stereotruth.matching import kinds
 from stereotruth.products.provenance import source_modules
 
+from ..synthetic.project import ROOT
 from ..synthetic.rules import FOLDER, read_rules
 
 RULES = read_rules()
@@ -123,3 +125,12 @@ def test_every_product_is_held_against_the_record_of_its_inputs(name):
     """The parameter that changes if an input is not what the product was made of."""
     params = WITH_SCRIPT[name].directives["params"]
     assert f"made=lambda w: making_of(rules.{name}, w)," in params
+
+
+@pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
+def test_every_script_counts_by_its_content(name):
+    """Snakemake would compare the time of its file; profiles/default has it leave that."""
+    rule = WITH_SCRIPT[name]
+    assert f'script=content_of("../scripts/{rule.script}.py"),' in rule.directives["params"]
+    profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())
+    assert profile["rerun-triggers"] == ["mtime", "params", "input", "software-env"]

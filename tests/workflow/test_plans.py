@@ -23,7 +23,7 @@ def test_a_city_is_planned_from_nothing(project):
 def test_all_cities_and_the_dataset_are_planned(project):
     assert project.plan()["export"] == 6
     assert project.plan("dataset")["dataset"] == 1
-    assert project.plan("report")["report_city"] == 6
+    assert project.plan("report", "--configfile", "config/config.yaml")["report_city"] == 6
 
 
 def test_exact_truth_is_planned_by_scene_and_by_city(project):
@@ -76,6 +76,21 @@ def test_a_forgotten_configuration_is_thought_of(project):
     for word in ("no city 'Mime'", "(configuration: config/config.yaml, mine.yaml)", "one of Mine"):
         assert word in run.text
     assert "FILE" not in run.text  # it was not forgotten
+
+
+def test_a_report_plans_no_city_that_nobody_asked_for(project):
+    run = project.snakemake("--dry-run", "report")
+    assert run.status != 0
+    for word in ("no city of it has tiles", "add --configfile FILE if it was forgotten"):
+        assert word in run.text
+    (project.folder / "tiles/Qichun").mkdir(parents=True)
+    assert project.plan("report")["report_city"] == 1
+    row = {"scene": "Mine-1", "city": "Mine"}
+    for name in ("left_image", "right_image", "lidar", "gcps"):
+        (project.folder / f"{name}.laz").touch()
+        row[name] = f"{name}.laz"
+    mine = project.add_scene("mine", [row])
+    assert project.plan("report", "--configfile", mine)["report_city"] == 1
 
 
 @pytest.mark.parametrize("column", ["left_image", "right_image", "lidar", "geoid", "gcps"])

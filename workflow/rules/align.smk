@@ -20,7 +20,7 @@ rule align:
     log:
         "logs/align/{city}/{scene}.log",
     benchmark:
-        "benchmarks/align/{city}/{scene}.tsv"
+        "logs/align/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 1
@@ -29,6 +29,7 @@ rule align:
         runtime=10,
     params:
         made=lambda w: making_of(rules.align, w),
+        script=content_of("../scripts/align.py"),
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
         code=source_digest("alignment.align", "alignment.align_report"),

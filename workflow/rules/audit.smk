@@ -6,7 +6,7 @@ rule audit:
     log:
         "logs/audit/{dataset}.log",
     benchmark:
-        "benchmarks/audit/{dataset}.tsv"
+        "logs/audit/{dataset}.tsv"
     wildcard_constraints:
         dataset="[^/]+",
     conda:
@@ -17,6 +17,7 @@ rule audit:
         runtime=240,
     params:
         made=lambda w: making_of(rules.audit, w),
+        script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=asdict(SETTINGS.audit),
         measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),

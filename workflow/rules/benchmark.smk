@@ -7,7 +7,7 @@ rule match:
     log:
         "logs/match/{dataset}/{method}.log",
     benchmark:
-        "benchmarks/match/{dataset}/{method}.tsv"
+        "logs/match/{dataset}/{method}.tsv"
     wildcard_constraints:
         dataset="[^/]+",
         method="[^/]+",
@@ -19,6 +19,7 @@ rule match:
         runtime=480,
     params:
         made=lambda w: making_of(rules.match, w),
+        script=content_of("../scripts/match.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
         split=SETTINGS.benchmark.split,
@@ -39,10 +40,10 @@ rule score:
     log:
         "logs/score/{dataset}/{method}.log",
     benchmark:
-        "benchmarks/score/{dataset}/{method}.tsv"
+        "logs/score/{dataset}/{method}.tsv"
     wildcard_constraints:
         dataset="[^/]+",
-        method="[^/]+",
+        method="[^/.]+",  # not a table of all methods
     conda:
         CONDA
     threads: 1
@@ -51,6 +52,7 @@ rule score:
         runtime=120,
     params:
         made=lambda w: making_of(rules.score, w),
+        script=content_of("../scripts/score.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         label=lambda w: method_label(w.method),
@@ -73,18 +75,18 @@ rule benchmark_tables:
         predictions=lambda w: expand(rules.match.output[0], **w, method=methods_of(w.dataset)),
     output:
         tables=expand(
-            "results/benchmark/{{dataset}}/{table}.{kind}",
+            "benchmark/{{dataset}}/{table}.{kind}",
             table=("table5", "table6", "table7", "strata", "differences"),
             kind=("csv", "md"),
         ),
         figure=report(
-            "results/benchmark/{dataset}/figure10.png",
+            "benchmark/{dataset}/figure10.png",
             caption="../report/figure10.rst",
             category="Stereo methods",
             labels={"dataset": "{dataset}", "kind": "figure 10"},
         ),
         page=report(
-            "results/benchmark/{dataset}/index.html",
+            "benchmark/{dataset}/index.html",
             caption="../report/benchmark.rst",
             category="Stereo methods",
             labels={"dataset": "{dataset}", "kind": "page"},
@@ -92,7 +94,7 @@ rule benchmark_tables:
     log:
         "logs/benchmark_tables/{dataset}.log",
     benchmark:
-        "benchmarks/benchmark_tables/{dataset}.tsv"
+        "logs/benchmark_tables/{dataset}.tsv"
     wildcard_constraints:
         dataset="[^/]+",
     conda:
@@ -103,6 +105,7 @@ rule benchmark_tables:
         runtime=30,
     params:
         made=lambda w: making_of(rules.benchmark_tables, w),
+        script=content_of("../scripts/benchmark_tables.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
@@ -117,7 +120,7 @@ rule benchmark_tables:
 rule benchmark:
     input:
         lambda w: expand(
-            "results/benchmark/{dataset}/index.html",
+            "benchmark/{dataset}/index.html",
             dataset=[name for name, of in SETTINGS.benchmark.datasets.items() if of],
         ),
     message:

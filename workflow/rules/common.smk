@@ -7,7 +7,7 @@ from snakemake.exceptions import WorkflowError
 
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
-from stereotruth.products.provenance import PACKAGE, file_sha256, source_digest
+from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.products.publication import made_of
 from stereotruth.project import (
     FILES,
@@ -20,6 +20,7 @@ from stereotruth.project import (
 
 # of the defaults, what neither a file of this folder nor the command line says other
 config.update(with_defaults(config))
+RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
 
@@ -72,3 +73,8 @@ def scenes_of(city):
 def making_of(rule, wildcards):
     """What the making of a job's products is called; other than it was if they are stale."""
     return made_of(rule.output[0].format(**wildcards))
+
+
+def content_of(script):
+    """Digest of a rule's script: the time of its file counts for nothing (profiles/default)."""
+    return script_digest(RULES / script)

@@ -6,7 +6,7 @@ rule grid_truth:
     log:
         "logs/grid_truth/{city}/{scene}.log",
     benchmark:
-        "benchmarks/grid_truth/{city}/{scene}.tsv"
+        "logs/grid_truth/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 2
@@ -15,6 +15,7 @@ rule grid_truth:
         runtime=60,
     params:
         made=lambda w: making_of(rules.grid_truth, w),
+        script=content_of("../scripts/grid_truth.py"),
         code=source_digest("evaluation.epipolar_truth"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
@@ -38,7 +39,7 @@ rule evaluate_truth:
     log:
         "logs/evaluate_truth/{city}/{scene}.log",
     benchmark:
-        "benchmarks/evaluate_truth/{city}/{scene}.tsv"
+        "logs/evaluate_truth/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 2
@@ -47,6 +48,7 @@ rule evaluate_truth:
         runtime=60,
     params:
         made=lambda w: making_of(rules.evaluate_truth, w),
+        script=content_of("../scripts/evaluate_truth.py"),
         code=source_digest("evaluation.labels_against_truth"),
     message:
         "Comparing scene {wildcards.scene} with its exact truth"
@@ -74,7 +76,7 @@ rule evaluate_truth_city:
     log:
         "logs/evaluate_truth_city/{city}.log",
     benchmark:
-        "benchmarks/evaluate_truth_city/{city}.tsv"
+        "logs/evaluate_truth_city/{city}.tsv"
     conda:
         CONDA
     threads: 2
@@ -83,6 +85,7 @@ rule evaluate_truth_city:
         runtime=60,
     params:
         made=lambda w: making_of(rules.evaluate_truth_city, w),
+        script=content_of("../scripts/evaluate_truth_city.py"),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("evaluation.labels_against_truth"),
     message:

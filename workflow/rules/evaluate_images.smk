@@ -36,7 +36,7 @@ rule evaluate_images:
     log:
         "logs/evaluate_images/{city}.log",
     benchmark:
-        "benchmarks/evaluate_images/{city}.tsv"
+        "logs/evaluate_images/{city}.tsv"
     conda:
         CONDA
     threads: 1
@@ -45,6 +45,7 @@ rule evaluate_images:
         runtime=30,
     params:
         made=lambda w: making_of(rules.evaluate_images, w),
+        script=content_of("../scripts/evaluate_images.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         code=source_digest("evaluation.labels_against_images"),
     message:

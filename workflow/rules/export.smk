@@ -30,7 +30,7 @@ rule export:
     log:
         "logs/export/{city}.log",
     benchmark:
-        "benchmarks/export/{city}.tsv"
+        "logs/export/{city}.tsv"
     wildcard_constraints:
         city="[^/]+",  # so that scenes_of can name the cities that there are
     conda:
@@ -41,6 +41,7 @@ rule export:
         runtime=60,
     params:
         made=lambda w: making_of(rules.export, w),
+        script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         city=lambda w: asdict(CITIES[w.city]),
         settings={
@@ -65,7 +66,7 @@ rule dataset:
     log:
         "logs/dataset/dataset.log",
     benchmark:
-        "benchmarks/dataset/dataset.tsv"
+        "logs/dataset/dataset.tsv"
     conda:
         CONDA
     threads: 1
@@ -74,6 +75,7 @@ rule dataset:
         runtime=60,
     params:
         made=lambda w: making_of(rules.dataset, w),
+        script=content_of("../scripts/dataset.py"),
         code=source_digest("dataset.published_layout"),
     message:
         "Putting the cities together in the layout of the published dataset"

@@ -7,7 +7,7 @@ rule ingest:
     log:
         "logs/ingest/{city}/{scene}/{lidar}.log",
     benchmark:
-        "benchmarks/ingest/{city}/{scene}/{lidar}.tsv"
+        "logs/ingest/{city}/{scene}/{lidar}.tsv"
     conda:
         CONDA
     threads: 1
@@ -16,6 +16,7 @@ rule ingest:
         runtime=60,
     params:
         made=lambda w: making_of(rules.ingest, w),
+        script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
         drop_classes=list(SETTINGS.ingest.drop_classes),
         code=source_digest("lidar.ingest"),

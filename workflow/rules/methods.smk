@@ -1,5 +1,9 @@
 """Datasets and stereo methods of the configuration."""
 
+from functools import cache
+
+from snakemake.logging import logger
+
 from stereotruth.matching.kinds import KINDS
 from stereotruth.matching.scenes.settings import Settings as PredictionSettings
 
@@ -47,10 +51,35 @@ def method_settings(name):
     return known[name]
 
 
+def needs_training(method):
+    """Whether a method is a network that the workflow has to train first."""
+    entry = method_settings(method)
+    return KINDS[entry["kind"]].is_network and not entry.get("weights")
+
+
+LEFT_OUT = {}  # what to say of methods that are not compared, by dataset
+
+
+@cache
 def methods_of(dataset):
-    """Names of the methods that are compared on a dataset."""
+    """Names of the methods that are compared on a dataset; of all, those that need no training."""
+    if chosen := dataset_settings(dataset).get("methods"):
+        return list(chosen)
     known = [n for n, of in config["benchmark"]["methods"].items() if of]
-    return dataset_settings(dataset).get("methods") or known
+    left_out = [name for name in known if needs_training(name)]
+    if left_out:
+        LEFT_OUT[dataset] = (
+            f"Left out on {dataset}, since they would be trained first: {', '.join(left_out)}. "
+            "To compare them, give them weights, or name them in "
+            f"benchmark.datasets.{dataset}.methods"
+        )
+        logger.warning(LEFT_OUT[dataset])
+    if known == left_out:
+        raise WorkflowError(
+            f"benchmark.datasets.{dataset}: no method that needs no training. "
+            f"Remedy: name some of {', '.join(known)} in its entry methods"
+        )
+    return [name for name in known if name not in left_out]
 
 
 def method_entry(name, dataset):

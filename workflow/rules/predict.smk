@@ -8,7 +8,7 @@ rule predict_scene:
     log:
         "logs/predict_scene/{city}/{scene}/{method}.log",
     benchmark:
-        "benchmarks/predict_scene/{city}/{scene}/{method}.tsv"
+        "logs/predict_scene/{city}/{scene}/{method}.tsv"
     wildcard_constraints:
         method="[^/]+",
     conda:
@@ -19,6 +19,7 @@ rule predict_scene:
         runtime=720,
     params:
         made=lambda w: making_of(rules.predict_scene, w),
+        script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
@@ -36,7 +37,7 @@ rule dsm:
     log:
         "logs/dsm/{city}/{scene}/{method}.log",
     benchmark:
-        "benchmarks/dsm/{city}/{scene}/{method}.tsv"
+        "logs/dsm/{city}/{scene}/{method}.tsv"
     wildcard_constraints:
         method="[^/]+",
     conda:
@@ -47,6 +48,7 @@ rule dsm:
         runtime=240,
     params:
         made=lambda w: making_of(rules.dsm, w),
+        script=content_of("../scripts/dsm.py"),
         settings=asdict(SETTINGS.predict.dsm),
         code=source_digest("matching.scenes.surface_model"),
     message:

@@ -14,7 +14,7 @@ rule project:
     log:
         "logs/project/{city}/{scene}.log",
     benchmark:
-        "benchmarks/project/{city}/{scene}.tsv"
+        "logs/project/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 2
@@ -23,6 +23,7 @@ rule project:
         runtime=240,
     params:
         made=lambda w: making_of(rules.project, w),
+        script=content_of("../scripts/project.py"),
         view="left",
         settings=PROJECTION,
         code=source_digest("disparity.project"),
@@ -43,9 +44,10 @@ use rule project as project_right with:
     log:
         "logs/project_right/{city}/{scene}.log",
     benchmark:
-        "benchmarks/project_right/{city}/{scene}.tsv"
+        "logs/project_right/{city}/{scene}.tsv"
     params:
         made=lambda w: making_of(rules.project_right, w),
+        script=content_of("../scripts/project.py"),
         view="right",
         settings=PROJECTION,
         code=source_digest("disparity.project"),
@@ -63,7 +65,7 @@ rule project_strip:
     log:
         "logs/project_strip/{city}/{scene}{side}_{strip}.log",
     benchmark:
-        "benchmarks/project_strip/{city}/{scene}{side}_{strip}.tsv"
+        "logs/project_strip/{city}/{scene}{side}_{strip}.tsv"
     conda:
         CONDA
     threads: 2
@@ -72,6 +74,7 @@ rule project_strip:
         runtime=120,
     params:
         made=lambda w: making_of(rules.project_strip, w),
+        script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
         settings=PROJECTION,

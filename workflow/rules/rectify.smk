@@ -11,7 +11,7 @@ rule rectify:
     log:
         "logs/rectify/{city}/{scene}.log",
     benchmark:
-        "benchmarks/rectify/{city}/{scene}.tsv"
+        "logs/rectify/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 2
@@ -20,6 +20,7 @@ rule rectify:
         runtime=120,
     params:
         made=lambda w: making_of(rules.rectify, w),
+        script=content_of("../scripts/rectify.py"),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",
@@ -42,7 +43,7 @@ rule rectify_strip:
     log:
         "logs/rectify_strip/{city}/{scene}_{strip}.log",
     benchmark:
-        "benchmarks/rectify_strip/{city}/{scene}_{strip}.tsv"
+        "logs/rectify_strip/{city}/{scene}_{strip}.tsv"
     conda:
         CONDA
     threads: 2
@@ -51,6 +52,7 @@ rule rectify_strip:
         runtime=60,
     params:
         made=lambda w: making_of(rules.rectify_strip, w),
+        script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         code=source_digest(
             "epipolar.rectify",

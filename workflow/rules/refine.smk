@@ -21,7 +21,7 @@ rule refine:
     log:
         "logs/refine/{city}/{scene}.log",
     benchmark:
-        "benchmarks/refine/{city}/{scene}.tsv"
+        "logs/refine/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 1
@@ -30,6 +30,7 @@ rule refine:
         runtime=30,
     params:
         made=lambda w: making_of(rules.refine, w),
+        script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
         code=source_digest("alignment.refine", "alignment.refine_report"),
     message:

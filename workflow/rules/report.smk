@@ -24,7 +24,7 @@ rule report_city:
     log:
         "logs/report_city/{city}.log",
     benchmark:
-        "benchmarks/report_city/{city}.tsv"
+        "logs/report_city/{city}.tsv"
     conda:
         CONDA
     threads: 2
@@ -33,6 +33,7 @@ rule report_city:
         runtime=60,
     params:
         made=lambda w: making_of(rules.report_city, w),
+        script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),
         template=file_sha256(PACKAGE / "report" / "page.html.jinja"),
@@ -42,8 +43,25 @@ rule report_city:
         "../scripts/report_city.py"
 
 
+def cities_of_report():
+    """All of a configuration that somebody named; of the examples, those that have tiles.
+
+    Who forgets --configfile asks for none of the synthetic cities.
+    """
+    examples = Path(SETTINGS.cities).match("config/cities.tsv")
+    if workflow.overwrite_configfiles or not examples:
+        return list(CITIES)
+    if made := [city for city in CITIES if Path(f"tiles/{city}").is_dir()]:
+        return made
+    raise WorkflowError(
+        f"{SETTINGS.cities}: no city of it has tiles to report on. Remedy: add --configfile FILE "
+        "if it was forgotten; or make tiles first (snakemake --cores 2 tiles/<City>), or ask for "
+        "all these cities by --configfile config/config.yaml"
+    )
+
+
 rule report:
     input:
-        expand("results/report/{city}/index.html", city=CITIES),
+        lambda w: expand("results/report/{city}/index.html", city=cities_of_report()),
     message:
         "Pages of all cities"

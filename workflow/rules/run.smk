@@ -1,10 +1,11 @@
 """One run at a time, and its last lines."""
 
-import json
 import re
 import sys
 
 from stereotruth.products.locks import FileLock
+from stereotruth.products.records import all_records
+from stereotruth.products.reruns import keep_metadata, save_metadata, settle_times
 from stereotruth.products.runs import Run, begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
@@ -30,10 +31,14 @@ if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, m
         Run().refuse_older()
     except InputError as error:
         raise WorkflowError(str(error))
+else:
+    keep_metadata(begin=False)
+    settle_times()
 
 
 onstart:
     refuse_second_run()
+    keep_metadata(begin=True)
     end_older_jobs()
     begin_run()
 
@@ -49,15 +54,16 @@ def complaints(snakemake_logs):
 
 
 def made():
-    """What the last lines of a run say: the tiles that there are, and where to look."""
-    summaries = [Path("results", "export", city, "summary.json") for city in CITIES]
-    lines = [
-        line
-        for file in summaries
-        if file.is_file()
-        for line in json.loads(file.read_text())["lines"]
+    """What the last lines of a run say: what it has made, its figures, and where to look."""
+    from stereotruth.last_lines import last_lines  # takes a second, and no plan needs it
+
+    products = [
+        path for job in all_records() if job["run"] == Run().name for path in job["outputs"]
     ]
-    return "\n".join(["", *lines]) if lines else "done"
+    left_out = [
+        said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
+    ]
+    return "\n".join(["", *last_lines(products), *left_out])
 
 
 def say(text):
@@ -67,8 +73,10 @@ def say(text):
 
 
 onsuccess:
+    save_metadata()
     say(made())
 
 
 onerror:
+    save_metadata()
     say(complaints(log))

@@ -4,7 +4,7 @@ rule simulate_image:
     log:
         "logs/simulate_image/{city}/{scene}/{view}.log",
     benchmark:
-        "benchmarks/simulate_image/{city}/{scene}/{view}.tsv"
+        "logs/simulate_image/{city}/{scene}/{view}.tsv"
     conda:
         CONDA
     threads: 1
@@ -13,6 +13,7 @@ rule simulate_image:
         runtime=30,
     params:
         made=lambda w: making_of(rules.simulate_image, w),
+        script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.render"),
     message:
@@ -27,7 +28,7 @@ rule simulate_lidar:
     log:
         "logs/simulate_lidar/{city}/{scene}/{tile}.log",
     benchmark:
-        "benchmarks/simulate_lidar/{city}/{scene}/{tile}.tsv"
+        "logs/simulate_lidar/{city}/{scene}/{tile}.tsv"
     wildcard_constraints:
         tile=r"[^/]+\.la[sz]",
     conda:
@@ -38,6 +39,7 @@ rule simulate_lidar:
         runtime=30,
     params:
         made=lambda w: making_of(rules.simulate_lidar, w),
+        script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
         code=source_digest("simulate.lidar"),
@@ -55,7 +57,7 @@ rule simulate_truth:
     log:
         "logs/simulate_truth/{city}/{scene}.log",
     benchmark:
-        "benchmarks/simulate_truth/{city}/{scene}.tsv"
+        "logs/simulate_truth/{city}/{scene}.tsv"
     conda:
         CONDA
     threads: 1
@@ -64,6 +66,7 @@ rule simulate_truth:
         runtime=30,
     params:
         made=lambda w: making_of(rules.simulate_truth, w),
+        script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.truth", "simulate.control_points"),
     message:

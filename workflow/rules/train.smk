@@ -15,7 +15,7 @@ rule train:
     log:
         "logs/train/{dataset}/{method}.log",
     benchmark:
-        "benchmarks/train/{dataset}/{method}.tsv"
+        "logs/train/{dataset}/{method}.tsv"
     wildcard_constraints:
         dataset="[^/]+",
         method="[^/]+",
@@ -27,6 +27,7 @@ rule train:
         runtime=2880,
     params:
         made=lambda w: making_of(rules.train, w),
+        script=content_of("../scripts/train.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         kind=lambda w: method_settings(w.method)["kind"],
         training=lambda w: training_of(w.method),

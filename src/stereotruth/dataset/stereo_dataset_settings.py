@@ -28,4 +28,5 @@ class Settings:
     a disparity map are filled with the lower one"""
 
     methods: Annotated[tuple[Text, ...] | None, Unit("names")] = None
-    """methods that the target `benchmark` compares; null or not given: all"""
+    """methods that the target `benchmark` compares; null or not given: all that need no training
+    (no networks without `weights`)"""

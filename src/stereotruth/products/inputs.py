@@ -21,7 +21,7 @@ from .provenance import file_sha256
 TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
 NOT_CONTENT = ".snakemake_timestamp"  # laid into folders by Snakemake when their job has ended
 # What runs write in the working directory, which may lie in the folder of a dataset.
-WRITTEN_BY_RUNS = ("results", "logs", "benchmarks", "benchmark", "audit")
+WRITTEN_BY_RUNS = ("results", "logs", "benchmark", "audit")
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,12 @@ def source_digest(*modules: str) -> str:
     return digest.hexdigest()[:16]
 
 
+def script_digest(file: str | Path) -> str:
+    """Digest of the parsed source of one file, without what it imports; see source_digest."""
+    tree = _without_docstrings(ast.parse(Path(file).read_text(encoding="utf-8")))
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16]
+
+
 def describe(
     inputs: Iterable[str | Path] | Mapping[str, str],
     parameters: Mapping[str, Any],

@@ -9,41 +9,21 @@ by hand.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from ..errors import InputError
 from .inputs import Checksums, Inputs, Marks, marks, refuse_replaced
 from .provenance import digest
+from .records import changed_inputs, read_record, write_record
 from .runs import KEPT, RUN, Run, listed
 
 log = logging.getLogger("stereotruth")
-
-
-def _record_file(product: str | Path) -> Path:
-    return KEPT / "made" / f"{os.path.relpath(product).replace(os.pardir, '_')}.json"
-
-
-def _write(product: str | Path, record: Mapping[str, Any]) -> None:
-    file = _record_file(product)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    scratch = file.with_name(f".{file.name}.{os.getpid()}")
-    scratch.write_text(json.dumps(record))
-    scratch.replace(file)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        return json.loads(file.read_text())
-    except (OSError, json.JSONDecodeError):
-        return {}
 
 
 class _Job:
@@ -54,7 +34,7 @@ class _Job:
         self.run = Run()
         self.published: dict[str, Marks] = {}
         with self.run.standing():
-            _write(self.first, {"made": made, "run": self.run.name})
+            write_record(self.first, {"made": made, "run": self.run.name})
         inputs = list(map(str, inputs))
         self.marks = marks(inputs)
         self.inputs = Inputs(inputs, Checksums(KEPT / "checksums"))
@@ -75,9 +55,10 @@ class _Job:
             record = {
                 "made": self.made,
                 "run": self.run.name,
+                "outputs": list(map(str, self.outputs.values())),
                 "inputs": dict(self.inputs.checksums),
             }
-            _write(self.first, record)
+            write_record(self.first, record)
 
 
 _job: _Job | None = None  # what this process makes
@@ -116,23 +97,13 @@ def publishing(path: str | Path) -> Iterator[None]:
             _job.published[place] = marks([path])
     except InputError:
         if placed:  # locks do nothing here, and another run has begun in this moment
-            _write(_job.first, {"made": f"by an older run: {uuid.uuid4().hex}"})
+            write_record(_job.first, {"made": f"by an older run: {uuid.uuid4().hex}"})
         raise
 
 
 def marks_of_inputs() -> Marks:
     """What tells cheaply whether the inputs of this process's job were replaced since it began."""
     return {} if _job is None else _job.marks
-
-
-@cache
-def _checksums() -> Checksums:
-    return Checksums(KEPT / "checksums")
-
-
-@cache
-def _checksum(path: str) -> str | None:
-    return _checksums().of(path)[1] if Path(path).exists() else None
 
 
 @cache
@@ -143,15 +114,12 @@ def made_of(product: str) -> str:
     input that changed unseen by Snakemake gives another, and so makes the product again. So does
     a product of a job that did not end, unless this is its own run, which tries again.
     """
-    record = _read(_record_file(product))
-    then = record.get("inputs")
+    record = read_record(product)
     if record and Path(product).exists():
-        if then is None:
+        if "inputs" not in record:
             mine = record.get("run") == os.environ.get(RUN, "")
             return record["made"] if mine else digest({"not ended": record})
-        now = {path: _checksum(path) for path in then}
-        other = {path: found for path, found in now.items() if found and found != then[path]}
-        if other:
+        if other := changed_inputs(record):
             log.warning("%s is made again: %s changed", product, ", ".join(sorted(other)))
             return digest({"before": record["made"], "inputs": other})
     return record.get("made", "")

@@ -13,6 +13,7 @@ import zarr
 
 from stereotruth.errors import InputError
 from stereotruth.products import publication as module
+from stereotruth.products import records
 from stereotruth.products.files import replacing, whole_folder
 from stereotruth.products.publication import made_of, publication
 from stereotruth.products.resumable_grids import BlockStore
@@ -33,7 +34,7 @@ def plan():
     """As a new process plans: nothing remembered."""
 
     def forget():
-        for function in (made_of, module._checksum, module._checksums):
+        for function in (made_of, records._checksum, records._checksums):
             function.cache_clear()
         return made_of("a.json")
 
@@ -84,18 +85,18 @@ def test_a_job_of_an_earlier_run_leaves_the_records_alone(monkeypatch):
     late = os.environ[RUN]
     begin_run()
     make()
-    record = module._record_file("a.json").read_text()
+    record = records.record_file("a.json").read_text()
     monkeypatch.setenv(RUN, late)
     with pytest.raises(InputError), publication(["in.csv"], ["a.json"], ""):
         pytest.fail("was let in")
-    assert module._record_file("a.json").read_text() == record
+    assert records.record_file("a.json").read_text() == record
 
 
 def test_an_input_that_changes_after_all_is_written_fails_the_job(plan):
     with pytest.raises(InputError), publication(["in.csv"], ["a.json"], ""):
         write()
         Path("in.csv").write_text("22")
-    assert "inputs" not in json.loads(module._record_file("a.json").read_text())
+    assert "inputs" not in json.loads(records.record_file("a.json").read_text())
 
 
 def test_a_change_that_snakemake_cannot_see_makes_the_product_again_once(plan):
@@ -140,7 +141,7 @@ def test_what_is_not_there_has_no_say(plan, gone):
 
 def test_a_record_that_cannot_be_read_has_no_say(plan):
     make()
-    module._record_file("a.json").write_text("{")
+    records.record_file("a.json").write_text("{")
     assert plan() == ""
 
 

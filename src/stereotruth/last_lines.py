@@ -1,0 +1,86 @@
+"""The last lines of a run: what this run has made, its figures, and where to look."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .matching.benchmark.score_method import describe
+
+
+def last_lines(products: Iterable[str]) -> list[str]:
+    """What to say of products, in the order of the workflow; without figures only where they are.
+
+    ``products``: files and folders by their paths relative to the working directory.
+    """
+    products = list(dict.fromkeys(products))
+    said = [
+        line
+        for pattern, say in SAYINGS.items()
+        for product in sorted(products)
+        if (found := re.fullmatch(pattern, product))
+        for line in say(product, *found.groups())
+    ]
+    if said or not products:
+        return said
+    more = f" and {len(products) - 3} more" if len(products) > 3 else ""
+    return [f"Made {', '.join(products[-3:])}{more}"]
+
+
+def _read(*parts: str) -> Mapping[str, Any]:
+    return json.loads(Path(*parts).read_text(encoding="utf-8"))
+
+
+def _tiles(product: str, city: str) -> Iterator[str]:
+    yield from _read("results/export", city, "summary.json")["lines"]
+
+
+def _against_truth(product: str, of: str) -> Iterator[str]:
+    errors = _read(product)["errors"]
+    if errors["count"]:
+        yield (
+            f"{of} against its exact truth: {errors['mean_absolute']:.3f} px mean absolute error, "
+            f"{100 * errors['share_over_1_px']:.2f} % off by more than 1 px; look at "
+            f"{Path(product).with_suffix('.csv')}"
+        )
+
+
+def _look(product: str, *_: str) -> Iterator[str]:
+    yield f"Look at {product}"
+
+
+def _training(product: str, dataset: str, method: str) -> Iterator[str]:
+    best = _read(product)["best"]
+    yield (
+        f"{method} trained on {dataset}: EPE {best['val_epe_px']:.3f} px, D1 "
+        f"{100 * best['val_d1']:.2f} % on the validation tiles; look at "
+        f"{Path(product).with_name('curves.png')}"
+    )
+
+
+def _scores(product: str, dataset: str) -> Iterator[str]:
+    summary = _read(product, "scores.json")
+    yield f"{summary['label']} on {dataset}: {describe(summary)}; look at {product}/cities.csv"
+
+
+def _audit(product: str, dataset: str) -> Iterator[str]:
+    for number, line in enumerate(_read(product, "summary.json")["statements"]):
+        yield line if number else f"Audit of {dataset}: {line}"
+    yield f"Look at {product}/index.html"
+
+
+SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
+    r"tiles/([^/]+)": _tiles,
+    r"results/evaluate/(?:[^/]+/)?([^/]+)/truth\.json": _against_truth,
+    r"results/evaluate/([^/]+)/table4\.csv": _look,
+    r"results/report/([^/]+)/index\.html": _look,
+    r"dataset": _look,
+    r"results/train/([^/]+)/([^/]+)/training\.json": _training,
+    r"benchmark/([^/]+)/[^/.]+": _scores,
+    r"benchmark/([^/]+)/index\.html": _look,
+    r"audit/([^/]+)": _audit,
+    r"results/predict/.*_dsm\.tif": _look,
+}

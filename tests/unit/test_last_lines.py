@@ -1,0 +1,73 @@
+"""What a run says at its end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from stereotruth.last_lines import last_lines
+
+SCORES = {
+    "label": "SGM",
+    "thresholds_px": [3, 1],
+    "tiles": 4,
+    "all": {"labelled": 9, "valid_share": 1, "epe_px": 0.5, "d1_3_px_share": 0.02},
+}
+TRUTH = {"errors": {"count": 5, "mean_absolute": 0.021, "share_over_1_px": 0.0004}}
+FILES = {
+    "results/export/A/summary.json": {"lines": ["A: 16 pairs", "Look at tiles/A"]},
+    "results/evaluate/A/truth.json": TRUTH,
+    "results/evaluate/A/A-1/truth.json": {"errors": {"count": 0}},
+    "results/train/own/net/training.json": {"best": {"val_epe_px": 1.25, "val_d1": 0.5}},
+    "benchmark/own/sgm/scores.json": SCORES,
+    "audit/own/summary.json": {"statements": ["4 pairs: 3 good.", "Labels fit."]},
+}
+
+
+@pytest.fixture(autouse=True)
+def made(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, values in FILES.items():
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(json.dumps(values))
+
+
+def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
+    products = [
+        "results/predict/A/A-1/sgm_dsm.tif",
+        "audit/own",
+        "benchmark/own/index.html",
+        "benchmark/own/table5.csv",
+        "benchmark/own/sgm",
+        "results/train/own/net/best.pt",
+        "results/train/own/net/training.json",
+        "results/report/A/index.html",
+        "results/evaluate/A/A-1/truth.json",
+        "results/evaluate/A/truth.json",
+        "tiles/A",
+        "tiles/A",
+        "results/project/A/A-1.zarr",
+    ]
+    assert last_lines(products) == [
+        "A: 16 pairs",
+        "Look at tiles/A",
+        "A against its exact truth: 0.021 px mean absolute error, 0.04 % off by more than 1 px; "
+        "look at results/evaluate/A/truth.csv",
+        "Look at results/report/A/index.html",
+        "net trained on own: EPE 1.250 px, D1 50.00 % on the validation tiles; "
+        "look at results/train/own/net/curves.png",
+        "SGM on own: EPE 0.500 px, D1 (3 px) 2.00 %; 4 pairs; look at benchmark/own/sgm/cities.csv",
+        "Look at benchmark/own/index.html",
+        "Audit of own: 4 pairs: 3 good.",
+        "Labels fit.",
+        "Look at audit/own/index.html",
+        "Look at results/predict/A/A-1/sgm_dsm.tif",
+    ]
+
+
+def test_what_has_no_figures_is_named():
+    assert last_lines([]) == []
+    stores = [f"results/ingest/A/A-1/{n}.zarr" for n in range(5)]
+    assert last_lines(stores) == [f"Made {stores[2]}, {stores[3]}, {stores[4]} and 2 more"]
