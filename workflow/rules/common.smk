@@ -47,7 +47,8 @@ def read_sheets(settings):
             tiles = synthetic_lidar(SYNTHETIC[scene.city], name)
             files = [Path(scene.lidar) / tile for tile in tiles]
         else:
-            sheets.require_files(scene, sheet, ["left_image", "right_image", "gcps", "geoid"])
+            files = ["left_image", "right_image", "gcps", "geoid", "left_mask", "right_mask"]
+            sheets.require_files(scene, sheet, files)
             files = sheets.find_lidar(scene, sheet)
         lidar[name] = sheets.store_names(files)
     for name, file in alignment.fixed.items():

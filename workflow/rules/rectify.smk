@@ -2,6 +2,8 @@ rule rectify:
     input:
         left=left_image,
         right=right_image,
+        left_mask=left_mask,
+        right_mask=right_mask,
         alignment=alignment_of,
         strips=lambda w: strips_made(w, "results/rectify/{city}/{scene}/strips/{strip}.json"),
     output:
@@ -36,6 +38,8 @@ rule rectify_strip:
     input:
         left=left_image,
         right=right_image,
+        left_mask=left_mask,
+        right_mask=right_mask,
         alignment=alignment_of,
     output:
         done=temp("results/rectify/{city}/{scene}/strips/{strip}.json"),

@@ -265,6 +265,7 @@ def refine(
     right_image: str | Path,
     point_stores: Sequence[str | Path],
     *,
+    masks: tuple[str | Path | None, str | Path | None] = (None, None),
     strict: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> tuple[Alignment, Observations | None]:
@@ -272,13 +273,13 @@ def refine(
 
     Returns the alignment, with the record of what was done in ``refinement``, and the
     observations. It is the one that came, affines and all, if the tie points do not contradict
-    it or are too few. Reads a fixed number of places, whatever the scene's size. ``strict`` makes
-    warnings errors.
+    it or are too few. Reads a fixed number of places, whatever the scene's size. ``masks``: of both
+    images, see :class:`.image_reader.Source`. ``strict`` makes warnings errors.
 
     Raises InputError if there are neither GCPs nor usable tie points.
     """
     of = f" (scene {alignment.scene})" if alignment.scene else ""
-    with open_pair(left_image, right_image) as (left, right):
+    with open_pair(left_image, right_image, *masks) as (left, right):
         stores = open_stores(sorted(Path(p) for p in point_stores))
         prior = prior_of(alignment)
         gcps = control_points_of(alignment)

@@ -157,6 +157,7 @@ def export_city(
         building_share=settings.building_share,
         limits=settings.quality,
         code=code or source_digest("dataset.export"),
+        flags=dict(sorted({k: v for source in sources for k, v in source.flags.items()}.items())),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=provenance,
     )

@@ -52,6 +52,7 @@ class Cut:
     building_share: float
     limits: Limits
     code: str
+    flags: Mapping[int, str]  # meaning of the status values of all scenes
     work: Path  # where the files of finished tiles wait, with the ledger
     provenance: Mapping[str, Any]
 
@@ -240,7 +241,7 @@ def write_tile(
         "lat": f"{lat:.7f}",
         **check_cells(checks, cut.limits),
     }
-    for value, meaning in source.flags.items():
+    for value, meaning in cut.flags.items():
         row[f"count_{meaning}"] = int((crop.status == value).sum())
     for kind in (*FILES, *(RIGHT_FILES if source.of_right is not None else ())):
         row[kind] = files.get(kind, "")

@@ -34,9 +34,10 @@ BELOW = 0.1  # of the largest value below zero: a fill value; noise of reflectan
 class Source:
     """One band of an image file, read by windows from any thread as float32 with NaN for nodata.
 
-    Nodata is the file's nodata value, or exactly 0 if it names none; what a mask or an alpha band
-    hides; and, as no sensor counts below zero, negative values (of real numbers those below
-    :data:`BELOW` of the largest value), since fill values are often not declared. Integer images
+    Nodata is the file's nodata value, or exactly 0 if it names none; what the file's own mask or
+    alpha band hides; and, as no sensor counts below zero, negative values (of real numbers those
+    below :data:`BELOW` of the largest value), since fill values are often not declared. ``mask`` is
+    a raster on the image's grid whose non-zero pixels hide the image's, too. Integer images
     keep their digital numbers. Others, and integers of more than 16 bits, keep theirs if their
     maximum lies in [256, 65535] (of integers: below), else they are multiplied by ``gain`` = 10000
     / maximum. The maximum is that of a decimated reading; hot pixels do not count.
@@ -44,8 +45,9 @@ class Source:
     Raises InputError if the file cannot be read, is complex-valued or larger than any image.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, mask: str | Path | None = None) -> None:
         self.path = Path(path)
+        self.mask_path = Path(mask) if mask else None
         self._local = threading.local()
         self._opened: list[rasterio.DatasetReader] = []
         self._told = False
@@ -56,7 +58,10 @@ class Source:
         self.nodata = 0.0 if dataset.nodata is None else float(dataset.nodata)
         alpha = [i for i, c in enumerate(dataset.colorinterp, 1) if c == ColorInterp.alpha]
         self._alpha = alpha[0] if alpha and alpha[0] != 1 else None
-        self._masked = self._alpha is None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+        self._own_mask = self._alpha is None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+        self.masks = self._alpha is not None or self._own_mask or self.mask_path is not None
+        if self.mask_path is not None:
+            self._refuse_mask(self._mask())
         if dataset.count > (1 if self._alpha is None else 2):
             log.warning(
                 "%s has %d bands; band 1 (%s) is used",
@@ -91,6 +96,15 @@ class Source:
                 "damaged: get it again",
             )
 
+    def _refuse_mask(self, mask: rasterio.DatasetReader) -> None:
+        if (mask.width, mask.height) != self.size:
+            raise InputError(
+                f"a mask of {mask.width} x {mask.height} pixels for the image {self.path.name} of "
+                f"{self.size[0]} x {self.size[1]}",
+                file=self.mask_path,
+                remedy="a mask has the pixels of its image (left_mask, right_mask in scenes.tsv)",
+            )
+
     def _scale(self, dataset: rasterio.DatasetReader, real: bool) -> None:
         """Set the gain, and below what values are fill values."""
         shape = tuple(min(n, 2048) for n in dataset.shape)
@@ -119,43 +133,81 @@ class Source:
 
     def _dataset(self) -> rasterio.DatasetReader:
         if not hasattr(self._local, "dataset"):
-            try:
-                dataset = open_raster(self.path)
-            except RasterioError as error:
-                raise InputError(
-                    f"not a raster that GDAL can read ({error})",
-                    file=self.path,
-                    remedy="check the path and the file",
-                ) from error
-            self._opened.append(dataset)
-            self._local.dataset = dataset
+            self._local.dataset = self._open(self.path)
         return self._local.dataset
 
+    def _mask(self) -> rasterio.DatasetReader:
+        if not hasattr(self._local, "mask"):
+            self._local.mask = self._open(self.mask_path)
+        return self._local.mask
+
+    def _open(self, path: Path) -> rasterio.DatasetReader:
+        try:
+            dataset = open_raster(path)
+        except RasterioError as error:
+            raise InputError(
+                f"not a raster that GDAL can read ({error})",
+                file=path,
+                remedy="check the path and the file",
+            ) from error
+        self._opened.append(dataset)
+        return dataset
+
     @contextmanager
-    def _readable(self, what: str) -> Iterator[None]:
+    def _readable(self, what: str, path: Path | None = None) -> Iterator[None]:
         try:
             yield
         except RasterioError as error:
             raise InputError(
                 f"{what} cannot be read ({error})",
-                file=self.path,
+                file=path or self.path,
                 remedy="the file is damaged or cut short: get it again",
             ) from error
 
+    def _hidden_by_itself(self, window: Window) -> NDArray[np.bool_] | None:
+        """What the file's own mask or alpha band hides; None if it has none."""
+        dataset = self._dataset()
+        with self._readable(
+            f"the mask of rows {window.row_off} to {window.row_off + window.height}"
+        ):
+            if self._alpha is not None:
+                return dataset.read(self._alpha, window=window) == 0
+            if self._own_mask:
+                return dataset.read_masks(1, window=window) == 0
+        return None
+
+    def read_masked(
+        self, col: int, row: int, cols: int, rows: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """A window as :meth:`read` gives it, and which of its pixels [rows, cols] are masked.
+
+        Those that only the file ``mask`` hides have their values.
+        """
+        window = Window(col, row, cols, rows)
+        hidden = self._hidden_by_itself(window)
+        values = self._values(window, hidden)
+        if hidden is None:
+            hidden = np.zeros(values.shape, np.bool_)
+        if self.mask_path is not None:
+            with self._readable(f"rows {row} to {row + rows}", self.mask_path):
+                hidden = hidden | (self._mask().read(1, window=window) != 0)
+        return values, hidden
+
     def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
         """Window [rows, cols] from (col, row) on; must lie in the image."""
-        dataset, window = self._dataset(), Window(col, row, cols, rows)
-        with self._readable(f"rows {row} to {row + rows}"):
+        values, hidden = self.read_masked(col, row, cols, rows)
+        if self.mask_path is not None:
+            values[hidden] = np.nan
+        return values
+
+    def _values(self, window: Window, hidden: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+        dataset = self._dataset()
+        with self._readable(f"rows {window.row_off} to {window.row_off + window.height}"):
             raw = dataset.read(1, window=window)
-            seen = None
-            if self._alpha is not None:
-                seen = dataset.read(self._alpha, window=window)
-            elif self._masked:
-                seen = dataset.read_masks(1, window=window)
         values = raw.astype(np.float32)
         values[raw == self.nodata] = np.nan
-        if seen is not None:
-            values[seen == 0] = np.nan
+        if hidden is not None:
+            values[hidden] = np.nan
         if self._lowest > -np.inf and (below := values < self._lowest).any():
             if not self._told:
                 self._told = True
@@ -188,8 +240,17 @@ class Source:
 
 
 @contextmanager
-def open_pair(left: str | Path, right: str | Path) -> Iterator[tuple[Source, Source]]:
+def open_pair(
+    left: str | Path,
+    right: str | Path,
+    left_mask: str | Path | None = None,
+    right_mask: str | Path | None = None,
+) -> Iterator[tuple[Source, Source]]:
     """Both images of a pair, of which GDAL keeps CACHE_MB decoded at most."""
     # GDAL's default, 5 % of the machine's memory, can be more than a job may use
-    with rasterio.Env(GDAL_CACHEMAX=CACHE_MB), Source(left) as first, Source(right) as second:
+    with (
+        rasterio.Env(GDAL_CACHEMAX=CACHE_MB),
+        Source(left, left_mask) as first,
+        Source(right, right_mask) as second,
+    ):
         yield first, second

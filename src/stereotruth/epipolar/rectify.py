@@ -33,6 +33,12 @@ SHARD = 1024  # px; one task writes one shard file
 CHUNK = 256
 LATTICE = 16  # px between exact source coordinates; in between they are bilinear
 LATTICE_ERROR = 0.002  # px, accepted error of that
+MASK = {
+    "units": "1",
+    "long_name": "what a mask hides",
+    "flag_values": [0, 1],
+    "flag_meanings": "seen masked",
+}
 
 
 def _lattice(model: ImageModel, rows: slice, cols: slice, step: int) -> Floats:
@@ -66,6 +72,21 @@ def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
     col, row = model.inverse([x - 1, x + 1, x, x], [y, y, y - 1, y + 1])
     spans = [float(np.hypot(c[1] - c[0], c[3] - c[2]) / 2) for c in (col, row)]
     return tuple(span if span > ANTIALIAS else 1.0 for span in spans)
+
+
+def _touched(
+    masked: NDArray[np.bool_],
+    lattice: Floats,
+    step: int,
+    scale: tuple[float, float],
+    shape: tuple[int, int],
+) -> NDArray[np.uint8]:
+    """1 where a pixel of the image would be made of masked ones, too; 0 outside the image."""
+    everywhere, beside = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+    resample(np.ones(masked.shape, np.float32), lattice, step, scale, everywhere)
+    there = np.where(masked, np.float32(np.nan), np.float32(1))
+    resample(there, lattice, step, scale, beside)
+    return ((everywhere > 0) & (beside == 0)).astype(np.uint8)
 
 
 def rectify_image(
@@ -111,12 +132,16 @@ def rectify_image(
             target.write((rows, cols), key, {}, 0)
             return
         lattice, (col, width, row, height) = found
-        pixels = source.read(col, row, width, height)
+        pixels, masked = source.read_masked(col, row, width, height)
         lattice[0] -= col
         lattice[1] -= row
-        out = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=np.uint16)
+        shape = rows.stop - rows.start, cols.stop - cols.start
+        out = np.zeros(shape, dtype=np.uint16)
         valid = resample(pixels, lattice, step, scale, out)
-        target.write((rows, cols), key, {"image": out}, valid)
+        arrays = {"image": out}
+        if masked.any():
+            arrays["mask"] = _touched(masked, lattice, step, scale, shape)
+        target.write((rows, cols), key, arrays, valid)
 
     every = blocks(shape, SHARD)
     part = every if strip is None else strip.of(every)
@@ -169,7 +194,8 @@ def rectify(
 ) -> None:
     """Resample both images of a pair into the Zarr grids of its epipolar model.
 
-    Grids hold ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model
+    Grids hold ``image`` uint16 [y, x], 0 where there is no value, and, of images with a mask,
+    ``mask`` uint8 [y, x], 1 where it hides the image; their attributes carry the model
     and ``provenance``, those of the left one ``left_attrs`` too. ``epipolar_json``: where the model
     goes. All three products appear when they are whole, or not at all.
 
@@ -186,15 +212,19 @@ def rectify(
             ("left", left, model.left_image, left_store),
             ("right", right, model.right_image, right_store),
         ):
-            layer = Layer(
-                dtype="uint16",
-                fill=0,
-                attrs={
-                    "units": "1",
-                    "long_name": f"digital numbers of the {view} epipolar image",
-                    "nodata": 0,
-                },
-            )
+            layers = {
+                "image": Layer(
+                    dtype="uint16",
+                    fill=0,
+                    attrs={
+                        "units": "1",
+                        "long_name": f"digital numbers of the {view} epipolar image",
+                        "nodata": 0,
+                    },
+                )
+            }
+            if source.masks:
+                layers["mask"] = Layer("uint8", 0, MASK | {"of": f"the {view} epipolar image"})
             attrs = {
                 "view": view,
                 "epipolar": model.to_dict(),
@@ -207,7 +237,7 @@ def rectify(
                 making(
                     store,
                     model.shape,
-                    {"image": layer},
+                    layers,
                     chunk=CHUNK,
                     shard=SHARD,
                     shared=strip is not None,
@@ -219,6 +249,8 @@ def rectify(
                 "model": image.to_dict(),
                 "code": code,
             }
+            if source.mask_path is not None:
+                made_of["mask"] = file_sha256(source.mask_path)
             attrs["resampling"] = rectify_image(
                 source,
                 image,

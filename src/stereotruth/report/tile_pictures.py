@@ -26,6 +26,7 @@ STATUS_COLOURS = {
     "low_correlation": "#6a4c93",
     "changed": "#edd03c",
     "out_of_frame": "#8d99a6",
+    "masked": "#3d5a80",
     "below_minimum_count": "#9c6b4f",
     "edge_in_pixel": "#2a9d8f",
     "labelled_between": "#bcd4e6",

@@ -166,3 +166,34 @@ def test_sizes_of_damaged_headers_are_refused(tmp_path, shape) -> None:
         ).close()
     with pytest.raises(InputError, match=r"no image of a satellite|can only be read as a whole"):
         Source(path)
+
+
+def test_what_a_mask_file_hides_is_not_read(tmp_path) -> None:
+    """Not zero: masked. Who asks for the mask gets the values under it, too."""
+    cloud = np.zeros(GREY.shape, np.uint8)
+    cloud[10:20, 30:50], cloud[40, 40] = 255, 1
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", cloud)
+    with Source(path, mask) as source:
+        assert source.masks
+        np.testing.assert_array_equal(np.isnan(source.read(0, 0, *source.size)), cloud > 0)
+        values, hidden = source.read_masked(25, 5, 60, 50)
+    np.testing.assert_array_equal(values, GREY[5:55, 25:85])
+    np.testing.assert_array_equal(hidden, cloud[5:55, 25:85] > 0)
+
+
+def test_own_mask_and_mask_file_add_up(tmp_path) -> None:
+    own, cloud = np.full(GREY.shape, 255, np.uint8), np.zeros(GREY.shape, np.float32)
+    own[3:9, 4:8], cloud[50:60, 60:70] = 0, 0.5
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=own)
+    with Source(path, write(tmp_path / "cloud.tif", cloud)) as source:
+        values, hidden = source.read_masked(0, 0, *source.size)
+    np.testing.assert_array_equal(np.isnan(values), own == 0)
+    np.testing.assert_array_equal(hidden, (own == 0) | (cloud > 0))
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", np.zeros((10, 12), np.uint8))
+    with pytest.raises(InputError, match=r"cloud.tif: a mask of 12 x 10 .* a.tif of 96 x 80"):
+        Source(path, mask)

@@ -219,3 +219,29 @@ def test_complex_images_are_refused(tmp_path: Path) -> None:
     radar = write_image(tmp_path / "sar.tif", None, np.ones((8, 8), dtype=np.complex64))
     with pytest.raises(InputError, match=r"sar.tif: complex image"):
         Source(radar)
+
+
+def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
+    """A mask hides what any of its pixels has a say in; under a mask file the image stays."""
+    sensors, cloud = pair(), np.zeros(SIZE[::-1], np.uint8)
+    cloud[200:210, 220:240] = 1
+    pixels = render(sensors[0], HEIGHT)
+    images = [write_image(tmp_path / f"{n}.tif", None, pixels) for n in ("left", "right")]
+    mask = write_image(tmp_path / "cloud.tif", None, cloud)
+    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
+    found = {}
+    for name, given in (("clear", (None, None)), ("masked", (mask, None))):
+        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
+        with open_pair(*images, *given) as opened:
+            rectify(*opened, model, *out)
+        found[name] = [open_grid(path) for path in out[1:]]
+    left, right = found["masked"]
+    assert "mask" not in right and "mask" not in found["clear"][0]
+    np.testing.assert_array_equal(left.image, found["clear"][0].image)
+    col, row = model.epipolar_to_left(*np.indices(model.shape)[::-1])
+    inside = (col > 217.1) & (col < 241.9) & (row > 197.1) & (row < 211.9)
+    outside = (col < 216.9) | (col > 242.1) | (row < 196.9) | (row > 212.1)
+    hidden = left.mask.values == 1
+    assert hidden[inside].all() and inside.sum() > 300
+    assert not hidden[outside].any()
+    assert left.mask.attrs["flag_meanings"] == "seen masked"
