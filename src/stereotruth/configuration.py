@@ -20,6 +20,7 @@ from pydantic import Field
 from .alignment.settings import Settings as Alignment
 from .dataset.settings import Evaluation, Limits, Tiles
 from .disparity.settings import Occlusion, Project, check_fill
+from .epipolar.settings import Settings as Rectify
 from .evaluation.audit.settings import Settings as Audit
 from .lidar.settings import Settings as Ingest
 from .matching.benchmark.settings import Settings as Benchmark
@@ -64,6 +65,7 @@ class Configuration:
     simulate: Simulate = field(default_factory=Simulate)
     ingest: Ingest = field(default_factory=Ingest)
     alignment: Alignment = field(default_factory=Alignment)
+    rectify: Rectify = field(default_factory=Rectify)
     occlusion: Occlusion = field(default_factory=Occlusion)
     project: Project = field(default_factory=Project)
     tiles: Tiles = field(default_factory=Tiles)

@@ -22,6 +22,7 @@ rule rectify:
         runtime=120,
     params:
         made=lambda w: making_of(rules.rectify, w),
+        bands=asdict(SETTINGS.rectify),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",
@@ -56,6 +57,7 @@ rule rectify_strip:
     params:
         made=lambda w: making_of(rules.rectify_strip, w),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
+        bands=asdict(SETTINGS.rectify),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",

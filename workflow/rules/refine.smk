@@ -33,6 +33,7 @@ rule refine:
     params:
         made=lambda w: making_of(rules.refine, w),
         strict=SETTINGS.strict,
+        bands=asdict(SETTINGS.rectify),
         code=source_digest("alignment.refine", "alignment.refine_report"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"

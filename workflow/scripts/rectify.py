@@ -5,6 +5,7 @@ from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.provenance import checksums, describe
 from stereotruth.products.publication import publication
@@ -19,7 +20,8 @@ if __name__ == "__main__":
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
-        with open_pair(*names, *masks) as (left, right):
+        bands = Settings(**snakemake.params.bands)
+        with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(
                 alignment.left,
                 alignment.right,
@@ -37,5 +39,7 @@ if __name__ == "__main__":
                 snakemake.output.right,
                 workers=snakemake.threads,
                 left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
-                provenance=describe(checksums(files, *masks), {}, snakemake.params.code),
+                provenance=describe(
+                    checksums(files, *masks), snakemake.params.bands, snakemake.params.code
+                ),
             )

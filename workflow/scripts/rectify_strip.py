@@ -4,6 +4,7 @@ from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
 from stereotruth.products.publication import publication
@@ -17,7 +18,8 @@ if __name__ == "__main__":
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
-        with open_pair(*names, *masks) as (left, right):
+        bands = Settings(**snakemake.params.bands)
+        with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(
                 alignment.left,
                 alignment.right,

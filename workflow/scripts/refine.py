@@ -3,6 +3,7 @@
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_report import write_refinement
+from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.provenance import checksums, describe, digest
@@ -25,6 +26,7 @@ if __name__ == "__main__":
             given.right[0],
             given.points,
             masks=masks,
+            bands=Settings(**snakemake.params.bands),
             strict=snakemake.params.strict,
             provenance=describe(inputs, {}, snakemake.params.code),
         )

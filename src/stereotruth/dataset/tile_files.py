@@ -73,6 +73,8 @@ class _Crop:
     status: NDArray[np.uint8]
     of_right: NDArray[np.float32] | None
     status_of_right: NDArray[np.uint8] | None
+    colour_left: NDArray[np.uint16] | None  # [3, h, w]
+    colour_right: NDArray[np.uint16] | None
 
     @classmethod
     def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
@@ -85,6 +87,12 @@ class _Crop:
             values = source.of_right["disparity"][there].astype(np.float64) - window.offset
             of_right = round_disparity(values, cut.dtype)
             status_of_right = source.of_right["status"][there]
+        colours = (None, None)
+        if source.colours is not None:
+            colours = (
+                np.stack([band[part] for band in bands])
+                for bands, part in zip(source.colours, (here, there))
+            )
         return cls(
             left=source.left[here],
             right=source.right[there],
@@ -93,6 +101,7 @@ class _Crop:
             status=source.status[here],
             of_right=of_right,
             status_of_right=status_of_right,
+            **dict(zip(("colour_left", "colour_right"), colours)),
         )
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -124,8 +133,9 @@ def _write_images(
     """Write a tile's TIFF files."""
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
-    write_tiff(paths["left"], crop.left, nodata=0)
-    write_tiff(paths["right"], crop.right, nodata=0)
+    for view in ("left", "right"):
+        grey, colour = getattr(crop, view), getattr(crop, f"colour_{view}")
+        write_tiff(paths[view], grey if colour is None else colour, nodata=0)
     if not window.labelled:
         return
     meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())

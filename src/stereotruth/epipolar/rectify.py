@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..job import BlockProgress
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, making
+from .colours import COLOURS
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, RADIUS, resample
@@ -111,6 +113,7 @@ def rectify_image(
     step, error = _lattice_step(model, shape)
     scale = _widening(model, shape)
     reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
+    names = ("image", *(COLOURS if source.colour else ()))
 
     def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
         lattice = _lattice(model, rows, cols, step)
@@ -132,13 +135,15 @@ def rectify_image(
             target.write((rows, cols), key, {}, 0)
             return
         lattice, (col, width, row, height) = found
-        pixels, masked = source.read_masked(col, row, width, height)
+        layers, masked = source.read_layers(col, row, width, height)
         lattice[0] -= col
         lattice[1] -= row
         shape = rows.stop - rows.start, cols.stop - cols.start
-        out = np.zeros(shape, dtype=np.uint16)
-        valid = resample(pixels, lattice, step, scale, out)
-        arrays = {"image": out}
+        arrays = {name: np.zeros(shape, dtype=np.uint16) for name in names}
+        valid, *_ = (
+            resample(pixels, lattice, step, scale, out)
+            for pixels, out in zip(layers, arrays.values())
+        )
         if masked.any():
             arrays["mask"] = _touched(masked, lattice, step, scale, shape)
         target.write((rows, cols), key, arrays, valid)
@@ -168,7 +173,11 @@ def rectify_image(
             remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
         )
     log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
-    return {
+    bands = {}
+    if source.band_count > 1:
+        mix = {f"band {band}": round(weight, 6) for band, weight in source.mix.items()}
+        bands = {"mix": mix, "colour": [f"band {band}" for band in source.colour]}
+    return bands | {
         "source": source.path.name,
         "source_nodata": source.nodata,
         "value_gain": source.gain,
@@ -194,8 +203,9 @@ def rectify(
 ) -> None:
     """Resample both images of a pair into the Zarr grids of its epipolar model.
 
-    Grids hold ``image`` uint16 [y, x], 0 where there is no value, and, of images with a mask,
-    ``mask`` uint8 [y, x], 1 where it hides the image; their attributes carry the model
+    Grids hold ``image`` uint16 [y, x], 0 where there is no value; of images in colour ``red``,
+    ``green`` and ``blue`` likewise, and of images with a mask ``mask`` uint8 [y, x], 1 where it
+    hides the image; their attributes carry the model
     and ``provenance``, those of the left one ``left_attrs`` too. ``epipolar_json``: where the model
     goes. All three products appear when they are whole, or not at all.
 
@@ -223,6 +233,10 @@ def rectify(
                     },
                 )
             }
+            if source.colour:
+                for name in COLOURS:
+                    said = {"long_name": f"{name} of the {view} epipolar image"}
+                    layers[name] = replace(layers["image"], attrs=layers["image"].attrs | said)
             if source.masks:
                 layers["mask"] = Layer("uint8", 0, MASK | {"of": f"the {view} epipolar image"})
             attrs = {
@@ -246,6 +260,7 @@ def rectify(
             made_of = {
                 "image": file_sha256(source.path),
                 "size": source.size,
+                "bands": [source.mix, source.colour],
                 "model": image.to_dict(),
                 "code": code,
             }

@@ -1,4 +1,4 @@
-"""TIFF and PNG files of one band: read and written in one place, no georeference expected."""
+"""TIFF and PNG files of one band or three: read and written in one place, not georeferenced."""
 
 from __future__ import annotations
 
@@ -28,21 +28,26 @@ def write_tiff(
     half: bool = False,
     description: str = "",
 ) -> None:
-    """A one-band deflate TIFF that libtiff's readers open; ``half`` stores float32 in 16 bits.
+    """A deflate TIFF of [h, w] or [3, h, w] that libtiff's readers open.
+
+    ``half`` stores float32 in 16 bits.
 
     GDAL writes IEEE half precision for 32-bit float with NBITS=16. Values must be rounded to
     half precision before.
     """
-    rows, cols = array.shape
+    bands = array if array.ndim == 3 else array[None]
+    rows, cols = array.shape[-2:]
     integer = np.issubdtype(array.dtype, np.integer)
     options: dict[str, Any] = {"nbits": 16} if half else {}
+    if array.ndim == 3:
+        options |= {"photometric": "RGB", "interleave": "pixel"}
     with open_raster(
         path,
         "w",
         driver="GTiff",
         width=cols,
         height=rows,
-        count=1,
+        count=len(bands),
         dtype=array.dtype,
         nodata=nodata,
         compress="deflate",
@@ -50,7 +55,7 @@ def write_tiff(
         blockysize=min(rows, 64),
         **options,
     ) as dataset:
-        dataset.write(array, 1)
+        dataset.write(bands)
         if description:
             dataset.update_tags(TIFFTAG_IMAGEDESCRIPTION=description)
 
@@ -103,11 +108,13 @@ def _opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def read_tile(path: Path) -> Floats:
-    """The band of an exported TIFF, float64[h, w]; NaN where it is nodata."""
+    """The band of an exported TIFF, or the mean of three, float64[h, w]; NaN where it is nodata."""
     with open_raster(path) as dataset:
-        values = dataset.read(1).astype(np.float64)
-        values[values == dataset.nodata] = np.nan
-        return values
+        bands = dataset.read().astype(np.float64)
+        missing = (bands == dataset.nodata).all(axis=0)
+    values = bands[0] if len(bands) == 1 else bands.mean(axis=0)
+    values[missing] = np.nan
+    return values
 
 
 def read_labels(path: str | Path) -> tuple[NDArray[Any], float | None]:

@@ -12,6 +12,7 @@ from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.epipolar.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.products.grids import open_grid
 
@@ -245,3 +246,28 @@ def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
     assert hidden[inside].all() and inside.sum() > 300
     assert not hidden[outside].any()
     assert left.mask.attrs["flag_meanings"] == "seen masked"
+
+
+def test_colours_are_rectified_alike(tmp_path: Path) -> None:
+    """A colour is what a grey image of its values alone would be; the image is the bands' mix."""
+    sensors = pair()
+    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
+    grey = render(sensors[0], HEIGHT)
+    bands = [(grey // k).astype(np.uint16) + 1 for k in (1, 2, 3)]
+    stores = {}
+    mix = Settings(panchromatic={1: 1, 2: 1})
+    for name, pixels, given in (("rgb", np.stack(bands), mix), ("green", bands[1], None)):
+        options = {"photometric": "RGB"} if name == "rgb" else {}
+        images = [write_image(tmp_path / f"{n}.tif", None, pixels, **options) for n in "lr"]
+        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
+        with open_pair(*images, bands=given) as opened:
+            rectify(*opened, model, *out)
+        stores[name] = open_grid(out[1])
+    rgb = stores["rgb"]
+    np.testing.assert_array_equal(rgb.green, stores["green"].image)
+    assert rgb.green.attrs["nodata"] == 0 and rgb.green.attrs["units"] == "1"
+    assert rgb.attrs["resampling"]["mix"] == {"band 1": 0.5, "band 2": 0.5}
+    assert "mix" not in stores["green"].attrs["resampling"]
+    mixed = (rgb.red.values.astype(float) + rgb.green.values) / 2
+    assert np.abs(mixed - rgb.image).max() <= 1.0
+    assert (rgb.red.values > rgb.blue.values)[rgb.image.values > 0].all()
