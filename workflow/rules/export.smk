@@ -15,6 +15,7 @@ rule export:
         tiles=directory("tiles/{city}"),
         summary="results/export/{city}/summary.json",
         matches="results/export/{city}/matches.csv",
+        ground_looks=directory("results/export/{city}/quick_looks"),
         coverage=report(
             "results/export/{city}/coverage.png",
             caption="../report/coverage.rst",

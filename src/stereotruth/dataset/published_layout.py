@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..job import progress
 from ..products.files import whole_folder, write_table
 from ..products.provenance import file_sha256
+from .footprints import read_footprints, write_footprints
 from .manifest import read_manifest
 from .split_names import NO_TRUTH, NONE, SPLITS, TRUTH
 from .splits import shared_ground
@@ -44,6 +45,7 @@ Conventions
   not here. Splits are contiguous regions. {shared}
 - quality in manifest.csv: ok, or the limits that the pair's labels exceed when held against its
   images (SIFT matches, image warping); class: building or vegetation.
+- footprints.geojson: where the pairs lie on the ground, with a style for QGIS.
 - manifest.csv: a row per pair with scene, window, offset, counts, split and SHA-256 of each file.
 """
 
@@ -94,6 +96,7 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
             log.warning("%s and %s share ground and are in different splits", a, b)
         if rows:
             write_table(scratch / "manifest.csv", rows)
+        write_footprints(scratch, _footprints(folders, rows))
         text = README.format(
             counts="\n".join(f"  {count:5d} pairs  {place}" for place, count in counts.items()),
             nodata=" or ".join(sorted(nodata)),
@@ -104,6 +107,17 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
     for place, count in sorted(counts.items()):
         log.info("%s/%s: %d pairs", out, place, count)
     return {"pairs": dict(counts), "shared_ground": shared}
+
+
+def _footprints(
+    folders: Iterable[Path], rows: Iterable[Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Where the dataset's pairs lie; ``rows`` of its manifest."""
+    found = {name: one for folder in folders for name, one in read_footprints(folder).items()}
+    for row in rows:
+        if one := found.get(row["tile"]):
+            files = {kind: row[kind] or None for kind in ("left", "right", "disp")}
+            yield one | {"properties": one["properties"] | files}
 
 
 def _copy(
