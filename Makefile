@@ -55,6 +55,6 @@ lock:
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset logs benchmark benchmarks audit
+	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark benchmarks audit
 
 FORCE:

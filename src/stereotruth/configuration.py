@@ -18,7 +18,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from .alignment.settings import Settings as Alignment
-from .dataset.settings import Evaluation, Limits, Tiles
+from .dataset.settings import Dataset, Evaluation, Limits, Tiles
 from .disparity.settings import Occlusion, Project, check_fill
 from .epipolar.settings import Settings as Rectify
 from .evaluation.audit.settings import Settings as Audit
@@ -71,6 +71,7 @@ class Configuration:
     tiles: Tiles = field(default_factory=Tiles)
     evaluation: Evaluation = field(default_factory=Evaluation)
     quality: Limits = field(default_factory=Limits)
+    dataset: Dataset = field(default_factory=Dataset)
 
     strips: Annotated[Strips | dict[str, Strips], Unit("number, or scene: number")] = 1
     """jobs among which the grid of a scene is shared, each for some rows of blocks of 1024 px; for

@@ -27,6 +27,7 @@ REACH = {
     "project_right": {"disparity", "alignment", "epipolar", "lidar", "products"},
     "project_strip": {"disparity", "alignment", "epipolar", "lidar", "products"},
     "export": {"dataset", "epipolar", "products"},
+    "originals": {"dataset", "epipolar", "products"},
     "dataset": {"dataset", "products"},
     "grid_truth": {"evaluation", "epipolar", "simulate", "products"},
     "evaluate_truth": {"evaluation", "dataset", "products"},

@@ -58,11 +58,40 @@ rule export:
         "../scripts/export.py"
 
 
+rule originals:
+    input:
+        tiles="tiles/{city}",
+        left=lambda w: [s.left_image for s in scenes_of(w.city)],
+        right=lambda w: [s.right_image for s in scenes_of(w.city)],
+    output:
+        directory("originals/{city}"),
+    log:
+        "logs/originals/{city}.log",
+    benchmark:
+        "benchmarks/originals/{city}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        made=lambda w: making_of(rules.originals, w),
+        scenes=lambda w: [s.scene for s in scenes_of(w.city)],
+        code=source_digest("dataset.originals"),
+    message:
+        "Cropping the original images of {wildcards.city}"
+    script:
+        "../scripts/originals.py"
+
+
 rule dataset:
     input:
-        expand("tiles/{city}", city=CITIES),
+        tiles=expand("tiles/{city}", city=CITIES),
+        originals=expand("originals/{city}", city=CITIES if SETTINGS.dataset.originals else []),
     output:
         directory("dataset"),
+        [directory(f"dataset_{name}") for name in SETTINGS.dataset.layouts if name != "whu"],
     log:
         "logs/dataset/dataset.log",
     benchmark:
@@ -75,7 +104,8 @@ rule dataset:
         runtime=60,
     params:
         made=lambda w: making_of(rules.dataset, w),
-        code=source_digest("dataset.published_layout"),
+        layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
+        code=source_digest("dataset.published_layout", "dataset.other_layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"
     script:

@@ -38,6 +38,21 @@ class Tiles:
 
 
 @settings
+class Dataset:
+    """The configuration's section dataset."""
+
+    layouts: tuple[Literal["whu", "kitti", "us3d"], ...] = ("whu",)
+    """what the target `dataset` writes: `dataset/` in the layout of the published WHU-Stereo
+    (always); `dataset_kitti/` with 16-bit PNGs, which cannot hold negative disparities: right
+    images are moved by `shift_px` of its manifest, so that the smallest disparity of each pair is 1
+    to 2 px; `dataset_us3d/` with RGB images of 8 bits"""
+
+    originals: Flag = False
+    """true: crops of the original images for each tile with corrected RPCs (tag and `_RPC.TXT`), in
+    `originals/<city>/`, for multi-view and neural reconstruction"""
+
+
+@settings
 class Evaluation:
     """The configuration's section evaluation."""
 

@@ -19,6 +19,8 @@ from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
 
+KITTI_STEPS = 256  # in a px of disparity, of PNGs
+
 
 def write_tiff(
     path: Path,
@@ -85,12 +87,16 @@ def image_shape(path: str | Path) -> tuple[int, int]:
 def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float32]:
     """A disparity map, float32[h, w] px; NaN where it is nodata (given or tagged) or not finite.
 
+    A PNG of 16 bits has KITTI's coding: KITTI_STEPS in a px, 0 where there is none.
+
     Raises InputError if it cannot be read.
     """
     with _opened(path) as source:
         values = source.read(1).astype(np.float32)
         missing = values == np.float32(nodata)
-        if source.nodata is not None:
+        if _is_kitti(source):
+            missing, values = values == 0, values / np.float32(KITTI_STEPS)
+        elif source.nodata is not None:
             missing |= values == np.float32(source.nodata)
     values[missing | ~np.isfinite(values)] = np.nan
     return values
@@ -118,9 +124,13 @@ def read_tile(path: Path) -> Floats:
 
 
 def read_labels(path: str | Path) -> tuple[NDArray[Any], float | None]:
-    """The band of a label file as it is, and its nodata tag."""
+    """The band of a label file as it is, and its nodata tag, or what stands for nodata in a PNG."""
     with open_raster(path) as dataset:
-        return dataset.read(1), dataset.nodata
+        return dataset.read(1), 0.0 if _is_kitti(dataset) else dataset.nodata
+
+
+def _is_kitti(dataset: rasterio.DatasetReader) -> bool:
+    return dataset.driver == "PNG" and dataset.dtypes[0] == "uint16"
 
 
 def read_flags(path: str | Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
