@@ -28,7 +28,7 @@ REACH = {
     "project_strip": {"disparity", "alignment", "epipolar", "lidar", "products"},
     "export": {"dataset", "epipolar", "products"},
     "originals": {"dataset", "epipolar", "products"},
-    "dataset": {"dataset", "products"},
+    "dataset": {"dataset", "epipolar", "products"},
     "grid_truth": {"evaluation", "epipolar", "simulate", "products"},
     "evaluate_truth": {"evaluation", "dataset", "products"},
     "evaluate_truth_city": {"evaluation", "dataset", "products"},

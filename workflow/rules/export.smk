@@ -104,6 +104,10 @@ rule dataset:
         runtime=60,
     params:
         made=lambda w: making_of(rules.dataset, w),
+        catalogs={
+            "catalogs": list(SETTINGS.dataset.catalogs),
+            "acquired": SETTINGS.dataset.acquired,
+        },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
         code=source_digest("dataset.published_layout", "dataset.other_layouts"),
     message:

@@ -11,6 +11,6 @@ if __name__ == "__main__":
         job(snakemake.log[0], "dataset"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
-        assemble_dataset(snakemake.input.tiles, dataset)
+        assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):
             write_layout(dataset, out, layout)

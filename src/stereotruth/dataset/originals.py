@@ -23,7 +23,8 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.rpc import RPC as RasterioRPC
 from rasterio.windows import Window
 
-from ..epipolar.rpc import RPC, SCALARS, VECTORS
+from ..epipolar.rpc import RPC
+from ..epipolar.rpc_files import rpc_text
 from ..errors import InputError
 from ..job import progress
 from ..products.files import whole_folder, write_table
@@ -33,7 +34,6 @@ from .manifest import read_manifest
 from .orientation import evaluate
 
 MARGIN_PX = 16  # of the crops around what the tiles show
-UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
 README = """Crops of the original images, with corrected RPCs
 
   {left,right}/<tile>.tif, <tile>_RPC.TXT   what the tile's left and right image show
@@ -136,15 +136,3 @@ def _crop(
     place = dict(zip(("col0", "row0", "cols", "rows"), (*low, cols, rows)))
     found = {f"{view}_{name}": value for name, value in place.items()}
     return found | {f"{view}_rpc_max_error_px": record["corrected_rpc_max_error_px"]}
-
-
-def rpc_text(rpc: RPC) -> str:
-    """``_RPC.TXT`` with all digits."""
-    values = rpc.to_dict()
-    lines = [
-        f"{name.upper()}: {values[name]!r} {UNITS.get(name.split('_')[0], 'meters')}"
-        for name in SCALARS
-    ]
-    for name in VECTORS:
-        lines += [f"{name.upper()}_{k}: {value!r}" for k, value in enumerate(values[name], 1)]
-    return "\n".join(lines) + "\n"

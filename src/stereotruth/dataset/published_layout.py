@@ -10,6 +10,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from ..errors import InputError
@@ -55,8 +56,17 @@ def _rounding(rows: Sequence[dict[str, str]]) -> str:
     return f"Stored values are rounded by at most {largest:.4f} px."
 
 
-def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[str, Any]:
+def assemble_dataset(
+    tile_dirs: Iterable[str | Path],
+    out: str | Path,
+    *,
+    catalogs: Sequence[str] = (),
+    acquired: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
     """Copy the cities' tiles to ``out`` in the published layout, with a manifest and a README.
+
+    ``catalogs``: stac, croissant, see :mod:`.stac_catalog` and :mod:`.croissant`; ``acquired``:
+    dates by scene.
 
     Each file is held against its manifest's checksum on the way. Tiles of split ``none`` (they
     share ground with two splits) stay behind. Returns counts by folder, and the pairs of tiles
@@ -94,9 +104,15 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
         shared = shared_ground(*(folder / "manifest.csv" for folder in folders))
         for a, b in shared:
             log.warning("%s and %s share ground and are in different splits", a, b)
+        footprints = {one["id"]: one for one in _footprints(folders, rows)}
+        write_footprints(scratch, footprints.values())
+        if rows and "stac" in catalogs:
+            where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
+            _module("stac").write_stac(scratch, rows, where, footprints, acquired or {})
         if rows:
             write_table(scratch / "manifest.csv", rows)
-        write_footprints(scratch, _footprints(folders, rows))
+        if rows and "croissant" in catalogs:
+            _module("croissant").write_croissant(scratch)
         text = README.format(
             counts="\n".join(f"  {count:5d} pairs  {place}" for place, count in counts.items()),
             nodata=" or ".join(sorted(nodata)),
@@ -107,6 +123,21 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
     for place, count in sorted(counts.items()):
         log.info("%s/%s: %d pairs", out, place, count)
     return {"pairs": dict(counts), "shared_ground": shared}
+
+
+def _module(catalog: str) -> ModuleType:
+    """The module that writes a catalog, with libraries that not everyone needs."""
+    try:
+        if catalog == "stac":
+            from . import stac_catalog as module
+        else:
+            from . import croissant as module
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"dataset.catalogs: {catalog} needs {error.name}, which is not installed",
+            remedy="pip install 'stereotruth[catalog]', or leave it out",
+        ) from None
+    return module
 
 
 def _footprints(

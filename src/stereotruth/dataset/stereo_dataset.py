@@ -81,7 +81,7 @@ class StereoDataset:
     """
 
     name: str
-    root: Path
+    root: str | Path
     layout: str
     disparity_range: tuple[int, int]
     nodata: float = float(Settings.nodata)

@@ -17,7 +17,10 @@ log = logging.getLogger("stereotruth")
 
 
 # files that the manifest does not list; STYLE is the user's to change
-LOOSE = {"manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE}
+LOOSE = (
+    *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE),
+    *("croissant.json", "stac/collection.json", "stac/rpc/*"),
+)
 FOREIGN = (  # what other programs leave beside the files that they open; in lower case
     "*.aux.xml",  # GDAL, QGIS: statistics
     "*.ovr",  # GDAL, QGIS: pyramids
@@ -51,7 +54,9 @@ def defects(folder: str | Path) -> list[str]:
         for p in files
         if not p.name.startswith(".") and not _is_foreign(p)
     }
-    found += [f"{name}: not in the manifest" for name in sorted(present - listed - LOOSE)]
+    found += [
+        f"{name}: not in the manifest" for name in sorted(present - listed) if not _is_loose(name)
+    ]
     if (record := folder / "export.json").is_file():
         said = json.loads(record.read_text(encoding="utf-8"))
         for name, key in (("manifest.csv", "manifest_sha256"), (FOOTPRINTS, "footprints_sha256")):
@@ -60,6 +65,10 @@ def defects(folder: str | Path) -> list[str]:
             elif file_sha256(folder / name) != said[key]:
                 found.append(f"{name}: changed")
     return found
+
+
+def _is_loose(name: str) -> bool:
+    return any(fnmatch(name, pattern) for pattern in LOOSE)
 
 
 def _is_foreign(path: Path) -> bool:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
@@ -76,6 +76,20 @@ def read_image(path: str | Path) -> NDArray[Any]:
     if bands.dtype not in (np.uint8, np.uint16):
         bands = np.nan_to_num(bands.astype(np.float32), copy=False)
     return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
+
+
+class ImageFacts(NamedTuple):
+    """Bands, type of their values, and nodata tag of an image."""
+
+    bands: int
+    dtype: str
+    nodata: float | None
+
+
+def image_facts(path: str | Path) -> ImageFacts:
+    """Of an image file. Raises InputError if it cannot be read."""
+    with _opened(path) as source:
+        return ImageFacts(source.count, source.dtypes[0], source.nodata)
 
 
 def image_shape(path: str | Path) -> tuple[int, int]:
