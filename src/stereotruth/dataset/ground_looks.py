@@ -55,7 +55,7 @@ def write_ground_looks(folder: Path, source: SceneStores) -> list[Path]:
     inside = (x >= 0) & (y >= 0) & (x <= height.shape[1] - 1) & (y <= height.shape[0] - 1)
     j, i = (np.where(inside, np.rint(value), 0).astype(int) for value in (y, x))
     left = np.stack([_linear(band, y, x) for band in np.moveaxis(image, -1, 0)], axis=-1)
-    left[~(image != 0).any(axis=-1)[j, i] | ~inside] = 0
+    left[_linear((image != 0).any(axis=-1), y, x) < 1.0 - 1e-6] = 0
     labels = np.where(inside, disparity[j, i], np.nan)
     made = []
     for name, picture, alpha in (
