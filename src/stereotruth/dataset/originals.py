@@ -106,7 +106,7 @@ def _crop(
         options = {
             "photometric": "RGB" if source.colorinterp[0] == ColorInterp.red else "MINISBLACK",
             "compress": "deflate",
-            "predictor": 3 if source.dtypes[0].startswith("float") else 2,
+            "predictor": 1 if source.dtypes[0].startswith("float") else 2,
             "tiled": True,
         }
         with (

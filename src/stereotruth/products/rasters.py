@@ -168,7 +168,7 @@ def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
             dtype="float32",
             nodata=np.nan,
             compress="deflate",
-            predictor=3,
+            predictor=1,  # readers without libtiff know no float predictor
             tiled=True,
         ) as target,
     ):
