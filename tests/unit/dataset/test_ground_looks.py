@@ -10,6 +10,7 @@ import rasterio
 from stereotruth.dataset.ground_looks import write_ground_looks
 from stereotruth.dataset.scene_stores import open_stores
 
+from ...synthetic.other_programs import PROGRAMS
 from ...synthetic.tiled_scene import make_scene, terrain, texture
 
 
@@ -25,6 +26,11 @@ def test_a_quick_look_shows_what_is_there(tmp_path, colour) -> None:
         assert dataset.crs.to_epsg() == 32650
         assert [c.name for c in dataset.colorinterp] == ["red", "green", "blue", "alpha"]
         assert 0.5 < to_map.a == -to_map.e < 1.5
+    for name, program in PROGRAMS.items():
+        found = program(left)
+        if name == "OpenCV":  # alpha came last
+            found = np.roll(found, -1, axis=-1)
+        np.testing.assert_array_equal(found, np.moveaxis(bands, 0, -1), err_msg=name)
     shown = bands[3] > 0
     assert shown.mean() > 0.5
     rows, cols = np.nonzero(shown)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import Source, open_pair
@@ -237,6 +238,8 @@ def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
             rectify(*opened, model, *out)
         found[name] = [open_grid(path) for path in out[1:]]
     left, right = found["masked"]
+    with xr.open_zarr(tmp_path / "masked/left.zarr") as alone:
+        np.testing.assert_array_equal(alone["mask"], left.mask)
     assert "mask" not in right and "mask" not in found["clear"][0]
     np.testing.assert_array_equal(left.image, found["clear"][0].image)
     col, row = model.epipolar_to_left(*np.indices(model.shape)[::-1])
@@ -264,6 +267,8 @@ def test_colours_are_rectified_alike(tmp_path: Path) -> None:
             rectify(*opened, model, *out)
         stores[name] = open_grid(out[1])
     rgb = stores["rgb"]
+    with xr.open_zarr(tmp_path / "rgb/left.zarr") as alone:
+        np.testing.assert_array_equal(alone["green"], rgb.green)
     np.testing.assert_array_equal(rgb.green, stores["green"].image)
     assert rgb.green.attrs["nodata"] == 0 and rgb.green.attrs["units"] == "1"
     assert rgb.attrs["resampling"]["mix"] == {"band 1": 0.5, "band 2": 0.5}
