@@ -23,19 +23,23 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 RANGE = (-64, 200)
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["grey", "colour"])
-def dataset(request, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("dataset")
-    run([make_scene(folder / "s1", bare_from=240, colour=request.param)], folder / "Town")
-    assemble_dataset([folder / "Town"], folder / "dataset")
-    return folder / "dataset"
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, found = tmp_path_factory.mktemp("dataset"), {}
+    for kind in ("grey", "colour"):
+        scene = make_scene(folder / kind / "s1", bare_from=240, colour=kind == "colour")
+        run([scene], folder / kind / "Town")
+        found[kind] = folder / kind / "dataset"
+        assemble_dataset([folder / kind / "Town"], found[kind])
+    return found
 
 
-@pytest.fixture(scope="module", params=["kitti", "us3d"])
-def written(request, dataset, tmp_path_factory) -> tuple[str, Path, Path]:
-    out = tmp_path_factory.mktemp("layout") / request.param
-    assert write_layout(dataset, out, request.param) >= 10
-    return request.param, dataset, out
+@pytest.fixture(scope="module", params=["kitti-grey", "kitti-colour", "us3d-grey", "us3d-colour"])
+def written(request, datasets, tmp_path_factory) -> tuple[str, Path, Path]:
+    layout, kind = request.param.split("-")
+    out = tmp_path_factory.mktemp("layout") / layout
+    assert write_layout(datasets[kind], out, layout) >= 10
+    return layout, datasets[kind], out
 
 
 def test_the_readers_give_the_same_disparities(written) -> None:
