@@ -66,6 +66,6 @@ lock:
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset logs benchmark audit report.html bench/out .snakemake
+	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark audit report.html bench/out .snakemake
 
 FORCE:

@@ -18,8 +18,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from .alignment.settings import Settings as Alignment
-from .dataset.settings import Evaluation, Limits, Tiles
+from .dataset.settings import Dataset, Evaluation, Limits, Tiles
 from .disparity.settings import Occlusion, Project
+from .epipolar.settings import Settings as Rectify
 from .evaluation.audit.settings import Settings as Audit
 from .lidar.settings import Settings as Ingest
 from .matching.benchmark.settings import Settings as Benchmark
@@ -64,11 +65,13 @@ class Configuration:
     simulate: Simulate = field(default_factory=Simulate)
     ingest: Ingest = field(default_factory=Ingest)
     alignment: Alignment = field(default_factory=Alignment)
+    rectify: Rectify = field(default_factory=Rectify)
     occlusion: Occlusion = field(default_factory=Occlusion)
     project: Project = field(default_factory=Project)
     tiles: Tiles = field(default_factory=Tiles)
     evaluation: Evaluation = field(default_factory=Evaluation)
     quality: Limits = field(default_factory=Limits)
+    dataset: Dataset = field(default_factory=Dataset)
 
     strips: Annotated[Strips | dict[str, Strips], Unit("number, or scene: number")] = 1
     """jobs among which the grid of a scene is shared, each for some rows of blocks of 1024 px; for

@@ -117,7 +117,7 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
         sheets.require_files(scene, rows, ["gcps"])
         made = lidar_files(SYNTHETIC[scene.city], scene.scene)
         return sheets.store_names([Path(scene.lidar) / file for file in made])
-    sheets.require_files(scene, rows, ["left_image", "right_image", "gcps", "geoid"])
+    sheets.require_files(scene, rows, sheets.FILES)
     return sheets.store_names(sheets.find_lidar(scene, rows))
 
 

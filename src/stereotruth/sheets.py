@@ -11,8 +11,8 @@ import difflib
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -84,9 +84,20 @@ class Scene:
     scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
     images lie on the LiDAR: the attribute `alignment_sigma` of `left.zarr` says how well"""
 
+    left_mask: Text = ""
+    """optional column: a raster on the left image's grid, not zero where the image is not to be
+    used (cloud, water, anything): no labels, no tie points, no correlation there; the pixels have
+    the status `masked` (11), as have those that the image's own mask or alpha band hides. The tile
+    shows them all the same, but for the image's own mask"""
 
-def _read_table(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """(line number, cells) of each row of a tab-separated sheet."""
+    right_mask: Text = ""
+    """likewise, of the right image"""
+
+
+def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
+    """(line number, cells) of each row of a tab-separated sheet; a cell is empty where none is."""
+    columns = [f.name for f in fields(sheet)]
+    needed = [f.name for f in fields(sheet) if f.default is MISSING]
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -101,14 +112,18 @@ def _read_table(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str,
     if not numbered:
         raise InputError("empty sheet", file=path, remedy=f"its columns are {', '.join(columns)}")
     header = numbered[0][1]
-    missing = [c for c in columns if c not in header]
+    missing = [c for c in needed if c not in header]
     unknown = [c for c in header if c not in columns]
     if missing or unknown:
         tabs = "" if len(header) > 1 else " (are the columns separated by tabs?)"
         wrong = [f"column {c!r} is missing" for c in missing]
         wrong += [f"column {c!r} is unknown" for c in unknown]
+        optional = [c for c in columns if c not in needed]
+        more = f"; {' and '.join(optional)} may be left out" if optional else ""
         raise InputError(
-            "; ".join(wrong) + tabs, file=path, remedy=f"the columns are {', '.join(columns)}"
+            "; ".join(wrong) + tabs,
+            file=path,
+            remedy=f"the columns are {', '.join(columns)}{more}",
         )
     table = []
     for number, row in numbered[1:]:
@@ -119,7 +134,7 @@ def _read_table(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str,
                 remedy="remove the surplus tab",
             )
         row += [""] * (len(header) - len(row))
-        table.append((number, dict(zip(header, row))))
+        table.append((number, dict.fromkeys(columns, "") | dict(zip(header, row))))
     return table
 
 
@@ -137,7 +152,7 @@ def read_cities(path: str | Path) -> dict[str, City]:
     """The cities sheet by name of the city. Raises InputError as described in the module."""
     path = Path(path)
     cities = {}
-    rows = _read_table(path, [f.name for f in fields(City)])
+    rows = _read_table(path, City)
     for number, cells in rows:
         values: dict[str, Any] = dict(cells)
         for count in ("training", "validation", "testing"):
@@ -158,7 +173,7 @@ def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene
     """The scenes sheet by id of the scene. Raises InputError as described in the module."""
     path = Path(path)
     scenes = {}
-    rows = _read_table(path, [f.name for f in fields(Scene)])
+    rows = _read_table(path, Scene)
     for number, cells in rows:
         scene = check(cells, Scene, f"{path}, line {number}")
         if cells["city"] not in cities:
@@ -178,6 +193,9 @@ def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene
         scenes[scene.scene] = scene
     _unique([cells["scene"] for _, cells in rows], "scene", path)
     return scenes
+
+
+FILES = ("left_image", "right_image", "gcps", "geoid", "left_mask", "right_mask")  # of a scene
 
 
 def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> None:

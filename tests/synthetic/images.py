@@ -22,13 +22,13 @@ def write_image(path: Path, rpc: RPC | None, pixels: np.ndarray | None = None, *
             path,
             "w",
             driver="GTiff",
-            width=pixels.shape[1],
-            height=pixels.shape[0],
-            count=1,
+            width=pixels.shape[-1],
+            height=pixels.shape[-2],
+            count=len(pixels) if pixels.ndim == 3 else 1,
             dtype=pixels.dtype,
             **options,
         ) as dataset:
-            dataset.write(pixels, 1)
+            dataset.write(np.atleast_3d(pixels.T).T)
             if rpc is not None:
                 dataset.rpcs = to_rasterio(rpc)
     return path

@@ -1,4 +1,7 @@
-"""What others open rasters with, by name: functions from a path to the values [h, w]."""
+"""What others open rasters with, by name: functions from a path to the values [h, w] or [h, w, 3].
+
+Pillow has 8 bits at most of each colour, and gives those of most weight.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,14 @@ import rioxarray
 from PIL import Image
 
 
+def _last(bands: np.ndarray) -> np.ndarray:
+    return bands[0] if len(bands) == 1 else np.moveaxis(bands, 0, -1)
+
+
 def _opencv(path: Path) -> np.ndarray:
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert values is not None, f"OpenCV cannot read {path}"
-    return values
+    return values if values.ndim == 2 else values[..., ::-1]
 
 
 def _pillow(path: Path) -> np.ndarray:
@@ -25,12 +32,12 @@ def _pillow(path: Path) -> np.ndarray:
 
 def _gdal(path: Path) -> np.ndarray:
     with rasterio.open(path) as dataset:
-        return dataset.read(1)
+        return _last(dataset.read())
 
 
 def _rioxarray(path: Path) -> np.ndarray:
     with rioxarray.open_rasterio(path) as array:
-        return array.values[0]
+        return _last(array.values)
 
 
 def _tifffile(path: Path) -> np.ndarray:

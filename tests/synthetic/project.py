@@ -121,8 +121,10 @@ class Project:
         """Write sheets and a config for a city of one's own; returns the config's file name."""
         import yaml
 
-        lines = ["\t".join(SHEET_COLUMNS)]
-        lines += ["\t".join(row.get(c, "") for c in SHEET_COLUMNS) for row in rows]
+        more = dict.fromkeys(c for row in rows for c in row if c not in SHEET_COLUMNS)
+        columns = [*SHEET_COLUMNS, *more]
+        lines = ["\t".join(columns)]
+        lines += ["\t".join(row.get(c, "") for c in columns) for row in rows]
         (self.folder / f"{name}_scenes.tsv").write_text("\n".join(lines) + "\n")
         cities = ["city\tprefix\ttraining\tvalidation\ttesting"]
         for n, city in enumerate(dict.fromkeys(row["city"] for row in rows)):

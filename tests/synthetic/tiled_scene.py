@@ -12,6 +12,7 @@ import rasterio
 from stereotruth.dataset.export import export_city
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.settings import Limits, Settings
+from stereotruth.epipolar.colours import COLOURS
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.products.grids import Layer, building, create_grid
@@ -71,16 +72,19 @@ def make_scene(
     texture: Callable[[np.ndarray, np.ndarray], np.ndarray] = texture,
     label_offset: float = 0.0,
     row_shift: float = 0.0,
+    colour: bool = False,
 ) -> SceneFiles:
     """Stores of one scene; labels end at epipolar row ``bare_from``.
 
-    Planted errors: of the labels (px), and of the right image's rows (px, down).
+    Planted errors: of the labels (px), and of the right image's rows (px, down). ``colour``: with
+    red, green and blue beside the grey images.
     """
     left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
     model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
     y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
     attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
-    layers = {"image": Layer("uint16", 0, {"units": "1", "long_name": "grey value"})}
+    layer = Layer("uint16", 0, {"units": "1", "long_name": "grey value"})
+    layers = dict.fromkeys(("image", *(COLOURS if colour else ())), layer)
     frames = []
     for name, to_sensor, sensor, shift in (
         ("left", model.epipolar_to_left, left, 0.0),
@@ -93,6 +97,8 @@ def make_scene(
         with building(folder / f"{name}.zarr") as path:
             array = create_grid(path, model.shape, layers, chunk=64, shard=128, attrs=attrs)
             array["image"][:] = grey
+            for k, band in enumerate(COLOURS if colour else ()):
+                array[band][:] = grey + np.uint16(300 * k) * (grey > 0)
         frames.append((inside, lon, lat, height))
     inside, lon, lat, height = frames[0]
     ground = model.ground_to_epipolar(lon.ravel(), lat.ravel(), height.ravel())

@@ -15,6 +15,7 @@ rule export:
         tiles=directory("tiles/{city}"),
         summary="results/export/{city}/summary.json",
         matches="results/export/{city}/matches.csv",
+        ground_looks=directory("results/export/{city}/quick_looks"),
         coverage=report(
             "results/export/{city}/coverage.png",
             caption="../report/coverage.rst",
@@ -58,11 +59,41 @@ rule export:
         "../scripts/export.py"
 
 
+rule originals:
+    input:
+        tiles="tiles/{city}",
+        left=lambda w: [s.left_image for s in scenes_of(w.city)],
+        right=lambda w: [s.right_image for s in scenes_of(w.city)],
+    output:
+        directory("originals/{city}"),
+    log:
+        "logs/originals/{city}.log",
+    benchmark:
+        "logs/originals/{city}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        made=lambda w: making_of(rules.originals, w),
+        script=content_of("../scripts/originals.py"),
+        scenes=lambda w: [s.scene for s in scenes_of(w.city)],
+        code=source_digest("dataset.originals"),
+    message:
+        "Cropping the original images of {wildcards.city}"
+    script:
+        "../scripts/originals.py"
+
+
 rule dataset:
     input:
-        expand("tiles/{city}", city=CITIES),
+        tiles=expand("tiles/{city}", city=CITIES),
+        originals=expand("originals/{city}", city=CITIES if SETTINGS.dataset.originals else []),
     output:
         directory("dataset"),
+        [directory(f"dataset_{name}") for name in SETTINGS.dataset.layouts if name != "whu"],
     log:
         "logs/dataset/dataset.log",
     benchmark:
@@ -76,7 +107,12 @@ rule dataset:
     params:
         made=lambda w: making_of(rules.dataset, w),
         script=content_of("../scripts/dataset.py"),
-        code=source_digest("dataset.published_layout"),
+        catalogs={
+            "catalogs": list(SETTINGS.dataset.catalogs),
+            "acquired": SETTINGS.dataset.acquired,
+        },
+        layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
+        code=source_digest("dataset.published_layout", "dataset.other_layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"
     script:

@@ -18,6 +18,14 @@ def right_image(wildcards):
     return with_rpc_files(SCENES[wildcards.scene].right_image)
 
 
+def left_mask(wildcards):
+    return SCENES[wildcards.scene].left_mask or []
+
+
+def right_mask(wildcards):
+    return SCENES[wildcards.scene].right_mask or []
+
+
 def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
     if given := SETTINGS.alignment.fixed.get(wildcards.scene):

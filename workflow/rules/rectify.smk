@@ -2,6 +2,8 @@ rule rectify:
     input:
         left=left_image,
         right=right_image,
+        left_mask=left_mask,
+        right_mask=right_mask,
         alignment=alignment_of,
         strips=lambda w: strips_made(w, "results/rectify/{city}/{scene}/strips/{strip}.json"),
     output:
@@ -21,6 +23,7 @@ rule rectify:
     params:
         made=lambda w: making_of(rules.rectify, w),
         script=content_of("../scripts/rectify.py"),
+        bands=asdict(SETTINGS.rectify),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",
@@ -37,6 +40,8 @@ rule rectify_strip:
     input:
         left=left_image,
         right=right_image,
+        left_mask=left_mask,
+        right_mask=right_mask,
         alignment=alignment_of,
     output:
         done=temp("results/rectify/{city}/{scene}/strips/{strip}.json"),
@@ -54,6 +59,7 @@ rule rectify_strip:
         made=lambda w: making_of(rules.rectify_strip, w),
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
+        bands=asdict(SETTINGS.rectify),
         code=source_digest(
             "epipolar.rectify",
             "epipolar.fit",

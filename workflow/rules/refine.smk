@@ -2,6 +2,8 @@ rule refine:
     input:
         left=left_image,
         right=right_image,
+        left_mask=left_mask,
+        right_mask=right_mask,
         alignment=rules.align.output.alignment,
         points=point_stores,
     output:
@@ -32,6 +34,7 @@ rule refine:
         made=lambda w: making_of(rules.refine, w),
         script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
+        bands=asdict(SETTINGS.rectify),
         code=source_digest("alignment.refine", "alignment.refine_report"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"

@@ -38,6 +38,7 @@ if __name__ == "__main__":
             coverage=snakemake.output.coverage,
             contact_sheet=snakemake.output.contact_sheet,
             matches=snakemake.output.matches,
+            ground_looks=snakemake.output.ground_looks,
             work=Path(snakemake.output.summary).with_name(".tiles.work"),
         )
         summary["lines"] = summary_lines(summary, snakemake.output.tiles)

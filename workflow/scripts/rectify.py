@@ -5,20 +5,23 @@ from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.provenance import describe
+from stereotruth.products.provenance import checksums, describe
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
-    files = [*snakemake.input.left, *snakemake.input.right, snakemake.input.alignment]
-    names = snakemake.input.left[0], snakemake.input.right[0]
+    given = snakemake.input
+    files = [*given.left, *given.right, given.alignment]
+    names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with (
         job(snakemake.log[0], f"rectify {scene}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
-        with open_pair(*names) as (left, right):
+        bands = Settings(**snakemake.params.bands)
+        with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(
                 alignment.left,
                 alignment.right,
@@ -36,5 +39,7 @@ if __name__ == "__main__":
                 snakemake.output.right,
                 workers=snakemake.threads,
                 left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
-                provenance=describe(files, {}, snakemake.params.code),
+                provenance=describe(
+                    checksums(files, *masks), snakemake.params.bands, snakemake.params.code
+                ),
             )

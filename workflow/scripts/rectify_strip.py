@@ -4,19 +4,22 @@ from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
-    names = snakemake.input.left[0], snakemake.input.right[0]
+    given = snakemake.input
+    names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with (
         job(snakemake.log[0], f"rectify {scene} {strip}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
-        with open_pair(*names) as (left, right):
+        bands = Settings(**snakemake.params.bands)
+        with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(
                 alignment.left,
                 alignment.right,

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..epipolar.image_reader import Source, open_pair
+from ..epipolar.settings import Settings as Bands
 from ..error_statistics import median_and_nmad
 from ..errors import InputError
 from ..lidar.point_store import PointStore, open_stores
@@ -265,6 +266,8 @@ def refine(
     right_image: str | Path,
     point_stores: Sequence[str | Path],
     *,
+    masks: tuple[str | Path | None, str | Path | None] = (None, None),
+    bands: Bands | None = None,
     strict: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> tuple[Alignment, Observations | None]:
@@ -272,13 +275,14 @@ def refine(
 
     Returns the alignment, with the record of what was done in ``refinement``, and the
     observations. It is the one that came, affines and all, if the tie points do not contradict
-    it or are too few. Reads a fixed number of places, whatever the scene's size. ``strict`` makes
+    it or are too few. Reads a fixed number of places, whatever the scene's size. ``masks``: of
+    both images, see :class:`.image_reader.Source`; ``bands``: which are looked at. ``strict`` makes
     warnings errors.
 
     Raises InputError if there are neither GCPs nor usable tie points.
     """
     of = f" (scene {alignment.scene})" if alignment.scene else ""
-    with open_pair(left_image, right_image) as (left, right):
+    with open_pair(left_image, right_image, *masks, bands=bands) as (left, right):
         stores = open_stores(sorted(Path(p) for p in point_stores))
         prior = prior_of(alignment)
         gcps = control_points_of(alignment)

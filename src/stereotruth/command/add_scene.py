@@ -61,7 +61,7 @@ def add_scene(
         "gcps": gcps,
     }
     scene = sheets.check(cells, sheets.Scene, f"scene {name}")
-    sheets.require_files(scene, rows, ["left_image", "right_image", "gcps", "geoid"])
+    sheets.require_files(scene, rows, sheets.FILES)
     found = Findings(name)
     surveyed = check_lidar(sheets.find_lidar(scene, rows), scene, found)
     for finding in found:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import InputError
 
-PAGES = ("results/report/*/index.html", "results/benchmark/*/index.html", "audit/*/index.html")
+PAGES = ("results/report/*/index.html", "benchmark/*/index.html", "audit/*/index.html")
 
 
 def pages(words: Iterable[str] = ()) -> list[Path]:

@@ -35,6 +35,8 @@ from ..errors import InputError
 from ..job import progress
 from ..products.files import growing_table, replacing, whole_folder, write_table
 from ..products.provenance import describe, file_sha256, source_digest
+from .footprints import FOOTPRINTS, feature, write_footprints
+from .ground_looks import write_ground_looks
 from .orientation import save
 from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
@@ -96,6 +98,7 @@ def export_city(
     coverage: str | Path | None = None,
     contact_sheet: str | Path | None = None,
     matches: str | Path | None = None,
+    ground_looks: str | Path | None = None,
     work: str | Path | None = None,
 ) -> dict[str, Any]:
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
@@ -104,9 +107,9 @@ def export_city(
     alignment.json (for the record) and the store of the right view's labels. ``training``,
     ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there are.
     ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
-    matches. ``work``: folder in which finished tiles wait for a later call that would make the
-    same, by default a hidden one beside ``out_dir``. Returns a summary, see
-    :func:`.summary.summary_lines`.
+    matches, ``ground_looks`` a folder of georeferenced quick looks. ``work``: folder in which
+    finished tiles wait for a later call that would make the same, by default a hidden one beside
+    ``out_dir``. Returns a summary, see :func:`.summary.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
@@ -157,6 +160,7 @@ def export_city(
         building_share=settings.building_share,
         limits=settings.quality,
         code=code or source_digest("dataset.export"),
+        flags=dict(sorted({k: v for source in sources for k, v in source.flags.items()}.items())),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=provenance,
     )
@@ -169,6 +173,9 @@ def export_city(
             None if path is None else stack.enter_context(replacing(path))
             for path in (coverage, contact_sheet)
         )
+        looks = None
+        if ground_looks is not None:
+            looks = stack.enter_context(whole_folder(ground_looks))
         scratch = stack.enter_context(whole_folder(out))
         kinds = {"left", "right", "disp", "status", "orientation"}
         if any(source.of_right is not None for source in sources):
@@ -200,8 +207,12 @@ def export_city(
         summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
         summary["quality"] = gates
         write_table(scratch / "manifest.csv", rows)
+        write_footprints(scratch, [feature(row, ring) for row, ring in written])
+        for source in sources if looks is not None else ():
+            write_ground_looks(looks, source)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
+            "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
             "provenance": provenance,
         }
         save(scratch / "export.json", record)

@@ -8,14 +8,16 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from ..errors import InputError
 from ..job import progress
 from ..products.files import whole_folder, write_table
 from ..products.provenance import file_sha256
+from .footprints import read_footprints, write_footprints
 from .manifest import read_manifest
 from .split_names import NO_TRUTH, NONE, SPLITS, TRUTH
 from .splits import shared_ground
@@ -44,6 +46,7 @@ Conventions
   not here. Splits are contiguous regions. {shared}
 - quality in manifest.csv: ok, or the limits that the pair's labels exceed when held against its
   images (SIFT matches, image warping); class: building or vegetation.
+- footprints.geojson: where the pairs lie on the ground, with a style for QGIS.
 - manifest.csv: a row per pair with scene, window, offset, counts, split and SHA-256 of each file.
 """
 
@@ -53,8 +56,17 @@ def _rounding(rows: Sequence[dict[str, str]]) -> str:
     return f"Stored values are rounded by at most {largest:.4f} px."
 
 
-def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[str, Any]:
+def assemble_dataset(
+    tile_dirs: Iterable[str | Path],
+    out: str | Path,
+    *,
+    catalogs: Sequence[str] = (),
+    acquired: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
     """Copy the cities' tiles to ``out`` in the published layout, with a manifest and a README.
+
+    ``catalogs``: stac, croissant, see :mod:`.stac_catalog` and :mod:`.croissant`; ``acquired``:
+    dates by scene.
 
     Each file is held against its manifest's checksum on the way. Tiles of split ``none`` (they
     share ground with two splits) stay behind. Returns counts by folder, and the pairs of tiles
@@ -92,8 +104,15 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
         shared = shared_ground(*(folder / "manifest.csv" for folder in folders))
         for a, b in shared:
             log.warning("%s and %s share ground and are in different splits", a, b)
+        footprints = {one["id"]: one for one in _footprints(folders, rows)}
+        write_footprints(scratch, footprints.values())
+        if rows and "stac" in catalogs:
+            where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
+            _module("stac").write_stac(scratch, rows, where, footprints, acquired or {})
         if rows:
             write_table(scratch / "manifest.csv", rows)
+        if rows and "croissant" in catalogs:
+            _module("croissant").write_croissant(scratch)
         text = README.format(
             counts="\n".join(f"  {count:5d} pairs  {place}" for place, count in counts.items()),
             nodata=" or ".join(sorted(nodata)),
@@ -104,6 +123,32 @@ def assemble_dataset(tile_dirs: Iterable[str | Path], out: str | Path) -> dict[s
     for place, count in sorted(counts.items()):
         log.info("%s/%s: %d pairs", out, place, count)
     return {"pairs": dict(counts), "shared_ground": shared}
+
+
+def _module(catalog: str) -> ModuleType:
+    """The module that writes a catalog, with libraries that not everyone needs."""
+    try:
+        if catalog == "stac":
+            from . import stac_catalog as module
+        else:
+            from . import croissant as module
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"dataset.catalogs: {catalog} needs {error.name}, which is not installed",
+            remedy="pip install 'stereotruth[catalog]', or leave it out",
+        ) from None
+    return module
+
+
+def _footprints(
+    folders: Iterable[Path], rows: Iterable[Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Where the dataset's pairs lie; ``rows`` of its manifest."""
+    found = {name: one for folder in folders for name, one in read_footprints(folder).items()}
+    for row in rows:
+        if one := found.get(row["tile"]):
+            files = {kind: row[kind] or None for kind in ("left", "right", "disp")}
+            yield one | {"properties": one["properties"] | files}
 
 
 def _copy(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import zarr
 
+from ..epipolar.colours import COLOURS
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..products.grids import require_complete
@@ -38,6 +39,7 @@ class SceneStores:
     scene: str
     left: zarr.Array
     right: zarr.Array
+    colours: tuple[tuple[zarr.Array, ...], tuple[zarr.Array, ...]] | None  # of left, right
     disparity: zarr.Array
     status: zarr.Array
     height: zarr.Array
@@ -86,6 +88,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         scene=item.scene,
         left=left["image"],
         right=right["image"],
+        colours=_colours(left, right),
         disparity=disparity["disparity"],
         status=status,
         height=disparity["height"],
@@ -98,6 +101,13 @@ def open_stores(item: SceneFiles) -> SceneStores:
         inputs=inputs,
         points_per_px=disparity.attrs.get("points_per_px"),
     )
+
+
+def _colours(*views: zarr.Group) -> tuple[tuple[zarr.Array, ...], ...] | None:
+    """Red, green and blue of both images; None where they are grey."""
+    if not all(name in view for view in views for name in COLOURS):
+        return None
+    return tuple(tuple(view[name] for name in COLOURS) for view in views)
 
 
 def _gcp_rms(alignment: Path) -> float | None:

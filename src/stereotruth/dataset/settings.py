@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..settings import Flag, Number, Share, Unit, Whole, settings
+from ..settings import Flag, Number, Share, Text, Unit, Whole, settings
 
 NotNegative = Annotated[Number, Field(ge=0)]
 
@@ -35,6 +35,30 @@ class Tiles:
 
     nodata: Annotated[Number, Unit("px")] = -999
     """value of unlabelled pixels in the disparity files"""
+
+
+@settings
+class Dataset:
+    """The configuration's section dataset."""
+
+    layouts: tuple[Literal["whu", "kitti", "us3d"], ...] = ("whu",)
+    """what the target `dataset` writes: `dataset/` in the layout of the published WHU-Stereo
+    (always); `dataset_kitti/` with 16-bit PNGs, which cannot hold negative disparities: right
+    images are moved by `shift_px` of its manifest, so that the smallest disparity of each pair is 1
+    to 2 px; `dataset_us3d/` with RGB images of 8 bits"""
+
+    catalogs: tuple[Literal["stac", "croissant"], ...] = ()
+    """descriptions of `dataset/` in it: STAC (`stac/collection.json` and an item for each pair,
+    with orientation files and RPCs) and Croissant (`croissant.json`); they need
+    `pip install 'stereotruth[catalog]'`"""
+
+    acquired: Annotated[dict[str, Text], Unit("scene: date")] = field(default_factory=dict)
+    """when scenes were taken, such as `2020-10-25` or `2020-10-25T03:12:45Z`, for STAC; items of
+    other scenes say that it is not known"""
+
+    originals: Flag = False
+    """true: crops of the original images for each tile with corrected RPCs (tag and `_RPC.TXT`), in
+    `originals/<city>/`, for multi-view and neural reconstruction"""
 
 
 @settings

@@ -6,6 +6,8 @@ stereotruth  what rule ``dataset`` makes: ``with ground truth/{train,val,test}/{
 whu          the published WHU-Stereo, in any folders: ``<P>_left_<n>.tiff`` and, beside it or in
              the folders ``right`` and ``disp`` beside its folder ``left``, ``<P>_right_<n>.tiff``
              and ``<P>_disparity_<n>.tiff``
+kitti        KITTI's, in any folders: ``image_2/<name>_10.png`` and, in the folders ``image_3`` and
+             ``disp_occ_0`` (or ``disp_noc_0``) beside its own, files of the same name
 us3d         US3D (DFC2019, track 2), in any folders: ``<P>_…_LEFT_RGB.tif``, ``…_RIGHT_RGB.tif``,
              ``…_LEFT_DSP.tif``
 ===========  ======================================================================================
@@ -33,7 +35,8 @@ from ..products.rasters import read_disparity
 from .split_names import NO_TRUTH, NONE, SPLITS
 from .stereo_dataset_settings import Settings
 
-LAYOUTS = ("stereotruth", "whu", "us3d")
+LAYOUTS = ("stereotruth", "whu", "kitti", "us3d")
+LEFT_NAMES = {"us3d": "*_LEFT_RGB.tif", "kitti": "image_2/*_10.png"}
 CITY_OF_PREFIX = {
     "SG": "Shaoguan",
     "KM": "Kunming",
@@ -78,7 +81,7 @@ class StereoDataset:
     """
 
     name: str
-    root: Path
+    root: str | Path
     layout: str
     disparity_range: tuple[int, int]
     nodata: float = float(Settings.nodata)
@@ -137,14 +140,14 @@ def find_pairs(root: str | Path, layout: str) -> list[Pair]:
         )
     if not root.is_dir():
         raise InputError("no such folder", file=root, remedy="name the root of the dataset")
-    if layout == "us3d":
-        found = list(_us3d(root))
+    if layout in ("us3d", "kitti"):
+        found = list({"us3d": _us3d, "kitti": _kitti}[layout](root))
     elif layout == "stereotruth" and (root / "manifest.csv").is_file():
         found = list(_of_manifest(root))
     else:
         found = list(_whu(root))
     if not found:
-        names = "*_LEFT_RGB.tif" if layout == "us3d" else "*_left_*.tiff"
+        names = LEFT_NAMES.get(layout, "*_left_*.tiff")
         others = [name for name in LAYOUTS if name != layout]
         raise InputError(
             f"no pair of layout {layout!r}: no file {names} below this folder",
@@ -216,6 +219,19 @@ def _us3d(root: Path) -> Iterator[Pair]:
             raise _partner(left, f"{name}_RIGHT_RGB.tif")
         disparity = by_name.get(f"{name}_LEFT_DSP")
         city = _city(name.partition("_")[0])
+        yield Pair(name, city, _split(root, left), left, right, disparity)
+
+
+def _kitti(root: Path) -> Iterator[Pair]:
+    for left in sorted(root.rglob("image_2/*_10.png")):
+        beside = left.parent.parent
+        right = beside / "image_3" / left.name
+        if not right.is_file():
+            raise _partner(left, f"image_3/{left.name}")
+        labels = (beside / kind / left.name for kind in ("disp_occ_0", "disp_noc_0"))
+        name = left.stem.removesuffix("_10")
+        city = _city(name.partition("_")[0]) if "_" in name else "KITTI"
+        disparity = next(filter(Path.is_file, labels), None)
         yield Pair(name, city, _split(root, left), left, right, disparity)
 
 

@@ -14,7 +14,7 @@ class Settings:
     root: Annotated[Text, Unit("path")]
     """its folder"""
 
-    layout: Literal["stereotruth", "whu", "us3d"]
+    layout: Literal["stereotruth", "whu", "kitti", "us3d"]
     """where its files lie and what they are called"""
 
     disparity_range: Range

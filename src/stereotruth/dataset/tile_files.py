@@ -52,6 +52,7 @@ class Cut:
     building_share: float
     limits: Limits
     code: str
+    flags: Mapping[int, str]  # meaning of the status values of all scenes
     work: Path  # where the files of finished tiles wait, with the ledger
     provenance: Mapping[str, Any]
 
@@ -72,6 +73,8 @@ class _Crop:
     status: NDArray[np.uint8]
     of_right: NDArray[np.float32] | None
     status_of_right: NDArray[np.uint8] | None
+    colour_left: NDArray[np.uint16] | None  # [3, h, w]
+    colour_right: NDArray[np.uint16] | None
 
     @classmethod
     def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
@@ -84,6 +87,12 @@ class _Crop:
             values = source.of_right["disparity"][there].astype(np.float64) - window.offset
             of_right = round_disparity(values, cut.dtype)
             status_of_right = source.of_right["status"][there]
+        colours = (None, None)
+        if source.colours is not None:
+            colours = (
+                np.stack([band[part] for band in bands])
+                for bands, part in zip(source.colours, (here, there))
+            )
         return cls(
             left=source.left[here],
             right=source.right[there],
@@ -92,6 +101,7 @@ class _Crop:
             status=source.status[here],
             of_right=of_right,
             status_of_right=status_of_right,
+            **dict(zip(("colour_left", "colour_right"), colours)),
         )
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -123,8 +133,9 @@ def _write_images(
     """Write a tile's TIFF files."""
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
-    write_tiff(paths["left"], crop.left, nodata=0)
-    write_tiff(paths["right"], crop.right, nodata=0)
+    for view in ("left", "right"):
+        grey, colour = getattr(crop, view), getattr(crop, f"colour_{view}")
+        write_tiff(paths[view], grey if colour is None else colour, nodata=0)
     if not window.labelled:
         return
     meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
@@ -240,7 +251,7 @@ def write_tile(
         "lat": f"{lat:.7f}",
         **check_cells(checks, cut.limits),
     }
-    for value, meaning in source.flags.items():
+    for value, meaning in cut.flags.items():
         row[f"count_{meaning}"] = int((crop.status == value).sum())
     for kind in (*FILES, *(RIGHT_FILES if source.of_right is not None else ())):
         row[kind] = files.get(kind, "")

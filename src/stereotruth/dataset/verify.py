@@ -10,12 +10,17 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..products.provenance import file_sha256
+from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest
 
 log = logging.getLogger("stereotruth")
 
 
-LOOSE = {"manifest.csv", "export.json", "README.txt"}  # files that the manifest does not list
+# files that the manifest does not list; STYLE is the user's to change
+LOOSE = (
+    *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE),
+    *("croissant.json", "stac/collection.json", "stac/rpc/*"),
+)
 FOREIGN = (  # what other programs leave beside the files that they open; in lower case
     "*.aux.xml",  # GDAL, QGIS: statistics
     "*.ovr",  # GDAL, QGIS: pyramids
@@ -49,16 +54,25 @@ def defects(folder: str | Path) -> list[str]:
         for p in files
         if not p.name.startswith(".") and not _is_foreign(p)
     }
-    found += [f"{name}: not in the manifest" for name in sorted(present - listed - LOOSE)]
+    found += [
+        f"{name}: not in the manifest" for name in sorted(present - listed) if not _is_loose(name)
+    ]
     if (record := folder / "export.json").is_file():
-        wanted = json.loads(record.read_text(encoding="utf-8"))["manifest_sha256"]
-        if file_sha256(folder / "manifest.csv") != wanted:
-            found.append("manifest.csv: changed")
+        said = json.loads(record.read_text(encoding="utf-8"))
+        for name, key in (("manifest.csv", "manifest_sha256"), (FOOTPRINTS, "footprints_sha256")):
+            if not (folder / name).is_file():
+                found.append(f"{name}: missing")
+            elif file_sha256(folder / name) != said[key]:
+                found.append(f"{name}: changed")
     return found
 
 
+def _is_loose(name: str) -> bool:
+    return any(fnmatch(name, pattern) for pattern in LOOSE)
+
+
 def _is_foreign(path: Path) -> bool:
-    return any(fnmatch(path.name.lower(), pattern) for pattern in FOREIGN)
+    return path.name != STYLE and any(fnmatch(path.name.lower(), p) for p in FOREIGN)
 
 
 def foreign_files(folder: str | Path) -> list[str]:

@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+USABLE, MASKED = 1, 2  # bits
+
 
 class Array2D(Protocol):
     """What is read of an image: a NumPy or Zarr array [y, x], uint16, 0 for nodata."""
@@ -17,13 +19,30 @@ class Array2D(Protocol):
     def __getitem__(self, key: tuple[slice, slice]) -> NDArray[np.uint16]: ...
 
 
+@dataclass(frozen=True, eq=False)
+class MaskedImage:
+    """An image [y, x] of which a ``mask`` [y, x] hides pixels: there it is 0, as at nodata."""
+
+    image: Array2D
+    mask: Array2D
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, cols)."""
+        return self.image.shape
+
+    def __getitem__(self, key: tuple[slice, slice]) -> NDArray[np.uint16]:
+        return np.where(self.mask[key] == 0, self.image[key], np.uint16(0))
+
+
 @dataclass(frozen=True)
 class Patch:
     """Part of an image, ready for the filter.
 
     ``pixels`` float32 [rows, cols], zero outside the image, with one more row and column than
-    ``usable`` has. ``usable`` uint8: 1 where a window whose centre lies in [col, col + 1) x
-    [row, row + 1) touches neither nodata nor the image's edge. (``row``, ``col``) is the image's
+    ``usable`` has. ``usable`` uint8: USABLE where a window whose centre lies in [col, col + 1) x
+    [row, row + 1) touches neither nodata nor the image's edge, MASKED where it touches what a mask
+    hides. (``row``, ``col``) is the image's
     pixel at the patch's origin.
     """
 
@@ -47,12 +66,22 @@ def read_patch(image: Array2D, rows: slice, cols: slice, window: int) -> Patch:
     left, right = max(col, 0), min(col + width + 1, image.shape[1])
     if top < bottom and left < right:
         pixels[top - row : bottom - row, left - col : right - col] = image[top:bottom, left:right]
-    # Count of nodata pixels in [-half, half + 1]² around every pixel, by an integral image.
-    bad = np.zeros((height + 2, width + 2), dtype=np.int32)
-    np.cumsum(pixels == 0.0, axis=0, dtype=np.int32, out=bad[1:, 1:])
-    np.cumsum(bad, axis=1, out=bad)
-    n = 2 * half + 2
     usable = np.zeros((height, width), dtype=np.uint8)
-    inner = bad[n:, n:] - bad[:-n, n:] - bad[n:, :-n] + bad[:-n, :-n] == 0
-    usable[half : half + inner.shape[0], half : half + inner.shape[1]] = inner
+    inner = _touched(pixels == 0.0, half) == 0
+    where = np.s_[half : half + inner.shape[0], half : half + inner.shape[1]]
+    usable[where] = inner
+    if isinstance(image, MaskedImage) and top < bottom and left < right:
+        masked = np.zeros(pixels.shape, np.bool_)
+        there = np.s_[top - row : bottom - row, left - col : right - col]
+        masked[there] = image.mask[top:bottom, left:right] != 0
+        usable[where][_touched(masked, half) > 0] = MASKED
     return Patch(pixels, usable, row, col)
+
+
+def _touched(chosen: NDArray[np.bool_], half: int) -> NDArray[np.int32]:
+    """How many pixels are ``chosen`` in [-half, half + 1]² around every pixel that has them."""
+    sums = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), dtype=np.int32)
+    np.cumsum(chosen, axis=0, dtype=np.int32, out=sums[1:, 1:])
+    np.cumsum(sums, axis=1, out=sums)
+    n = 2 * half + 2
+    return sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]

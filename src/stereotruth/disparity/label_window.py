@@ -162,7 +162,7 @@ def _by_images(
     is_open = between.outcome == STEP_IN_RIGHT
     is_open |= (between.outcome == STEP_IN_LEFT) & between.rough
     found = surfaces_by_images(
-        is_open & (status != Status.CHANGED) & (status != Status.OUT_OF_FRAME),
+        is_open & ~np.isin(status, (Status.CHANGED, Status.OUT_OF_FRAME, Status.MASKED)),
         np.where(known, labels.disparity, np.nan),
         labels.slope,
         between.disparity,
@@ -267,6 +267,7 @@ def _test_points(
     """Status of each pixel by its point that got furthest."""
     status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
     status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
+    status[points.masked.reshape(points.shape)] = Status.MASKED
     status[points.count > 0] = Status.HIDDEN_IN_LEFT
     if settings.method == "correlation":
         status[points.any(seen)] = Status.LOW_CORRELATION

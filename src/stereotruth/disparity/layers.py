@@ -6,10 +6,15 @@ import numpy as np
 
 from ..products.grids import Layer
 from .settings import Settings
+from .status import Status
 
 
-def layers(settings: Settings, view: str) -> dict[str, Layer]:
-    """The arrays of a disparity store of the ``view``, left or right."""
+def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Layer]:
+    """The arrays of a disparity store of the ``view``, left or right.
+
+    ``masked``: whether a mask hides something of an image.
+    """
+    statuses = [*settings.statuses, *([Status.MASKED] if masked else [])]
     other = {"left": "right", "right": "left"}[view]
     match = {"left": "x - disparity", "right": "x + disparity"}[view]
     condensed, used = (
@@ -37,6 +42,12 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
             "edge_in_pixel": "no smooth triangle of points, or a step between points may be "
             "nearer to one of the cameras",
         }
+    hidden = {}
+    if masked:
+        hidden = {
+            "masked": f"a mask hides the pixel, or what the {other} image shows of it; or a mask "
+            "reaches into the windows that are compared around it"
+        }
     return {
         "disparity": Layer(
             "float32",
@@ -57,8 +68,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
             {
                 "units": "1",
                 "long_name": "why a pixel has a label or none",
-                "flag_values": [int(status) for status in settings.statuses],
-                "flag_meanings": " ".join(status.name.lower() for status in settings.statuses),
+                "flag_values": [int(status) for status in statuses],
+                "flag_meanings": " ".join(status.name.lower() for status in statuses),
                 f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre "
                 "sees",
                 "changed": "LiDAR and images show different surfaces there, or water",
@@ -67,7 +78,8 @@ def layers(settings: Settings, view: str) -> dict[str, Layer]:
                 "precedence": f"frame, {view} view, correlation of points; {other} view, edge, "
                 "change, number of points of pixels",
             }
-            | lonely,
+            | lonely
+            | hidden,
         ),
         "height": Layer(
             "float32",

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .image_patches import Patch
+from .image_patches import MASKED, USABLE, Patch
 
 Ints = NDArray[np.int64]
 Records = NDArray[np.void]
@@ -45,13 +45,15 @@ class PixelPoints:
     """Points of a window of ``shape`` (rows, cols) whose first pixel is (row, col) ``first``.
 
     ``points`` POINT[n] are those in both frames; pixel p (row-major) has those from ``start[p]`` to
-    ``start[p + 1]``. ``outside`` [pixels]: number of points that are not in both frames.
+    ``start[p + 1]``. ``outside`` [pixels]: number of points that are not in both frames;
+    ``masked`` bool[pixels]: whether a mask hides one of them.
     ``origin``: lattice (lon, lat) from which the points count.
     """
 
     points: Records
     start: Ints
     outside: NDArray[np.int32]
+    masked: NDArray[np.bool_]
     shape: tuple[int, int]
     first: tuple[int, int]
     origin: tuple[int, int]
@@ -93,6 +95,7 @@ def _take(
     pixel: NDArray[np.int32],
     count: NDArray[np.int32],
     outside: NDArray[np.int32],
+    masked: NDArray[np.bool_],
 ) -> int:
     """Fills ``points`` and ``pixel`` with those in both frames; returns how many these are."""
     n = 0
@@ -118,7 +121,9 @@ def _take(
         framed = 0 <= r < left.shape[0] and 0 <= c < left.shape[1]
         framed = framed and 0 <= q < right.shape[0] and 0 <= d < right.shape[1]
         if framed:
-            framed = left[np.uint64(r), np.uint64(c)] & right[np.uint64(q), np.uint64(d)] != 0
+            in_left, in_right = left[np.uint64(r), np.uint64(c)], right[np.uint64(q), np.uint64(d)]
+            framed = in_left & in_right == USABLE
+            masked[p] |= (in_left | in_right) & MASKED != 0
         if not framed:
             outside[p] += 1
             continue
@@ -160,6 +165,7 @@ class Collection:
         size = self.shape[0] * self.shape[1]
         self.count = np.zeros(size + 1, dtype=np.int32)
         self.outside = np.zeros(size, dtype=np.int32)
+        self.masked = np.zeros(size, dtype=np.bool_)
 
     def add(
         self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8], xy: Floats
@@ -187,6 +193,7 @@ class Collection:
             pixel,
             self.count,
             self.outside,
+            self.masked,
         )
 
     def _close(self) -> None:
@@ -204,4 +211,6 @@ class Collection:
             _scatter(*self.parts[part], place, points)
             self.parts[part] = None
         self.parts = []
-        return PixelPoints(points, start, self.outside, self.shape, self.first, self.origin)
+        return PixelPoints(
+            points, start, self.outside, self.masked, self.shape, self.first, self.origin
+        )

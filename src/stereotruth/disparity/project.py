@@ -30,13 +30,14 @@ from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import describe, digest
 from ..products.resumable_grids import BlockStore, making
+from .image_patches import MaskedImage
 from .label_window import label_window
 from .layers import layers
 from .overlap_check import apart, refuse_apart
 from .rays import CELL_PX
 from .scene_inputs import SceneInputs
 from .settings import Settings
-from .status import is_labelled
+from .status import Status, is_labelled
 
 log = logging.getLogger("stereotruth")
 
@@ -83,7 +84,7 @@ class _Blocks:
         """Label one block and write it, with its pixels by status and counts of points."""
         here = self.scene.pair.cols(cols)
         shape = rows.stop - rows.start, cols.stop - cols.start
-        fill = layers(self.scene.settings, self.scene.view)
+        fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)
         arrays: dict[str, NDArray] = {}
         points = np.zeros(3, dtype=np.int64)
         for r, c in self.scene.windows.parts(rows, here, self.max_points):
@@ -99,9 +100,14 @@ class _Blocks:
                     arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
                 arrays[name][part] = layer
             points += found[1]
+        image = self.scene.pair.images[0]
+        if isinstance(image, MaskedImage) and (masked := image.mask[rows, here] != 0).any():
+            arrays.setdefault("status", np.full(shape, fill["status"].fill, np.uint8))
+            for name, array in arrays.items():
+                array[masked] = Status.MASKED if name == "status" else fill[name].fill
         arrays = self.scene.pair.arrays(arrays)
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
-        counts = np.bincount(status.reshape(-1), minlength=len(self.scene.settings.statuses))
+        counts = np.bincount(status.reshape(-1), minlength=len(Status))
         out.write((rows, cols), key, arrays, [*counts.tolist(), *points.tolist()])
 
 
@@ -200,7 +206,7 @@ def project_scene(
     grid = making(
         out,
         shape,
-        layers(settings, view),
+        layers(settings, view, inputs.has_masks),
         chunk=CHUNK,
         shard=SHARD,
         shared=strip is not None,
@@ -220,12 +226,13 @@ def project_scene(
         if strip is not None:
             return None
         counts = np.sum(unfinished.results(every), axis=0).tolist()
-        pixels = {status.name.lower(): counts[status] for status in settings.statuses}
-        in_grid, framed, used = counts[len(settings.statuses) :]
+        pixels = {status.name.lower(): counts[status] for status in inputs.statuses}
+        in_grid, framed, used = counts[len(Status) :]
         if framed == 0:
             refuse_apart(tuple(bounds), images, heights, where)
-        reached = sum(pixels.values()) - pixels["no_points"] - pixels["out_of_frame"]
-        labelled = sum(counts[status] for status in settings.statuses if is_labelled(status))
+        beyond = "no_points", "out_of_frame", "masked"
+        reached = sum(n for name, n in pixels.items() if name not in beyond)
+        labelled = sum(counts[status] for status in inputs.statuses if is_labelled(status))
         summary = {
             "pixels": pixels,
             "points": {"in_grid": in_grid, "in_frame": framed, "used": used},

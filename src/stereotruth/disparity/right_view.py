@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
-from .image_patches import Array2D
+from .image_patches import Array2D, MaskedImage
 from .status import Status
 from .view_geometry import ViewGeometry
 
@@ -77,6 +77,12 @@ class MirroredImage:
         return self.image[rows, mirrored(cols, self.shape[1])][:, ::-1]
 
 
+def _mirrored_image(image: Array2D) -> Array2D:
+    if isinstance(image, MaskedImage):
+        return MaskedImage(MirroredImage(image.image), MirroredImage(image.mask))
+    return MirroredImage(image)
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """A pair whose left image gets labels.
@@ -108,7 +114,7 @@ class MirroredPair(Pair):
     def of(cls, pair: Pair) -> MirroredPair:
         """From the pair as it is."""
         left, right = pair.images
-        images = MirroredImage(right), MirroredImage(left)
+        images = _mirrored_image(right), _mirrored_image(left)
         return cls(images, MirroredModel(pair.model), pair.uncertainty)
 
     def cols(self, cols: slice) -> slice:

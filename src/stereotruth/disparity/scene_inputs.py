@@ -13,11 +13,13 @@ from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
+from .image_patches import MaskedImage
 from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
 from .settings import Settings
 from .smooth_triangles import Scale
+from .status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +46,26 @@ class SceneInputs:
         return seen_from(
             self.view,
             Pair(
-                (left["image"], right["image"]),
+                tuple(
+                    MaskedImage(group["image"], group["mask"])
+                    if "mask" in group
+                    else group["image"]
+                    for group in (left, right)
+                ),
                 EpipolarModel.from_dict(left.attrs["epipolar"]),
                 LabelUncertainty.from_attrs(left.attrs),
             ),
         )
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether a mask hides something of an image."""
+        return any(isinstance(image, MaskedImage) for image in self.pair.images)
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Those that occur."""
+        return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
 
     @cached_property
     def rays(self) -> Rays:

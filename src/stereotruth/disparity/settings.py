@@ -94,7 +94,8 @@ class Settings(Representative, Occlusion):
         return [
             s
             for s in Status
-            if (self.fills or s != Status.LABELLED_BETWEEN)
+            if s != Status.MASKED
+            and (self.fills or s != Status.LABELLED_BETWEEN)
             and (self.asks_images or s != Status.LABELLED_BY_IMAGES)
         ]
 

@@ -24,8 +24,10 @@ class Status(IntEnum):
     EDGE_IN_PIXEL = 8
     LABELLED_BETWEEN = 9
     LABELLED_BY_IMAGES = 10
+    MASKED = 11
 
 
 def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Where a status says that there is a label: measured, between points, or told by images."""
-    return (status == Status.LABELLED) | (status >= Status.LABELLED_BETWEEN)
+    between = (status >= Status.LABELLED_BETWEEN) & (status <= Status.LABELLED_BY_IMAGES)
+    return (status == Status.LABELLED) | between

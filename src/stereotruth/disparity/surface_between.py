@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..lidar.lattice import LATTICE_M
-from .image_patches import Patch
+from .image_patches import MASKED, USABLE, Patch
 from .local_projection import LocalProjection
 from .pixel_labels import Labels
 from .smooth_triangles import STEP_PX, GroundSurface
@@ -397,9 +397,11 @@ def between_labels(
     shown = between.outcome == SHOWN
     row, col = np.nonzero(shown)
     place = col + first[1] - between.disparity[row, col]
-    inside = _usable(left, row + first[0], col + first[1])
-    inside &= _usable(right, row + first[0], np.floor(place).astype(np.int64))
+    in_left = _usable(left, row + first[0], col + first[1])
+    in_right = _usable(right, row + first[0], np.floor(place).astype(np.int64))
+    inside, masked = in_left & in_right == USABLE, (in_left | in_right) & MASKED != 0
     status[row[~inside], col[~inside]] = Status.OUT_OF_FRAME
+    status[row[masked], col[masked]] = Status.MASKED
     with np.errstate(invalid="ignore"):
         measured = np.abs(own.disparity - between.disparity) <= STEP_PX
     between_points = status == Status.LABELLED_BETWEEN
@@ -414,9 +416,10 @@ def between_labels(
     ), status
 
 
-def _usable(patch: Patch, row: Ints, col: Ints) -> Bools:
-    """Whether an image shows something at pixels [n]."""
+def _usable(patch: Patch, row: Ints, col: Ints) -> NDArray[np.uint8]:
+    """Of :class:`.image_patches.Patch`, at pixels [n]; 0 outside the patch."""
     r, c = row - patch.row, col - patch.col
     inside = (r >= 0) & (c >= 0) & (r < patch.usable.shape[0]) & (c < patch.usable.shape[1])
-    inside[inside] = patch.usable[r[inside], c[inside]] == 1
-    return inside
+    found = np.zeros(r.size, np.uint8)
+    found[inside] = patch.usable[r[inside], c[inside]]
+    return found

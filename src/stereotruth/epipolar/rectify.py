@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..job import BlockProgress
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, making
+from .colours import COLOURS
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, RADIUS, resample
@@ -33,6 +35,12 @@ SHARD = 1024  # px; one task writes one shard file
 CHUNK = 256
 LATTICE = 16  # px between exact source coordinates; in between they are bilinear
 LATTICE_ERROR = 0.002  # px, accepted error of that
+MASK = {
+    "units": "1",
+    "long_name": "what a mask hides",
+    "flag_values": [0, 1],
+    "flag_meanings": "seen masked",
+}
 
 
 def _lattice(model: ImageModel, rows: slice, cols: slice, step: int) -> Floats:
@@ -68,6 +76,21 @@ def _widening(model: ImageModel, shape: tuple[int, int]) -> tuple[float, float]:
     return tuple(span if span > ANTIALIAS else 1.0 for span in spans)
 
 
+def _touched(
+    masked: NDArray[np.bool_],
+    lattice: Floats,
+    step: int,
+    scale: tuple[float, float],
+    shape: tuple[int, int],
+) -> NDArray[np.uint8]:
+    """1 where a pixel of the image would be made of masked ones, too; 0 outside the image."""
+    everywhere, beside = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+    resample(np.ones(masked.shape, np.float32), lattice, step, scale, everywhere)
+    there = np.where(masked, np.float32(np.nan), np.float32(1))
+    resample(there, lattice, step, scale, beside)
+    return ((everywhere > 0) & (beside == 0)).astype(np.uint8)
+
+
 def rectify_image(
     source: Source,
     model: ImageModel,
@@ -90,6 +113,7 @@ def rectify_image(
     step, error = _lattice_step(model, shape)
     scale = _widening(model, shape)
     reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
+    names = ("image", *(COLOURS if source.colour else ()))
 
     def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
         lattice = _lattice(model, rows, cols, step)
@@ -111,12 +135,18 @@ def rectify_image(
             target.write((rows, cols), key, {}, 0)
             return
         lattice, (col, width, row, height) = found
-        pixels = source.read(col, row, width, height)
+        layers, masked = source.read_layers(col, row, width, height)
         lattice[0] -= col
         lattice[1] -= row
-        out = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=np.uint16)
-        valid = resample(pixels, lattice, step, scale, out)
-        target.write((rows, cols), key, {"image": out}, valid)
+        shape = rows.stop - rows.start, cols.stop - cols.start
+        arrays = {name: np.zeros(shape, dtype=np.uint16) for name in names}
+        valid, *_ = (
+            resample(pixels, lattice, step, scale, out)
+            for pixels, out in zip(layers, arrays.values())
+        )
+        if masked.any():
+            arrays["mask"] = _touched(masked, lattice, step, scale, shape)
+        target.write((rows, cols), key, arrays, valid)
 
     every = blocks(shape, SHARD)
     part = every if strip is None else strip.of(every)
@@ -143,7 +173,11 @@ def rectify_image(
             remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
         )
     log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
-    return {
+    bands = {}
+    if source.band_count > 1:
+        mix = {f"band {band}": round(weight, 6) for band, weight in source.mix.items()}
+        bands = {"mix": mix, "colour": [f"band {band}" for band in source.colour]}
+    return bands | {
         "source": source.path.name,
         "source_nodata": source.nodata,
         "value_gain": source.gain,
@@ -169,7 +203,9 @@ def rectify(
 ) -> None:
     """Resample both images of a pair into the Zarr grids of its epipolar model.
 
-    Grids hold ``image`` uint16 [y, x], 0 where there is no value; their attributes carry the model
+    Grids hold ``image`` uint16 [y, x], 0 where there is no value; of images in colour ``red``,
+    ``green`` and ``blue`` likewise, and of images with a mask ``mask`` uint8 [y, x], 1 where it
+    hides the image; their attributes carry the model
     and ``provenance``, those of the left one ``left_attrs`` too. ``epipolar_json``: where the model
     goes. All three products appear when they are whole, or not at all.
 
@@ -186,15 +222,23 @@ def rectify(
             ("left", left, model.left_image, left_store),
             ("right", right, model.right_image, right_store),
         ):
-            layer = Layer(
-                dtype="uint16",
-                fill=0,
-                attrs={
-                    "units": "1",
-                    "long_name": f"digital numbers of the {view} epipolar image",
-                    "nodata": 0,
-                },
-            )
+            layers = {
+                "image": Layer(
+                    dtype="uint16",
+                    fill=0,
+                    attrs={
+                        "units": "1",
+                        "long_name": f"digital numbers of the {view} epipolar image",
+                        "nodata": 0,
+                    },
+                )
+            }
+            if source.colour:
+                for name in COLOURS:
+                    said = {"long_name": f"{name} of the {view} epipolar image"}
+                    layers[name] = replace(layers["image"], attrs=layers["image"].attrs | said)
+            if source.masks:
+                layers["mask"] = Layer("uint8", 0, MASK | {"of": f"the {view} epipolar image"})
             attrs = {
                 "view": view,
                 "epipolar": model.to_dict(),
@@ -207,7 +251,7 @@ def rectify(
                 making(
                     store,
                     model.shape,
-                    {"image": layer},
+                    layers,
                     chunk=CHUNK,
                     shard=SHARD,
                     shared=strip is not None,
@@ -216,9 +260,12 @@ def rectify(
             made_of = {
                 "image": file_sha256(source.path),
                 "size": source.size,
+                "bands": [source.mix, source.colour],
                 "model": image.to_dict(),
                 "code": code,
             }
+            if source.mask_path is not None:
+                made_of["mask"] = file_sha256(source.mask_path)
             attrs["resampling"] = rectify_image(
                 source,
                 image,

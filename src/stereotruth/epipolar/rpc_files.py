@@ -35,6 +35,7 @@ _RPB_NAMES = {
 }
 
 
+UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
 MAX_BYTES = 1_000_000  # of an RPC file; they have some 8000
 
 
@@ -159,3 +160,15 @@ def read_rpc(image: str | Path) -> RPC:
         ) from error
     log.info("RPC of %s from %s", image.name, "its tags" if source == image else source.name)
     return rpc
+
+
+def rpc_text(rpc: RPC) -> str:
+    """``_RPC.TXT`` with all digits."""
+    values = rpc.to_dict()
+    lines = [
+        f"{name.upper()}: {values[name]!r} {UNITS.get(name.split('_')[0], 'meters')}"
+        for name in SCALARS
+    ]
+    for name in VECTORS:
+        lines += [f"{name.upper()}_{k}: {value!r}" for k, value in enumerate(values[name], 1)]
+    return "\n".join(lines) + "\n"

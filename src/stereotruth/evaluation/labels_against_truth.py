@@ -160,14 +160,22 @@ class Comparison:
         self.counts = np.zeros((len(GROUPS), len(self.statuses)), np.int64)
 
     def merge(self, other: Comparison) -> None:
-        """Add the figures of other pixels. Raises ValueError if their statuses are others."""
-        if self.statuses != other.statuses:
+        """Add the figures of other pixels. Raises ValueError if their statuses are others.
+
+        Where one has masks and the other none, one may have more statuses.
+        """
+        names, more = sorted((self.statuses, other.statuses), key=len)
+        if names != more[: len(names)]:
             raise ValueError(f"statuses {self.statuses} and {other.statuses}")
+        self.statuses = more
+        self.counts, counts = (
+            np.pad(c, ((0, 0), (0, len(more) - c.shape[1]))) for c in (self.counts, other.counts)
+        )
         self.labels += other.labels
         self.errors.merge(other.errors)
         self.calibration.merge(other.calibration)
         self.parallax.merge(other.parallax)
-        self.counts += other.counts
+        self.counts += counts
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready; px and shares 0 … 1 (null where there are no such pixels)."""

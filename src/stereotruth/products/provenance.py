@@ -24,6 +24,19 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def checksums(
+    files: Iterable[str | Path],
+    left_mask: str | Path | None = None,
+    right_mask: str | Path | None = None,
+) -> dict[str, str]:
+    """Checksums of a scene's files by their names, and of the masks of its images."""
+    found = {Path(file).name: file_sha256(file) for file in files}
+    for view, mask in (("left", left_mask), ("right", right_mask)):
+        if mask:
+            found[f"{view}_mask/{Path(mask).name}"] = file_sha256(mask)
+    return found
+
+
 def _module_file(module: str) -> Path | None:
     """File of the package's module ``a.b`` (relative to the package), or None if there is none."""
     path = PACKAGE.joinpath(*module.split(".")) if module else PACKAGE

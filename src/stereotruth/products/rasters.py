@@ -1,4 +1,4 @@
-"""TIFF and PNG files of one band: read and written in one place, no georeference expected."""
+"""TIFF and PNG files of one band or three: read and written in one place, not georeferenced."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
@@ -19,6 +19,8 @@ from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
 
+KITTI_STEPS = 256  # in a px of disparity, of PNGs
+
 
 def write_tiff(
     path: Path,
@@ -28,21 +30,26 @@ def write_tiff(
     half: bool = False,
     description: str = "",
 ) -> None:
-    """A one-band deflate TIFF that libtiff's readers open; ``half`` stores float32 in 16 bits.
+    """A deflate TIFF of [h, w] or [3, h, w] that libtiff's readers open.
+
+    ``half`` stores float32 in 16 bits.
 
     GDAL writes IEEE half precision for 32-bit float with NBITS=16. Values must be rounded to
     half precision before.
     """
-    rows, cols = array.shape
+    bands = array if array.ndim == 3 else array[None]
+    rows, cols = array.shape[-2:]
     integer = np.issubdtype(array.dtype, np.integer)
     options: dict[str, Any] = {"nbits": 16} if half else {}
+    if array.ndim == 3:
+        options |= {"photometric": "RGB", "interleave": "pixel"}
     with open_raster(
         path,
         "w",
         driver="GTiff",
         width=cols,
         height=rows,
-        count=1,
+        count=len(bands),
         dtype=array.dtype,
         nodata=nodata,
         compress="deflate",
@@ -50,7 +57,7 @@ def write_tiff(
         blockysize=min(rows, 64),
         **options,
     ) as dataset:
-        dataset.write(array, 1)
+        dataset.write(bands)
         if description:
             dataset.update_tags(TIFFTAG_IMAGEDESCRIPTION=description)
 
@@ -71,6 +78,20 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
 
 
+class ImageFacts(NamedTuple):
+    """Bands, type of their values, and nodata tag of an image."""
+
+    bands: int
+    dtype: str
+    nodata: float | None
+
+
+def image_facts(path: str | Path) -> ImageFacts:
+    """Of an image file. Raises InputError if it cannot be read."""
+    with _opened(path) as source:
+        return ImageFacts(source.count, source.dtypes[0], source.nodata)
+
+
 def image_shape(path: str | Path) -> tuple[int, int]:
     """Rows and columns of an image. Raises InputError if it cannot be read."""
     with _opened(path) as source:
@@ -80,12 +101,16 @@ def image_shape(path: str | Path) -> tuple[int, int]:
 def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float32]:
     """A disparity map, float32[h, w] px; NaN where it is nodata (given or tagged) or not finite.
 
+    A PNG of 16 bits has KITTI's coding: KITTI_STEPS in a px, 0 where there is none.
+
     Raises InputError if it cannot be read.
     """
     with _opened(path) as source:
         values = source.read(1).astype(np.float32)
         missing = values == np.float32(nodata)
-        if source.nodata is not None:
+        if _is_kitti(source):
+            missing, values = values == 0, values / np.float32(KITTI_STEPS)
+        elif source.nodata is not None:
             missing |= values == np.float32(source.nodata)
     values[missing | ~np.isfinite(values)] = np.nan
     return values
@@ -103,17 +128,23 @@ def _opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def read_tile(path: Path) -> Floats:
-    """The band of an exported TIFF, float64[h, w]; NaN where it is nodata."""
+    """The band of an exported TIFF, or the mean of three, float64[h, w]; NaN where it is nodata."""
     with open_raster(path) as dataset:
-        values = dataset.read(1).astype(np.float64)
-        values[values == dataset.nodata] = np.nan
-        return values
+        bands = dataset.read().astype(np.float64)
+        missing = (bands == dataset.nodata).all(axis=0)
+    values = bands[0] if len(bands) == 1 else bands.mean(axis=0)
+    values[missing] = np.nan
+    return values
 
 
 def read_labels(path: str | Path) -> tuple[NDArray[Any], float | None]:
-    """The band of a label file as it is, and its nodata tag."""
+    """The band of a label file as it is, and its nodata tag, or what stands for nodata in a PNG."""
     with open_raster(path) as dataset:
-        return dataset.read(1), dataset.nodata
+        return dataset.read(1), 0.0 if _is_kitti(dataset) else dataset.nodata
+
+
+def _is_kitti(dataset: rasterio.DatasetReader) -> bool:
+    return dataset.driver == "PNG" and dataset.dtypes[0] == "uint16"
 
 
 def read_flags(path: str | Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
@@ -137,7 +168,7 @@ def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
             dtype="float32",
             nodata=np.nan,
             compress="deflate",
-            predictor=3,
+            predictor=1,  # readers without libtiff know no float predictor
             tiled=True,
         ) as target,
     ):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..dataset.warped_tile import warp_tile
 from ..products import pictures
 from ..products.pictures import Picture, encode
-from ..products.rasters import read_flags, read_tile
+from ..products.rasters import read_flags, read_image, read_tile
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
@@ -26,6 +26,7 @@ STATUS_COLOURS = {
     "low_correlation": "#6a4c93",
     "changed": "#edd03c",
     "out_of_frame": "#8d99a6",
+    "masked": "#3d5a80",
     "below_minimum_count": "#9c6b4f",
     "edge_in_pixel": "#2a9d8f",
     "labelled_between": "#bcd4e6",
@@ -57,7 +58,7 @@ def status_colours(names: Sequence[str]) -> dict[str, str]:
     return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
 
 
-def _grey(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
+def _shown(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
     lut = np.rint(255.0 * np.linspace(0, 1, 256) ** GAMMA).astype(np.uint8)
     return lut[pictures.stretch(image, limits=limits)]
 
@@ -85,12 +86,12 @@ def tile_pictures(
     """
     folder = Path(folder)
     side, size = thumbnail
-    left, right = (read_tile(folder / row[kind]) for kind in ("left", "right"))
+    left, right = (read_image(folder / row[kind]).astype(np.float64) for kind in ("left", "right"))
     limits = _limits(left)
     result = TilePictures({})
     for name, image in (("left", left), ("right", right)):
-        grey = _grey(np.nan_to_num(image), limits if name == "left" else _limits(right))
-        result.uris[name] = encode(pictures.shrink(grey, side), size)
+        shown = _shown(image, limits if name == "left" else _limits(right))
+        result.uris[name] = encode(pictures.shrink(shown, side), size)
     if row.get("status"):
         status, names = read_flags(folder / row["status"])
         colours = status_colours(list(names.values()))
@@ -118,8 +119,8 @@ def tile_pictures(
     nothing = ~np.isfinite(matched)
     spread = max(DIFFERENCE * (limits[1] - limits[0]), 1e-9)
     large = {
-        "slider_left": _grey(tile.left, limits),
-        "slider_warped": np.repeat(_grey(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
+        "slider_left": _shown(left, limits),
+        "slider_warped": np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
         "slider_difference": pictures.colours(tile.left - matched, (-spread, spread), "RdBu"),
         "slider_disparity": coloured,
     }

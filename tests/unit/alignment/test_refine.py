@@ -160,6 +160,20 @@ def test_a_simpler_model_is_refined_too(images, points):
     assert max(relative_error(refined)) < 0.03
 
 
+def test_no_tie_point_lies_under_a_mask(images, points, tmp_path):
+    cloud = np.zeros(SIZE[::-1], np.uint8)
+    cloud[:, : SIZE[0] // 2] = 1
+    lake = np.zeros(SIZE[::-1], np.uint8)
+    lake[SIZE[1] * 2 // 3 :] = 255
+    masks = [write_image(tmp_path / f"{n}.tif", None, m) for n, m in (("l", cloud), ("r", lake))]
+    refined, observations = refine(start(NONE, PLANTED, 0.5), *images, [points], masks=masks)
+    assert refined.refinement["applied"]
+    assert refined.refinement["used"] > 50
+    assert observations.ties.left[:, 0].min() >= SIZE[0] // 2
+    found = observations.ties.right + observations.ties.shift
+    assert found[:, 1].max() < SIZE[1] * 2 // 3
+
+
 def test_too_little_to_see_is_said(images, tmp_path):
     cloud = lidar()
     corner = cloud[(cloud[:, 0] > LON + 190 / METRES[0])]

@@ -98,10 +98,10 @@ def test_equal_names_in_two_splits_get_the_split_in_front(tmp_path):
 def test_what_is_wrong_with_a_folder_is_told(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         find_pairs(tmp_path / "nowhere", "whu")
-    with pytest.raises(InputError, match="no layout 'kitti'"):
-        find_pairs(tmp_path, "kitti")
+    with pytest.raises(InputError, match="no layout 'middlebury'"):
+        find_pairs(tmp_path, "middlebury")
     us3d_pair(tmp_path, "JAX_1_2_3")
-    with pytest.raises(InputError, match=r"\*_left_\*\.tiff.*take layout stereotruth or us3d"):
+    with pytest.raises(InputError, match=r"\*_left_\*\.tiff.*layout stereotruth or kitti or us3d"):
         find_pairs(tmp_path, "whu")
     (tmp_path / "JAX_1_2_3_RIGHT_RGB.tif").unlink()
     with pytest.raises(InputError, match=r"partner JAX_1_2_3_RIGHT_RGB\.tif is missing"):

@@ -13,10 +13,12 @@ from scipy.ndimage import map_coordinates
 
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.tile_files import round_disparity
-from stereotruth.products.rasters import write_tiff
+from stereotruth.epipolar.colours import COLOURS
+from stereotruth.products.rasters import read_image, read_tile, write_tiff
 
 from ...synthetic.other_programs import PROGRAMS
-from ...synthetic.tiled_scene import SIZE, labels, read, rows_of, run
+from ...synthetic.pictures import colours_in, read_picture
+from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -106,6 +108,45 @@ def test_every_program_opens_the_tiles(
             else:
                 assert found.dtype == values.dtype
                 assert np.array_equal(found, values)
+
+
+@pytest.fixture(scope="module")
+def in_colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
+    folder = tmp_path_factory.mktemp("colour")
+    scene = make_scene(folder / "Town-1", bare_from=240, colour=True)
+    run([scene], folder / "Town", contact_sheet=folder / "contact.png")
+    return folder / "Town", scene
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_tiles_in_colour(in_colour, program: str) -> None:
+    folder, scene = in_colour
+    stores = {view: zarr.open_group(getattr(scene, view), mode="r") for view in ("left", "right")}
+    row = rows_of(folder)[0]
+    for view, col in (("left", 0), ("right", -int(row["right_offset_px"]))):
+        rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
+        cols = slice(int(row["col0"]) + col, int(row["col0"]) + col + SIZE)
+        wanted = np.stack([stores[view][name][rows, cols] for name in COLOURS], axis=-1)
+        found = PROGRAMS[program](folder / row[view])
+        if program == "Pillow":
+            wanted = wanted >> 8
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_tiles_in_colour_are_read_like_others(in_colour, exported: tuple[Path, dict]) -> None:
+    """Same windows and labels as of the grey image; the project's readers give both."""
+    folder, _ = in_colour
+    for row, grey in zip(rows_of(folder), rows_of(exported[0])):
+        for column in ("row0", "col0", "disp_sha256", "split", "sift_matches", "warp_correlation"):
+            assert row[column] == grey[column]
+        assert row["left_sha256"] != grey["left_sha256"]
+        image = read_image(folder / row["left"])
+        assert image.shape == (SIZE, SIZE, 3)
+        np.testing.assert_array_equal(image[..., 0], read_image(exported[0] / grey["left"]))
+        mean = read_tile(folder / row["left"])
+        np.testing.assert_array_equal(mean, image.mean(axis=2))
+    contact = read_picture(folder.parent / "contact.png")
+    assert colours_in(contact) > 0.1
 
 
 def test_the_papers_16_bits_can_be_chosen(scene: SceneFiles, tmp_path: Path) -> None:

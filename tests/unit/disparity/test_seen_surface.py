@@ -21,7 +21,8 @@ def window_of(x: np.ndarray, y: np.ndarray, disparity: np.ndarray, side: int) ->
     count = np.bincount(row * side + col, minlength=side * side)
     start = np.concatenate([[0], np.cumsum(count)])
     outside = np.zeros(side * side, np.int32)
-    return PixelPoints(points[order], start, outside, (side, side), (0, 0), (0, 0))
+    masked = np.zeros(side * side, np.bool_)
+    return PixelPoints(points[order], start, outside, masked, (side, side), (0, 0), (0, 0))
 
 
 def gap(angles: np.ndarray) -> int:

@@ -11,7 +11,8 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.epipolar.image_reader import Source
+from stereotruth.epipolar.image_reader import Source, open_pair
+from stereotruth.epipolar.settings import Settings
 from stereotruth.errors import InputError
 
 from ...synthetic.images import pattern
@@ -166,3 +167,78 @@ def test_sizes_of_damaged_headers_are_refused(tmp_path, shape) -> None:
         ).close()
     with pytest.raises(InputError, match=r"no image of a satellite|can only be read as a whole"):
         Source(path)
+
+
+def test_what_a_mask_file_hides_is_not_read(tmp_path) -> None:
+    """Not zero: masked. Who asks for the mask gets the values under it, too."""
+    cloud = np.zeros(GREY.shape, np.uint8)
+    cloud[10:20, 30:50], cloud[40, 40] = 255, 1
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", cloud)
+    with Source(path, mask) as source:
+        assert source.masks
+        np.testing.assert_array_equal(np.isnan(source.read(0, 0, *source.size)), cloud > 0)
+        (values,), hidden = source.read_layers(25, 5, 60, 50)
+    np.testing.assert_array_equal(values, GREY[5:55, 25:85])
+    np.testing.assert_array_equal(hidden, cloud[5:55, 25:85] > 0)
+
+
+def test_own_mask_and_mask_file_add_up(tmp_path) -> None:
+    own, cloud = np.full(GREY.shape, 255, np.uint8), np.zeros(GREY.shape, np.float32)
+    own[3:9, 4:8], cloud[50:60, 60:70] = 0, 0.5
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=own)
+    with Source(path, write(tmp_path / "cloud.tif", cloud)) as source:
+        (values,), hidden = source.read_layers(0, 0, *source.size)
+    np.testing.assert_array_equal(np.isnan(values), own == 0)
+    np.testing.assert_array_equal(hidden, (own == 0) | (cloud > 0))
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", np.zeros((10, 12), np.uint8))
+    with pytest.raises(InputError, match=r"cloud.tif: a mask of 12 x 10 .* a.tif of 96 x 80"):
+        Source(path, mask)
+
+
+COLOURED = {"photometric": "RGB"}
+
+
+def coloured(path: Path, **options) -> Path:
+    """Red, green, blue and near infrared, each a multiple of the other; a hole in all, in one."""
+    bands = [(GREY * k).astype(np.uint16) for k in (1, 2, 3, 5)]
+    for band in bands:
+        band[10, 10] = 0
+    bands[0][20, 20] = 0
+    return write(path, *bands, **COLOURED, **options)
+
+
+def test_colours_and_a_mix_of_bands_are_read(tmp_path) -> None:
+    path = coloured(tmp_path / "a.tif")
+    with Source(path, mix={2: 0.75, 4: 0.25}, colour=(3, 2, 1)) as source:
+        layers, _ = source.read_layers(0, 0, *source.size)
+        np.testing.assert_array_equal(source.read(0, 0, *source.size), layers[0])
+    there = np.ones(GREY.shape, bool)
+    there[10, 10] = there[20, 20] = False
+    for layer, factor in zip(layers, (0.75 * 2 + 0.25 * 5, 3, 2, 1)):
+        np.testing.assert_allclose(layer[there], (GREY * factor)[there], rtol=1e-6)
+    assert np.isnan(layers[:, 10, 10]).all()
+    assert layers[3, 20, 20] == 0  # dark in one band is not nodata
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [({}, (1, 2, 3)), ({"colour": None}, ()), ({"colour": (4, 1, 2)}, (4, 1, 2))],
+)
+def test_colour_is_what_both_images_call_so(tmp_path, options, expected, caplog) -> None:
+    pair = [coloured(tmp_path / f"{n}.tif") for n in "ab"]
+    with open_pair(*pair, bands=Settings(**options)) as (left, right):
+        assert left.colour == right.colour == expected
+        assert left.mix == pytest.approx(dict.fromkeys(expected, 1 / 3) if expected else {1: 1})
+    assert ("band 1 (red) is used" in caplog.text) == (not expected)
+    grey = write(tmp_path / "g.tif", GREY.astype(np.uint16))
+    if options.get("colour"):
+        with pytest.raises(InputError, match=r"g.tif: no band 4: it has 1\. .*rectify.colour"):
+            open_pair(pair[0], grey, bands=Settings(**options)).__enter__()
+    else:
+        with open_pair(pair[0], grey, bands=Settings(**options)) as (left, right):
+            assert left.colour == right.colour == ()

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.epipolar.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.products.grids import open_grid
 
@@ -219,3 +221,58 @@ def test_complex_images_are_refused(tmp_path: Path) -> None:
     radar = write_image(tmp_path / "sar.tif", None, np.ones((8, 8), dtype=np.complex64))
     with pytest.raises(InputError, match=r"sar.tif: complex image"):
         Source(radar)
+
+
+def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
+    """A mask hides what any of its pixels has a say in; under a mask file the image stays."""
+    sensors, cloud = pair(), np.zeros(SIZE[::-1], np.uint8)
+    cloud[200:210, 220:240] = 1
+    pixels = render(sensors[0], HEIGHT)
+    images = [write_image(tmp_path / f"{n}.tif", None, pixels) for n in ("left", "right")]
+    mask = write_image(tmp_path / "cloud.tif", None, cloud)
+    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
+    found = {}
+    for name, given in (("clear", (None, None)), ("masked", (mask, None))):
+        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
+        with open_pair(*images, *given) as opened:
+            rectify(*opened, model, *out)
+        found[name] = [open_grid(path) for path in out[1:]]
+    left, right = found["masked"]
+    with xr.open_zarr(tmp_path / "masked/left.zarr") as alone:
+        np.testing.assert_array_equal(alone["mask"], left.mask)
+    assert "mask" not in right and "mask" not in found["clear"][0]
+    np.testing.assert_array_equal(left.image, found["clear"][0].image)
+    col, row = model.epipolar_to_left(*np.indices(model.shape)[::-1])
+    inside = (col > 217.1) & (col < 241.9) & (row > 197.1) & (row < 211.9)
+    outside = (col < 216.9) | (col > 242.1) | (row < 196.9) | (row > 212.1)
+    hidden = left.mask.values == 1
+    assert hidden[inside].all() and inside.sum() > 300
+    assert not hidden[outside].any()
+    assert left.mask.attrs["flag_meanings"] == "seen masked"
+
+
+def test_colours_are_rectified_alike(tmp_path: Path) -> None:
+    """A colour is what a grey image of its values alone would be; the image is the bands' mix."""
+    sensors = pair()
+    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
+    grey = render(sensors[0], HEIGHT)
+    bands = [(grey // k).astype(np.uint16) + 1 for k in (1, 2, 3)]
+    stores = {}
+    mix = Settings(panchromatic={1: 1, 2: 1})
+    for name, pixels, given in (("rgb", np.stack(bands), mix), ("green", bands[1], None)):
+        options = {"photometric": "RGB"} if name == "rgb" else {}
+        images = [write_image(tmp_path / f"{n}.tif", None, pixels, **options) for n in "lr"]
+        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
+        with open_pair(*images, bands=given) as opened:
+            rectify(*opened, model, *out)
+        stores[name] = open_grid(out[1])
+    rgb = stores["rgb"]
+    with xr.open_zarr(tmp_path / "rgb/left.zarr") as alone:
+        np.testing.assert_array_equal(alone["green"], rgb.green)
+    np.testing.assert_array_equal(rgb.green, stores["green"].image)
+    assert rgb.green.attrs["nodata"] == 0 and rgb.green.attrs["units"] == "1"
+    assert rgb.attrs["resampling"]["mix"] == {"band 1": 0.5, "band 2": 0.5}
+    assert "mix" not in stores["green"].attrs["resampling"]
+    mixed = (rgb.red.values.astype(float) + rgb.green.values) / 2
+    assert np.abs(mixed - rgb.image).max() <= 1.0
+    assert (rgb.red.values > rgb.blue.values)[rgb.image.values > 0].all()

@@ -425,6 +425,6 @@ def _write_tiff(out: Path, made: BlockStore, raster: Raster, tags: dict[str, str
             blockxsize=CHUNK,
             blockysize=CHUNK,
             compress="deflate",
-            predictor=3,
+            predictor=1,  # readers without libtiff know no float predictor
             BIGTIFF="IF_SAFER",
         )

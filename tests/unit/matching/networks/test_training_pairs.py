@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +31,19 @@ def test_pairs_are_scaled_and_unlabelled_pixels_are_nan(dataset: StereoDataset) 
     assert left.shape == right.shape == (1, SIZE, SIZE) and disparity.shape == (SIZE, SIZE)
     assert torch.isnan(disparity[: SIZE // 4]).all()
     assert (disparity[SIZE // 4 :] == -6).all()
+
+
+def test_the_three_lines_of_the_readme(dataset: StereoDataset, tmp_path, monkeypatch) -> None:
+    text = (Path(__file__).parents[4] / "README.md").read_text(encoding="utf-8")
+    (lines,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Labelled" in b)
+    assert len(list(filter(None, lines.splitlines()))) == 3
+    (tmp_path / "dataset").symlink_to(dataset.root)
+    monkeypatch.chdir(tmp_path)
+    found: dict = {}
+    exec(lines, found)
+    left, right, disparity = found["pairs"][0]
+    assert left.shape == right.shape == (1, SIZE, SIZE) and disparity.shape == (SIZE, SIZE)
+    assert len(found["pairs"]) == 3 and torch.isfinite(disparity).any()
 
 
 def test_labels_out_of_range_count_nowhere(dataset: StereoDataset) -> None:

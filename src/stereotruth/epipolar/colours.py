@@ -1,0 +1,3 @@
+"""The names of the layers of rectified images in colour."""
+
+COLOURS = ("red", "green", "blue")
