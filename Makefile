@@ -61,7 +61,7 @@ lint: $(READY)
 
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:
-	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra dev --extra cluster \
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster \
 	  --universal --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 

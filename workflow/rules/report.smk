@@ -43,23 +43,6 @@ rule report_city:
         "../scripts/report_city.py"
 
 
-def cities_of_report():
-    """All of a configuration that somebody named; of the examples, those that have tiles.
-
-    Who forgets --configfile asks for none of the synthetic cities.
-    """
-    examples = Path(SETTINGS.cities).match("config/cities.tsv")
-    if workflow.overwrite_configfiles or not examples:
-        return list(CITIES)
-    if made := [city for city in CITIES if Path(f"tiles/{city}").is_dir()]:
-        return made
-    raise WorkflowError(
-        f"{SETTINGS.cities}: no city of it has tiles to report on. Remedy: add --configfile FILE "
-        "if it was forgotten; or make tiles first (snakemake --cores 2 tiles/<City>), or ask for "
-        "all these cities by --configfile config/config.yaml"
-    )
-
-
 rule report:
     input:
         lambda w: expand("results/report/{city}/index.html", city=cities_of_report()),
