@@ -23,6 +23,7 @@ copyright = "The stereotruth developers, Apache-2.0"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["_build"]
+highlight_language = "text"
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # types of NumPy and others: their pages are not at hand
 
