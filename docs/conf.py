@@ -8,12 +8,13 @@ from pathlib import Path
 
 import typer.main
 from sphinx.application import Sphinx
-from sphinx.errors import ExtensionError
+from sphinx.util import logging
 from typer.cli import get_docs_for_click
 
 from stereotruth import __version__
 from stereotruth.command.main import app as command
 
+LOG = logging.getLogger(__name__)
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 
@@ -57,7 +58,7 @@ LINK = re.compile(r"(?<!`)\[([^\]\n]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
 def with_links(text: str, file: Path, page: str) -> str:
     """Text of ``file`` with its links as they go from ``page``.
 
-    A link to a file that has no page becomes its path. Raises ExtensionError if it is not there.
+    A link to a file that has no page becomes its path; one to what is not there is a warning.
     """
 
     def link(found: re.Match[str]) -> str:
@@ -66,7 +67,8 @@ def with_links(text: str, file: Path, page: str) -> str:
             return found[0]
         there = (file.parent / target).resolve()
         if not there.exists():
-            raise ExtensionError(f"{file.relative_to(ROOT)} links to {target}, which is not there")
+            LOG.warning("%s links to %s, which is not there", file.relative_to(ROOT), target)
+            return found[0]
         name = there.relative_to(ROOT).as_posix()
         if name in HOMES:
             there = DOCS / f"{HOMES[name]}.md"
