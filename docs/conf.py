@@ -32,7 +32,7 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 
 autodoc_typehints = "signature"
-autodoc_type_aliases = {"ArrayLike": "ArrayLike", "Floats": "Floats"}  # not what they stand for
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}  # not the union that it stands for
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True}
 autodoc_preserve_defaults = True
