@@ -7,6 +7,7 @@
 # make test-all       set up, then pass all: kills and restarts, browsers, benchmarks, real scenes too
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
+# make docs           set up, then build the documentation: docs/_build/html/index.html
 # make networks       set up with PyTorch
 # make lint           format, lint, lock file
 # make lock           resolve the pins again (needs uv)
@@ -16,7 +17,7 @@ CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup help networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup help docs networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -43,6 +44,10 @@ test: $(READY)
 test-all: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES)
 
+# Warnings are errors; links to what is not there are such.
+docs: $(READY)
+	$(BIN)/sphinx-build -W --keep-going -n -q -b html docs docs/_build/html
+
 networks: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
 
@@ -61,11 +66,11 @@ lint: $(READY)
 
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:
-	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster \
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster --extra docs \
 	  --universal --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark audit report.html bench/out .snakemake
+	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark audit report.html bench/out docs/_build .snakemake
 
 FORCE:

@@ -1,0 +1,115 @@
+"""The site of the documentation: ``make docs`` writes it to ``docs/_build``, without network."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import typer.main
+from sphinx.application import Sphinx
+from sphinx.util import logging
+from typer.cli import get_docs_for_click
+
+from stereotruth import __version__
+from stereotruth.command.main import app as command
+
+LOG = logging.getLogger(__name__)
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+
+project = "stereotruth"
+author = "The stereotruth developers"
+copyright = "The stereotruth developers, Apache-2.0"
+version = release = __version__
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+exclude_patterns = ["_build"]
+highlight_language = "text"
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", ".*")]  # types of NumPy and others: their pages are not at hand
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+
+autodoc_typehints = "signature"
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}  # not the union that it stands for
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True}
+autodoc_preserve_defaults = True
+
+html_theme = "furo"
+html_title = "stereotruth"
+html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["wide_tables.css"]
+
+# What lies beside the files that it tells of, and its page here.
+HOMES = {
+    "bench/README.md": "benchmarks",
+    "config/README.md": "reference/configuration",
+    "envs/README.md": "reference/environments",
+    "profiles/README.md": "reference/profiles",
+    "CONTRIBUTING.md": "contributing",
+    "README.md": "index",
+}
+INCLUDED = re.compile(r"^```\{include\} (\S+)\n```$", re.MULTILINE)
+LINK = re.compile(r"(?<!`)\[([^\]\n]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def with_links(text: str, file: Path, page: str) -> str:
+    """Text of ``file`` with its links as they go from ``page``.
+
+    A link to a file that has no page becomes its path; one to what is not there is a warning.
+    """
+
+    def link(found: re.Match[str]) -> str:
+        words, target, anchor = found[1], found[2], found[3] or ""
+        if "://" in target:
+            return found[0]
+        there = (file.parent / target).resolve()
+        if not there.exists():
+            LOG.warning("%s links to %s, which is not there", file.relative_to(ROOT), target)
+            return found[0]
+        name = there.relative_to(ROOT).as_posix()
+        if name in HOMES:
+            there = DOCS / f"{HOMES[name]}.md"
+        elif not there.is_relative_to(DOCS):
+            return f"`{name}`"
+        return f"[{words}]({Path(os.path.relpath(there, (DOCS / page).parent)).as_posix()}{anchor})"
+
+    return LINK.sub(link, text)
+
+
+def complete(app: Sphinx, page: str, source: list[str]) -> None:
+    """Put what stands elsewhere, and what is generated, into the text of a page."""
+    here = Path(app.env.doc2path(page))
+
+    def include(found: re.Match[str]) -> str:
+        file = (here.parent / found[1]).resolve()
+        app.env.note_dependency(str(file))
+        return with_links(file.read_text(encoding="utf-8"), file, page)
+
+    text = with_links(source[0], here, page)
+    text = INCLUDED.sub(include, text)
+    source[0] = text.replace("<!-- command line -->", command_line())
+
+
+EXAMPLES = re.compile(r"^\[bold\]Examples\[/bold\]\n((?:\n\[cyan\].*\[/cyan\]\n)+)", re.MULTILINE)
+
+
+def command_line() -> str:
+    """Help of all commands, as Markdown."""
+    click = typer.main.get_command(command)
+    context = click.make_context("stereotruth", [], resilient_parsing=True)
+    text = get_docs_for_click(obj=click, ctx=context, name="stereotruth")
+
+    def examples(found: re.Match[str]) -> str:
+        lines = re.findall(r"\[cyan\](.*)\[/cyan\]", found[1])
+        return "\n".join(["**Examples**:", "", "```console", *(f"$ {x}" for x in lines), "```", ""])
+
+    return EXAMPLES.sub(examples, text.partition("\n")[2])
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", complete)
