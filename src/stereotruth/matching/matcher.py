@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,27 @@ class Matcher(Protocol):
 
     def scaling(self, left: Any, right: Any) -> Any:
         """Statistics of whole images (NumPy or Dask arrays) that all their parts must share."""
+        ...
+
+
+class Matched(NamedTuple):
+    """A result with what it took: seconds, and peak memory in MB (None: not known)."""
+
+    disparity: NDArray[np.float32]
+    seconds: float
+    memory_mb: float | None
+
+
+@runtime_checkable
+class BatchMatcher(Matcher, Protocol):
+    """A stereo method that is better asked for many pairs at once, and measures itself."""
+
+    def many(
+        self,
+        pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+        disparity_range: DisparityRange,
+    ) -> Iterator[Matched]:
+        """The results of pairs of images, in their order, each as soon as it is there."""
         ...
 
 
