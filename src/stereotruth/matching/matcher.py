@@ -43,6 +43,14 @@ class Matcher(Protocol):
         ...
 
 
+class ImagePair(NamedTuple):
+    """Two images as :class:`Matcher` takes them, and what they are called."""
+
+    name: str
+    left: NDArray[Any]
+    right: NDArray[Any]
+
+
 class Matched(NamedTuple):
     """A result with what it took: seconds, and peak memory in MB (None: not known)."""
 
@@ -57,7 +65,7 @@ class BatchMatcher(Matcher, Protocol):
 
     def many(
         self,
-        pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+        pairs: Iterable[ImagePair],
         disparity_range: DisparityRange,
     ) -> Iterator[Matched]:
         """The results of pairs of images, in their order, each as soon as it is there."""

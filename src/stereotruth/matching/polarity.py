@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .matcher import BatchMatcher, DisparityRange, Matched, Matcher
+from .matcher import BatchMatcher, DisparityRange, ImagePair, Matched, Matcher
 
 RIM_PX = 1
 POLARITIES = ("any", "positive")
@@ -99,11 +99,13 @@ class PositiveBatchMethod(PositiveMethod):
 
     def many(
         self,
-        pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+        pairs: Iterable[ImagePair],
         disparity_range: DisparityRange,
     ) -> Iterator[Matched]:
         """The results of many pairs, in their order; see :class:`matcher.BatchMatcher`."""
-        moved = (_moved(left, right, disparity_range) for left, right in pairs)
+        moved = (
+            ImagePair(name, *_moved(left, right, disparity_range)) for name, left, right in pairs
+        )
         for found in self._method.many(moved, _seen(disparity_range)):
             yield found._replace(disparity=self._back(found.disparity, disparity_range))
 

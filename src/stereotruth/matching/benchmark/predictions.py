@@ -2,7 +2,8 @@
 
 ``<pair>.tiff`` is float32, NaN where the method gives no disparity. ``predictions.json`` says how
 they were made, the seconds of each pair (the first pair that a process works on is matched twice,
-and only the second time counts), and the memory of the process at its peak.
+and only the second time counts), and the memory of the process at its peak. Programs of their own
+(kind ``command``) measure themselves, with their start, and nothing is matched twice.
 
 Pairs stay in a work folder (hard links) with a record of what they were made of, images and
 method, so that a later call carries on where one was killed, and takes over what it would make the
@@ -17,13 +18,12 @@ import re
 import resource
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,14 +34,15 @@ from ...products.files import link, whole_folder
 from ...products.finished_pieces import Ledger
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
-from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
+from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER
-from ..matcher import Matcher
-from ..methods import make_method
+from ..matcher import BatchMatcher, ImagePair, Matcher
+from ..methods import MOVED, make_method
+from ..result_files import SUFFIXES, read_result
 from .prediction_files import RECORD
 
-SUFFIXES = (".tif", ".tiff", ".npy", ".pfm")  # of a folder of results
 MB = 1 << 20
+Disparity = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -84,24 +85,28 @@ def predict(
     }
     if settings["kind"] == FOLDER:
         made_of["nodata"] = dataset.nodata
-        maker: _Results | _Runs = _Results(name, Path(settings["folder"]), dataset.nodata)
+        maker: _Results | _Runs = _Results(name, settings, dataset.nodata)
     else:
         maker = _Runs(name, settings, dataset.disparity_range, workers)
     ledger = Ledger(work / "done")
-    found = {}
-    for pair in progress(pairs, len(pairs), f"{name}: pairs matched"):
-        file = work / f"{pair.name}.tiff"
+    found, keys, seen, missing = {}, {}, {}, []
+    for pair in pairs:
         sources = maker.sources(pair)
-        here = marks(sources)
-        key = digest(made_of | {"images": [file_sha256(source) for source in sources]})
-        piece = ledger.find(pair.name, key, {"disparity": file})
+        seen[pair.name] = marks(sources)
+        keys[pair.name] = digest(made_of | {"images": [file_sha256(source) for source in sources]})
+        piece = ledger.find(pair.name, keys[pair.name], {"disparity": work / f"{pair.name}.tiff"})
         if piece is None:
-            disparity, made = maker(pair)
-            _check(disparity, pair, name)
-            write_disparity(file, disparity)
-            refuse_replaced(before | here)
-            piece = ledger.put(pair.name, key, {"disparity": file}, vars(made))
-        found[pair.name] = Prediction(**piece.result)
+            missing.append(pair)
+        else:
+            found[pair.name] = Prediction(**piece.result)
+    made = progress(maker(missing), len(missing), f"{name}: pairs matched")
+    for pair, (disparity, took) in zip(missing, made, strict=True):
+        file = work / f"{pair.name}.tiff"
+        _check(disparity, pair, name)
+        write_disparity(file, disparity)
+        refuse_replaced(before | seen[pair.name])
+        ledger.put(pair.name, keys[pair.name], {"disparity": file}, vars(took))
+        found[pair.name] = took
     record = {
         "dataset": dataset.name,
         "split": split,
@@ -111,7 +116,7 @@ def predict(
         "device": maker.device,
         "threads": workers,
         **_summary(found),
-        "pairs": {pair: vars(of) for pair, of in found.items()},
+        "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
     with whole_folder(out) as scratch:
@@ -133,28 +138,36 @@ class _Runs:
     ) -> None:
         self._range = range_px
         self._matcher: Matcher = make_method(name, settings, workers)
-        self._warm = False
         self.device = str(getattr(self._matcher, "device", f"CPU, {platform.machine()}"))
 
     def sources(self, pair: Pair) -> list[Path]:
         """The files that the disparity of a pair follows from."""
         return [pair.left, pair.right]
 
-    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
-        """Disparity of a pair, and what it took."""
-        left, right = read_image(pair.left), read_image(pair.right)
-        if left.shape != right.shape or left.dtype != right.dtype:
-            raise InputError(
-                f"left image is {left.shape} {left.dtype}, right one {right.shape} {right.dtype}",
-                file=pair.right,
-                remedy="give images of one size and type",
-            )
-        for _ in range(1 if self._warm else 2):
-            start = time.perf_counter()
-            disparity = self._matcher(left, right, self._range)
-            seconds = time.perf_counter() - start
-        self._warm = True
-        return disparity, Prediction(round(seconds, 6), round(peak_memory_mb(), 1))
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[tuple[Disparity, Prediction]]:
+        """Disparities of pairs, and what they took."""
+        images = (ImagePair(pair.name, *_images(pair)) for pair in pairs)
+        if isinstance(self._matcher, BatchMatcher):
+            for disparity, seconds, memory_mb in self._matcher.many(images, self._range):
+                yield disparity, Prediction(round(seconds, 6), memory_mb)
+            return
+        for number, (_, left, right) in enumerate(images):
+            for _ in range(1 if number else 2):
+                start = time.perf_counter()
+                disparity = self._matcher(left, right, self._range)
+                seconds = time.perf_counter() - start
+            yield disparity, Prediction(round(seconds, 6), round(peak_memory_mb(), 1))
+
+
+def _images(pair: Pair) -> tuple[NDArray[Any], NDArray[Any]]:
+    left, right = read_image(pair.left), read_image(pair.right)
+    if left.shape != right.shape or left.dtype != right.dtype:
+        raise InputError(
+            f"left image is {left.shape} {left.dtype}, right one {right.shape} {right.dtype}",
+            file=pair.right,
+            remedy="give images of one size and type",
+        )
+    return left, right
 
 
 class _Results:
@@ -162,7 +175,13 @@ class _Results:
 
     device = ""
 
-    def __init__(self, name: str, folder: Path, nodata: float) -> None:
+    def __init__(self, name: str, settings: Mapping[str, Any], nodata: float) -> None:
+        if moved := [key for key in MOVED if key in settings]:
+            raise InputError(
+                f"method {name!r}: {' and '.join(moved)} cannot change a folder of results",
+                remedy="take it away: results are x_left − x_right as they are",
+            )
+        folder = Path(settings["folder"])
         self._name, self._folder, self._nodata = name, folder, nodata
         if not folder.is_dir():
             raise InputError(
@@ -184,17 +203,10 @@ class _Results:
         """The file with the result of a pair."""
         return [self._file(pair)]
 
-    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
-        """Disparity of a pair."""
-        file = self._file(pair)
-        if file.suffix in (".tif", ".tiff"):
-            return read_disparity(file, self._nodata), Prediction(None, None)
-        values = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), -1)
-        if values is None:
-            raise InputError("no image that can be read", file=file, remedy="write it anew")
-        values = values.astype(np.float32)
-        values[~np.isfinite(values) | (values == np.float32(self._nodata))] = np.nan
-        return values, Prediction(None, None)
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[tuple[Disparity, Prediction]]:
+        """Disparities of pairs."""
+        for pair in pairs:
+            yield read_result(self._file(pair), self._nodata), Prediction(None, None)
 
 
 def _check(disparity: NDArray[np.float32], pair: Pair, name: str) -> None:

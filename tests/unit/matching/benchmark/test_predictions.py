@@ -135,8 +135,11 @@ def test_what_a_folder_lacks_is_told(dataset):
     with pytest.raises(InputError, match="no result for pair KM_2"):
         run(dataset, settings)
     write(Path("theirs/KM_2.tif"), np.zeros((3, 3), np.float32))
+    write(Path("theirs/KM_3.tif"), np.zeros(SHAPE, np.float32))
     with pytest.raises(InputError, match=r"KM_2 is \(3, 3\), its image \(8, 12\)"):
         run(dataset, settings)
+    with pytest.raises(InputError, match="polarity cannot change a folder"):
+        run(dataset, settings | {"polarity": "positive"})
 
 
 def test_images_that_do_not_fit_each_other_are_refused(dataset):
