@@ -15,8 +15,7 @@ from .kinds import kind_of
 from .matcher import Matcher
 from .polarity import with_polarity
 
-# keys of an entry that are no settings of its kind
-SHOWN = ("kind", "label", "fine_tuned_of", "licence", "version")
+TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
 MOVED = ("polarity", "outside")  # of any kind
 
 
@@ -31,7 +30,7 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
     method does not take.
     """
     kind = kind_of(name, settings)
-    options = {k: v for k, v in settings.items() if k not in (*SHOWN, *MOVED)}
+    options = {k: v for k, v in settings.items() if k not in ("kind", *TOLD, *MOVED)}
     moved = {key: settings[key] for key in MOVED if key in settings}
     if kind.module is None:
         raise InputError(f"method {name!r} is a folder of results", remedy="take one that can run")

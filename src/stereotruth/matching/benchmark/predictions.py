@@ -4,6 +4,7 @@
 they were made, the seconds of each pair (the first pair that a process works on is matched twice,
 and only the second time counts), and the memory of the process at its peak. Programs of their own
 (kind ``command``) measure themselves, with their start, and nothing is matched twice.
+``machine`` is the one of the last call.
 
 Pairs stay in a work folder (hard links) with a record of what they were made of, images and
 method, so that a later call carries on where one was killed, and takes over what it would make the
@@ -37,8 +38,9 @@ from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER
 from ..matcher import BatchMatcher, ImagePair, Matcher
-from ..methods import MOVED, make_method
+from ..methods import MOVED, TOLD, make_method
 from ..result_files import SUFFIXES, read_result
+from .identity import identity, machine
 from .prediction_files import RECORD
 
 MB = 1 << 20
@@ -78,7 +80,7 @@ def predict(
     files = [file for file in files if Path(file).is_file()]
     before = marks(files)
     made_of = {
-        "method": dict(settings),
+        "method": {key: value for key, value in settings.items() if key not in TOLD},
         "files": [file_sha256(file) for file in files],
         "range": list(dataset.disparity_range),
         "code": code,
@@ -112,6 +114,8 @@ def predict(
         "split": split,
         "method": name,
         "settings": dict(settings),
+        "identity": identity(settings, files, code),
+        "machine": machine(),
         "disparity_range": list(dataset.disparity_range),
         "device": maker.device,
         "threads": workers,

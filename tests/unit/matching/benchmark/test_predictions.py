@@ -98,6 +98,9 @@ def test_only_what_a_pair_is_made_of_has_it_matched_again(dataset):
     first = read_record("out")
     write(Path("data/test/disp/KM_disparity_2.tiff"), np.zeros(SHAPE, np.float32))  # a label
     assert run(dataset, **files) == first and calls() == []
+    told = run(dataset, METHOD | {"licence": "MIT", "version": "3"}, **files)
+    assert told["identity"]["licence"] == "MIT" and calls() == []
+    assert list(told["identity"]["files"]) == ["mine.py"] and told["machine"]["cores"] >= 1
     run(dataset, **files, code="other")
     assert len(calls()) == 4
     Path("mine.py").write_text(CODE + "\n# another")
