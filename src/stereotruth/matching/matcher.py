@@ -52,11 +52,31 @@ class ImagePair(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """A result with what it took: seconds, and peak memory in MB (None: not known)."""
+    """A result with what it took: seconds and peak memory in MB (None: not known).
+
+    ``uncertainty``: standard uncertainty of each disparity, float32[h, w] px, of methods that
+    state one.
+    """
 
     disparity: NDArray[np.float32]
-    seconds: float
+    seconds: float | None
     memory_mb: float | None
+    uncertainty: NDArray[np.float32] | None = None
+
+
+@runtime_checkable
+class UncertainMatcher(Matcher, Protocol):
+    """A stereo method that may state the standard uncertainty of its disparities."""
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Disparity as :class:`Matcher` has it, and its standard uncertainty [h, w] px or None."""
+        ...
 
 
 @runtime_checkable

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .matcher import BatchMatcher, DisparityRange, ImagePair, Matched, Matcher
+from .matcher import BatchMatcher, DisparityRange, ImagePair, Matched, Matcher, UncertainMatcher
 
 RIM_PX = 1
 POLARITIES = ("any", "positive")
@@ -73,18 +73,31 @@ class PositiveMethod:
         scaling: Any = None,
     ) -> NDArray[np.float32]:
         """Disparity float32[h, w] px of the range, which may have both signs."""
+        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """The disparity, and its standard uncertainty if the method states one."""
         if scaling is None:
             scaling = self._method.scaling(left, right)
         moved = _moved(left, right, disparity_range)
-        found = self._method(*moved, _seen(disparity_range), scaling)
-        return self._back(found, disparity_range)
+        seen = _seen(disparity_range)
+        if isinstance(self._method, UncertainMatcher):
+            found, sigma = self._method.with_uncertainty(*moved, seen, scaling)
+        else:
+            found, sigma = self._method(*moved, seen, scaling), None
+        return self._back(found, disparity_range), _cut(sigma, disparity_range)
 
     def _back(
         self, found: NDArray[np.float32], disparity_range: DisparityRange
     ) -> NDArray[np.float32]:
         low, _ = disparity_range
-        (before, after), _ = _added(disparity_range)
-        disparity = found[:, before : found.shape[1] - after] + np.float32(min(low, 0))
+        disparity = _cut(found, disparity_range) + np.float32(min(low, 0))
         if self._invalid_outside:
             width = disparity.shape[1]
             match = np.arange(width) - disparity
@@ -107,7 +120,10 @@ class PositiveBatchMethod(PositiveMethod):
             ImagePair(name, *_moved(left, right, disparity_range)) for name, left, right in pairs
         )
         for found in self._method.many(moved, _seen(disparity_range)):
-            yield found._replace(disparity=self._back(found.disparity, disparity_range))
+            yield found._replace(
+                disparity=self._back(found.disparity, disparity_range),
+                uncertainty=_cut(found.uncertainty, disparity_range),
+            )
 
 
 def _added(disparity_range: DisparityRange) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -117,6 +133,16 @@ def _added(disparity_range: DisparityRange) -> tuple[tuple[int, int], tuple[int,
         return (0, 0), (0, 0)
     high = max(high, 0)
     return (high - low, RIM_PX), (high, RIM_PX - low)
+
+
+def _cut(
+    values: NDArray[np.float32] | None, disparity_range: DisparityRange
+) -> NDArray[np.float32] | None:
+    """What a method says of the widened left image, without the columns that were added."""
+    if values is None:
+        return None
+    (before, after), _ = _added(disparity_range)
+    return values[:, before : values.shape[1] - after]
 
 
 def _moved(

@@ -6,6 +6,9 @@ file that the disparities x_left − x_right go to ([h, w] px, NaN, infinity or 
 there is none; ``suffix``: TIFF, NumPy's .npy or .pfm), ``{low}`` and ``{high}`` the range (the
 second excluded), ``{threads}`` the threads that it may use.
 
+With ``uncertainty: true`` it also writes the standard uncertainty of each disparity in px to
+``{uncertainty}``, a map as the other one; with ``pairs: file`` that is the fourth of a row.
+
 ``pairs: each``: the program is called for each pair. ``pairs: file``: it is called once for up to
 ``MOST_PAIRS`` pairs, and ``{pairs}`` is a CSV file without header, a row ``left,right,out`` for
 each. A result is taken as soon as that of a later row has been begun and it was left alone for
@@ -62,6 +65,7 @@ class CommandMethod:
         command: str,
         pairs: str = "each",
         suffix: str = ".tif",
+        uncertainty: bool = False,
         files: Sequence[str] = (),
         margin_px: int = MARGIN_PX,
         workers: int = 1,
@@ -72,15 +76,19 @@ class CommandMethod:
                     f"method {name!r}: {key} is {value!r}",
                     remedy=f"take one of {', '.join(known)}",
                 )
-        if lacking := [word for word in NEEDED[pairs] if word not in command]:
+        needed = NEEDED[pairs]
+        if uncertainty and pairs == "each":
+            needed += ("{uncertainty}",)
+        if lacking := [word for word in needed if word not in command]:
             raise InputError(
                 f"method {name!r}: its command has no {', '.join(lacking)}",
-                remedy=f"write where the program is told of {' '.join(NEEDED[pairs])}",
+                remedy=f"write where the program is told of {' '.join(needed)}",
             )
         self.margin_px = margin_px
         self._name, self._words, self._suffix = name, words_of(command), suffix
         self._at_once = MOST_PAIRS if pairs == "file" else 1
         self._workers = workers
+        self._columns = ("left", "right", "out", *(("uncertainty",) if uncertainty else ()))
 
     def scaling(self, left: Any, right: Any) -> None:
         """None: nothing is known of what the program does."""
@@ -93,8 +101,18 @@ class CommandMethod:
         scaling: Any = None,
     ) -> NDArray[np.float32]:
         """The program's disparity; raises InputError if it fails, or gives none of this size."""
+        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """The program's disparity, and its standard uncertainty if it writes one."""
         (found,) = self.many([ImagePair("pair", left, right)], disparity_range)
-        return found.disparity
+        return found.disparity, found.uncertainty
 
     def many(
         self, pairs: Iterable[ImagePair], disparity_range: DisparityRange
@@ -112,24 +130,21 @@ class CommandMethod:
                 del some
                 yield from self._results(Path(folder), names, rows, shapes, disparity_range)
 
-    def _written(self, folder: Path, pair: ImagePair) -> tuple[Path, Path, Path]:
-        """The files of a pair: images, which are written, and result."""
-        left, right, out = (
-            folder / f"{pair.name}_{what}"
-            for what in ("left.tif", "right.tif", f"disparity{self._suffix}")
-        )
-        for file, image in ((left, pair.left), (right, pair.right)):
-            # OpenCV has blue first
-            cv2.imwrite(
-                str(file), np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image)
-            )
-        return left, right, out
+    def _written(self, folder: Path, pair: ImagePair) -> list[Path]:
+        """The files of a pair: images, which are written, and results."""
+        ends = ("left.tif", "right.tif", f"disparity{self._suffix}", f"uncertainty{self._suffix}")
+        files = [folder / f"{pair.name}_{end}" for end in ends[: len(self._columns)]]
+        for file, image in zip(files, (pair.left, pair.right)):
+            if image.ndim == 3:
+                image = np.ascontiguousarray(image[..., ::-1])  # OpenCV has blue first
+            cv2.imwrite(str(file), image)
+        return files
 
     def _results(
         self,
         folder: Path,
         names: Sequence[str],
-        rows: Sequence[tuple[Path, Path, Path]],
+        rows: Sequence[list[Path]],
         shapes: Sequence[tuple[int, int]],
         disparity_range: DisparityRange,
     ) -> Iterator[Matched]:
@@ -137,36 +152,39 @@ class CommandMethod:
         with table.open("w", newline="", encoding="utf-8") as stream:
             csv.writer(stream, lineterminator="\n").writerows(rows)
         low, high = disparity_range
-        values = dict(zip(("left", "right", "out"), rows[0]), pairs=table, low=low, high=high)
+        values = dict(zip(self._columns, rows[0]), pairs=table, low=low, high=high)
         values["threads"] = self._workers
         words = [_filled(word, values) for word in self._words]
-        outs = [out for *_, out in rows]
+        outs = [row[2:] for row in rows]
         last, done = time.time(), 0
         with self._started(words, folder / "output.txt") as program:
             while done < len(outs):
                 status = program.wait(POLL_SECONDS)
-                if status == 0 and not outs[done].is_file():
-                    raise program.failure(
-                        f"wrote no disparities of pair {names[done]}", names[done]
-                    )
+                lacking = [out for out in outs[done] if not out.is_file()]
+                if status == 0 and lacking:
+                    what = "uncertainty" if lacking[0] not in outs[done][:1] else "disparities"
+                    raise program.failure(f"wrote no {what} of pair {names[done]}", names[done])
                 if _finished(outs, done, status):
-                    written = outs[done].stat().st_mtime
+                    written = max(out.stat().st_mtime for out in outs[done])
                     seconds = max(written - last, 0.0) if len(outs) > 1 else program.seconds
                     last = max(written, last)
-                    disparity = read_result(outs[done])
-                    if disparity.shape != shapes[done]:
-                        raise program.failure(
-                            f"wrote disparities of {disparity.shape} px for images of "
-                            f"{shapes[done]}",
-                            names[done],
-                        )
-                    yield Matched(disparity, seconds, program.memory_mb)
-                    outs[done].unlink()
+                    maps = [read_result(out) for out in outs[done]]
+                    for found in maps:
+                        if found.shape != shapes[done]:
+                            raise program.failure(
+                                f"wrote disparities of {found.shape} px for images of "
+                                f"{shapes[done]}",
+                                names[done],
+                            )
+                    yield Matched(maps[0], seconds, program.memory_mb, *maps[1:])
+                    for out in outs[done]:
+                        out.unlink()
                     done += 1
                 elif status:
                     how = f"status {status}" if status > 0 else f"signal {-status}"
-                    lacking = (n for n, out in zip(names[done:], outs[done:]) if not out.exists())
-                    raise program.failure(f"ended with {how}", next(lacking, names[-1]))
+                    begun = [any(out.exists() for out in of) for of in outs]
+                    at = next((n for n in range(done, len(outs)) if not begun[n]), -1)
+                    raise program.failure(f"ended with {how}", names[at])
             if program.wait():
                 raise program.failure("failed after its last result", names[-1])
 
@@ -248,14 +266,15 @@ def _filled(word: str, values: Mapping[str, Any]) -> str:
     return word
 
 
-def _finished(outs: Sequence[Path], index: int, status: int | None) -> bool:
-    """Whether a result is whole, as far as can be told from outside."""
-    if not outs[index].is_file() or status == 0:
-        return outs[index].is_file()
-    if not any(out.exists() for out in outs[index + 1 :]):
+def _finished(outs: Sequence[Sequence[Path]], index: int, status: int | None) -> bool:
+    """Whether the results of a pair are whole, as far as can be told from outside."""
+    there = all(out.is_file() for out in outs[index])
+    if not there or status == 0:
+        return there
+    if not any(out.exists() for later in outs[index + 1 :] for out in later):
         return False
-    settled = time.time() - outs[index].stat().st_mtime > SETTLED_SECONDS
-    return settled or status is not None
+    written = max(out.stat().st_mtime for out in outs[index])
+    return status is not None or time.time() - written > SETTLED_SECONDS
 
 
 def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> CommandMethod:

@@ -251,3 +251,26 @@ def test_the_files_of_a_program_are_the_words_that_are_files(here):
     assert KINDS["command"].files(settings) == [
         Path(name) for name in ("infer.py", "more.py", "weights.pt")
     ]
+
+
+@pytest.mark.parametrize("pairs", ["each", "file"])
+def test_a_program_may_state_uncertainties(here, pairs):
+    code = (
+        "import csv, sys, numpy as np\n"
+        "rows = csv.reader(open(sys.argv[1])) if len(sys.argv) == 2 else [sys.argv[1:]]\n"
+        "for left, right, out, uncertainty in rows:\n"
+        "    np.save(out, np.zeros((4, 6)))\n"
+        "    np.save(uncertainty, np.full((4, 6), 0.5))\n"
+    )
+    Path("own.py").write_text(code)
+    given = "{pairs}" if pairs == "file" else "{left} {right} {out} {uncertainty}"
+    settings = {"kind": "command", "pairs": pairs, "suffix": ".npy", "uncertainty": True}
+    settings["command"] = f"'{sys.executable}' own.py {given}"
+    method = make_method("m", settings)
+    for found in method.many([constant(1), constant(2)], RANGE):
+        assert np.all(found.disparity == 0) and np.all(found.uncertainty == 0.5)
+    Path("own.py").write_text(code.replace("np.save(uncertainty", "(lambda *_: 0)(uncertainty"))
+    with pytest.raises(InputError, match="wrote no uncertainty of pair p1"):
+        list(method.many([constant(1)], RANGE))
+    with pytest.raises(InputError, match=r"no \{uncertainty\}"):
+        make_method("m", {**settings, "pairs": "each", "command": "x {left} {right} {out}"})

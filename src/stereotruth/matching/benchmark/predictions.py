@@ -1,6 +1,7 @@
 """A method over the pairs of a dataset: a folder of disparity maps, with the time of each.
 
-``<pair>.tiff`` is float32, NaN where the method gives no disparity. ``predictions.json`` says how
+``<pair>.tiff`` is float32, NaN where the method gives no disparity; ``uncertainty/<pair>.tiff`` is
+its standard uncertainty in px, of methods that state one. ``predictions.json`` says how
 they were made, the seconds of each pair (the first pair that a process works on is matched twice,
 and only the second time counts), and the memory of the process at its peak. Programs of their own
 (kind ``command``) measure themselves, with their start, and nothing is matched twice.
@@ -37,14 +38,13 @@ from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER
-from ..matcher import BatchMatcher, ImagePair, Matcher
+from ..matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
 from ..methods import MOVED, TOLD, make_method
 from ..result_files import SUFFIXES, read_result
 from .identity import identity, machine
-from .prediction_files import RECORD
+from .prediction_files import RECORD, UNCERTAINTY
 
 MB = 1 << 20
-Disparity = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,21 @@ def predict(
         sources = maker.sources(pair)
         seen[pair.name] = marks(sources)
         keys[pair.name] = digest(made_of | {"images": [file_sha256(source) for source in sources]})
-        piece = ledger.find(pair.name, keys[pair.name], {"disparity": work / f"{pair.name}.tiff"})
+        piece = ledger.find(pair.name, keys[pair.name], _maps(work, pair))
         if piece is None:
             missing.append(pair)
         else:
             found[pair.name] = Prediction(**piece.result)
     made = progress(maker(missing), len(missing), f"{name}: pairs matched")
-    for pair, (disparity, took) in zip(missing, made, strict=True):
-        file = work / f"{pair.name}.tiff"
-        _check(disparity, pair, name)
-        write_disparity(file, disparity)
+    for pair, result in zip(missing, made, strict=True):
+        places = _maps(work, pair)
+        _check(result, pair, name)
+        write_disparity(places["disparity"], result.disparity)
+        if result.uncertainty is not None:
+            write_disparity(places[UNCERTAINTY], result.uncertainty)
         refuse_replaced(before | seen[pair.name])
-        ledger.put(pair.name, keys[pair.name], {"disparity": file}, vars(took))
+        took = Prediction(result.seconds and round(result.seconds, 6), result.memory_mb)
+        ledger.put(pair.name, keys[pair.name], places, vars(took))
         found[pair.name] = took
     record = {
         "dataset": dataset.name,
@@ -125,10 +128,12 @@ def predict(
     text = json.dumps(record, indent=2) + "\n"
     with whole_folder(out) as scratch:
         for pair in pairs:
-            link(work / f"{pair.name}.tiff", scratch / f"{pair.name}.tiff")
+            for source, target in zip(*(_maps(top, pair).values() for top in (work, scratch))):
+                if source.exists():
+                    link(source, target)
         (scratch / RECORD).write_text(text, encoding="utf-8")
     ledger.keep_only(set(found))
-    for file in work.glob("*.tiff"):
+    for file in work.rglob("*.tiff"):
         if file.stem not in found:
             file.unlink()
     return record
@@ -148,19 +153,25 @@ class _Runs:
         """The files that the disparity of a pair follows from."""
         return [pair.left, pair.right]
 
-    def __call__(self, pairs: Sequence[Pair]) -> Iterator[tuple[Disparity, Prediction]]:
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[Matched]:
         """Disparities of pairs, and what they took."""
         images = (ImagePair(pair.name, *_images(pair)) for pair in pairs)
         if isinstance(self._matcher, BatchMatcher):
-            for disparity, seconds, memory_mb in self._matcher.many(images, self._range):
-                yield disparity, Prediction(round(seconds, 6), memory_mb)
+            yield from self._matcher.many(images, self._range)
             return
         for number, (_, left, right) in enumerate(images):
             for _ in range(1 if number else 2):
                 start = time.perf_counter()
-                disparity = self._matcher(left, right, self._range)
+                disparity, uncertainty = self._matched(left, right)
                 seconds = time.perf_counter() - start
-            yield disparity, Prediction(round(seconds, 6), round(peak_memory_mb(), 1))
+            yield Matched(disparity, seconds, round(peak_memory_mb(), 1), uncertainty)
+
+    def _matched(
+        self, left: NDArray[Any], right: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        if isinstance(self._matcher, UncertainMatcher):
+            return self._matcher.with_uncertainty(left, right, self._range)
+        return self._matcher(left, right, self._range), None
 
 
 def _images(pair: Pair) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -192,35 +203,51 @@ class _Results:
                 f"method {name!r}: no such folder", file=folder, remedy="name a folder of results"
             )
 
-    def _file(self, pair: Pair) -> Path:
-        candidates = (self._folder / f"{pair.name}{end}" for end in SUFFIXES)
-        file = next(filter(Path.is_file, candidates), None)
+    def _file(self, name: str) -> Path | None:
+        candidates = (self._folder / f"{name}{end}" for end in SUFFIXES)
+        return next(filter(Path.is_file, candidates), None)
+
+    def sources(self, pair: Pair) -> list[Path]:
+        """The file with the result of a pair, and that of its uncertainty if there is one."""
+        file = self._file(pair.name)
         if file is None:
             raise InputError(
                 f"method {self._name!r}: no result for pair {pair.name} ({' or '.join(SUFFIXES)})",
                 file=self._folder,
                 remedy=f"put {pair.name}.tif there",
             )
-        return file
+        uncertainty = self._file(f"{pair.name}_{UNCERTAINTY}")
+        return [file] if uncertainty is None else [file, uncertainty]
 
-    def sources(self, pair: Pair) -> list[Path]:
-        """The file with the result of a pair."""
-        return [self._file(pair)]
-
-    def __call__(self, pairs: Sequence[Pair]) -> Iterator[tuple[Disparity, Prediction]]:
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[Matched]:
         """Disparities of pairs."""
         for pair in pairs:
-            yield read_result(self._file(pair), self._nodata), Prediction(None, None)
+            disparity, *uncertainty = (
+                read_result(file, self._nodata) for file in self.sources(pair)
+            )
+            yield Matched(disparity, None, None, *uncertainty)
 
 
-def _check(disparity: NDArray[np.float32], pair: Pair, name: str) -> None:
-    shape = image_shape(pair.left)
-    if disparity.shape != shape:
+def _maps(folder: Path, pair: Pair) -> dict[str, Path]:
+    """The files of a pair in a folder of predictions."""
+    file = f"{pair.name}.tiff"
+    return {"disparity": folder / file, UNCERTAINTY: folder / UNCERTAINTY / file}
+
+
+def _check(result: Matched, pair: Pair, name: str) -> None:
+    shape, uncertainty = image_shape(pair.left), result.uncertainty
+    for what, values in (("disparity", result.disparity), (UNCERTAINTY, uncertainty)):
+        if values is not None and values.shape != shape:
+            raise InputError(
+                f"method {name!r}: {what} of pair {pair.name} is {values.shape}, its image {shape}",
+                file=pair.left,
+                remedy=f"give the {what} of each pixel of the left image",
+            )
+    if uncertainty is not None and np.any(uncertainty < 0):
         raise InputError(
-            f"method {name!r}: disparity of pair {pair.name} is {disparity.shape}, "
-            f"its image {shape}",
+            f"method {name!r}: the uncertainty of pair {pair.name} is below 0 in places",
             file=pair.left,
-            remedy="give the disparity of each pixel of the left image",
+            remedy="give standard uncertainties in px, NaN where there is none",
         )
 
 
