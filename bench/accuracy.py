@@ -155,7 +155,7 @@ def status_rows(comparisons: Mapping[str, labels_against_truth.ByClass]) -> list
             return ", ".join(
                 f"{state} {100 * n / total:.2f}"
                 for state, n in sorted(found.items(), key=lambda item: -item[1])
-                if state != "labelled"
+                if not state.startswith("labelled")
             )
 
         def surfaces(group: str, has_label: bool, figures: Mapping[str, Any] = figures) -> str:

@@ -9,6 +9,7 @@ may use.
 from __future__ import annotations
 
 import os.path
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -63,6 +64,26 @@ def _code(settings: Mapping[str, Any]) -> list[Path]:
         )
     here = Path.cwd()
     return sorted(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
+
+
+def words_of(command: str) -> list[str]:
+    """The words of a command, as a shell has them.
+
+    Raises InputError if it has none, or quotes that do not close.
+    """
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise InputError(f"command {command!r}: {error}", remedy="close the quotes") from None
+    if not words:
+        raise InputError("no command", remedy="write the program and its arguments as command")
+    return words
+
+
+def _program(settings: Mapping[str, Any]) -> list[Path]:
+    """The words of the command that are files, and what is named besides."""
+    words = map(Path, words_of(settings.get("command", "")))
+    return sorted({*filter(Path.is_file, words), *map(Path, settings.get("files") or ())})
 
 
 def place_of(function: str) -> tuple[str, str]:
@@ -123,6 +144,7 @@ KINDS = {
     "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
     "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
     "function": Kind(module="matching.user_function", files=_code),
+    "command": Kind(module="matching.user_command", files=_program),
     FOLDER: Kind(files=_results),
 }
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,55 @@ class Matcher(Protocol):
 
     def scaling(self, left: Any, right: Any) -> Any:
         """Statistics of whole images (NumPy or Dask arrays) that all their parts must share."""
+        ...
+
+
+class ImagePair(NamedTuple):
+    """Two images as :class:`Matcher` takes them, and what they are called."""
+
+    name: str
+    left: NDArray[Any]
+    right: NDArray[Any]
+
+
+class Matched(NamedTuple):
+    """A result with what it took: seconds and peak memory in MB (None: not known).
+
+    ``uncertainty``: standard uncertainty of each disparity, float32[h, w] px, of methods that
+    state one.
+    """
+
+    disparity: NDArray[np.float32]
+    seconds: float | None
+    memory_mb: float | None
+    uncertainty: NDArray[np.float32] | None = None
+
+
+@runtime_checkable
+class UncertainMatcher(Matcher, Protocol):
+    """A stereo method that may state the standard uncertainty of its disparities."""
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Disparity as :class:`Matcher` has it, and its standard uncertainty [h, w] px or None."""
+        ...
+
+
+@runtime_checkable
+class BatchMatcher(Matcher, Protocol):
+    """A stereo method that is better asked for many pairs at once, and measures itself."""
+
+    def many(
+        self,
+        pairs: Iterable[ImagePair],
+        disparity_range: DisparityRange,
+    ) -> Iterator[Matched]:
+        """The results of pairs of images, in their order, each as soon as it is there."""
         ...
 
 

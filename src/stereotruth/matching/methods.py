@@ -1,17 +1,5 @@
 """From a configuration entry (``benchmark.methods.<name>``) to a stereo method.
 
-``sgm``                         OpenCV's semi-global matching (:mod:`.sgm`)
-``stereonet, psmnet, hmsmnet``  the networks (:mod:`.networks`; needs PyTorch)
-``function``                    the user's own, named by ``function``: ``package.module:name``
-                                (modules of the working directory are found), ``path.py:name``, or
-                                the entry point ``name`` of the group ``stereotruth.methods``
-``folder``                      a folder of disparities made elsewhere: scored, never run
-==============================  ====================================================================
-
-The user's function takes ``(left, right, disparity_range)`` and the entry's ``options`` as keyword
-arguments, and returns the disparity as :class:`Matcher` says. What has ``scaling`` and
-``margin_px`` is taken for a Matcher as it is; of a class, the options make the object.
-=======
 A method is a :class:`Matcher`; :mod:`kinds` lists the kinds of entries, and names the module that
 makes the methods of each.
 """
@@ -25,20 +13,25 @@ from typing import Any
 from ..errors import InputError
 from .kinds import kind_of
 from .matcher import Matcher
+from .polarity import with_polarity
 
-SHOWN = ("kind", "label", "fine_tuned_of")  # keys of an entry that are no settings
+TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
+MOVED = ("polarity", "outside")  # of any kind
 
 
 def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Matcher:
     """The method of a configuration entry; ``workers`` are the threads that it may use.
 
-    ``label`` (how tables call the method) and ``fine_tuned_of`` (the method whose training was
-    carried on) are no settings.
+    ``label`` (how tables call the method), ``fine_tuned_of`` (the method whose training was
+    carried on), ``licence`` and ``version`` are no settings; ``polarity`` and ``outside`` are those
+    of any kind (:mod:`polarity`).
 
     Raises InputError for an unknown kind, a function that cannot be found, and settings that the
     method does not take.
     """
-    kind, options = kind_of(name, settings), {k: v for k, v in settings.items() if k not in SHOWN}
+    kind = kind_of(name, settings)
+    options = {k: v for k, v in settings.items() if k not in ("kind", *TOLD, *MOVED)}
+    moved = {key: settings[key] for key in MOVED if key in settings}
     if kind.module is None:
         raise InputError(f"method {name!r} is a folder of results", remedy="take one that can run")
     try:  # by its name, so that code digests of one method do not hold the others' code
@@ -50,4 +43,5 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
             f"{settings['kind']} needs {error.name}, which is not installed",
             remedy="pip install '.[networks]'",
         ) from error
-    return module.make(name, settings["kind"], options, workers)
+    made = module.make(name, settings["kind"], options, workers)
+    return with_polarity(name, made, **moved)

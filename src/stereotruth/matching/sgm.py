@@ -79,6 +79,7 @@ class SemiGlobalMatcher:
     """
 
     margin_px = MARGIN_PX
+    invalid_outside = True  # what matches outside the right image has no disparity
 
     def __init__(
         self,

@@ -3,8 +3,8 @@
 It is ``package.module:name`` (modules of the working directory are found), ``path.py:name``, or an
 entry point of the group ``stereotruth.methods``. It takes ``(left, right, disparity_range)`` and
 the entry's ``options`` as keyword arguments, and returns the disparity as :class:`matcher.Matcher`
-says. What has ``scaling`` and ``margin_px`` is taken for a Matcher as it is; of a class, the
-options make the object.
+says; or a tuple of it and of its standard uncertainty in px, [h, w] as well. What has ``scaling``
+and ``margin_px`` is taken for a Matcher as it is; of a class, the options make the object.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ MARGIN_PX = 128  # of a function that states none
 
 
 class FunctionMethod:
-    """A plain function ``(left, right, disparity_range) -> disparity`` as a Matcher."""
+    """A plain function ``(left, right, disparity_range) -> disparity`` as a Matcher.
+
+    It may return a tuple of the disparity and its standard uncertainty.
+    """
 
     def __init__(
         self, function: Callable[..., Any], margin_px: int = MARGIN_PX, name: str = "function"
@@ -45,15 +48,39 @@ class FunctionMethod:
         scaling: Any = None,
     ) -> NDArray[np.float32]:
         """The function's disparity; raises InputError if it is none of the images' size."""
+        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """The function's disparity, and its standard uncertainty if the function states one.
+
+        Raises InputError if one of them is none of the images' size.
+        """
         found = self.function(left, right, disparity_range)
-        disparity = np.ma.filled(np.ma.asarray(found, dtype=np.float32), np.nan)
-        if disparity.shape != left.shape[:2]:
+        if not isinstance(found, tuple):
+            return self._map(found, left), None
+        if len(found) != 2:
             raise InputError(
-                f"method {self.name!r} returned shape {disparity.shape} for images of "
+                f"method {self.name!r} returned {len(found)} values",
+                remedy="return the disparity, or a tuple of it and its standard uncertainty",
+            )
+        disparity, uncertainty = (self._map(values, left) for values in found)
+        return disparity, uncertainty
+
+    def _map(self, values: Any, left: NDArray[Any]) -> NDArray[np.float32]:
+        of_pixels = np.ma.filled(np.ma.asarray(values, dtype=np.float32), np.nan)
+        if of_pixels.shape != left.shape[:2]:
+            raise InputError(
+                f"method {self.name!r} returned shape {of_pixels.shape} for images of "
                 f"{left.shape[:2]}",
                 remedy="return the disparity of each pixel of the left image, [h, w]",
             )
-        return disparity
+        return of_pixels
 
     def scaling(self, left: Any, right: Any) -> None:
         """None: nothing is known of what the function does."""

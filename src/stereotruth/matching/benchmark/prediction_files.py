@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...products.rasters import read_disparity
 
 RECORD = "predictions.json"
+UNCERTAINTY = "uncertainty"  # folder in it
 
 
 def read_record(folder: str | Path) -> dict[str, Any]:
@@ -27,3 +28,9 @@ def read_record(folder: str | Path) -> dict[str, Any]:
 def read_prediction(folder: str | Path, pair: Pair) -> NDArray[np.float32]:
     """A pair's prediction, float32[h, w] px, NaN where there is none."""
     return read_disparity(Path(folder) / f"{pair.name}.tiff", np.nan)
+
+
+def read_uncertainty(folder: str | Path, pair: Pair) -> NDArray[np.float32] | None:
+    """The standard uncertainty of a pair's prediction, float32[h, w] px; None: not stated."""
+    file = Path(folder) / UNCERTAINTY / f"{pair.name}.tiff"
+    return read_disparity(file, np.nan) if file.is_file() else None

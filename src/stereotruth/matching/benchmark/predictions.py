@@ -1,8 +1,11 @@
 """A method over the pairs of a dataset: a folder of disparity maps, with the time of each.
 
-``<pair>.tiff`` is float32, NaN where the method gives no disparity. ``predictions.json`` says how
+``<pair>.tiff`` is float32, NaN where the method gives no disparity; ``uncertainty/<pair>.tiff`` is
+its standard uncertainty in px, of methods that state one. ``predictions.json`` says how
 they were made, the seconds of each pair (the first pair that a process works on is matched twice,
-and only the second time counts), and the memory of the process at its peak.
+and only the second time counts), and the memory of the process at its peak. Programs of their own
+(kind ``command``) measure themselves, with their start, and nothing is matched twice.
+``machine`` is the one of the last call.
 
 Pairs stay in a work folder (hard links) with a record of what they were made of, images and
 method, so that a later call carries on where one was killed, and takes over what it would make the
@@ -17,13 +20,12 @@ import re
 import resource
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,13 +36,14 @@ from ...products.files import link, whole_folder
 from ...products.finished_pieces import Ledger
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
-from ...products.rasters import image_shape, read_disparity, read_image, write_disparity
+from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER
-from ..matcher import Matcher
-from ..methods import make_method
-from .prediction_files import RECORD
+from ..matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
+from ..methods import MOVED, TOLD, make_method
+from ..result_files import SUFFIXES, read_result
+from .identity import identity, machine
+from .prediction_files import RECORD, UNCERTAINTY
 
-SUFFIXES = (".tif", ".tiff", ".npy", ".pfm")  # of a folder of results
 MB = 1 << 20
 
 
@@ -77,49 +80,60 @@ def predict(
     files = [file for file in files if Path(file).is_file()]
     before = marks(files)
     made_of = {
-        "method": dict(settings),
+        "method": {key: value for key, value in settings.items() if key not in TOLD},
         "files": [file_sha256(file) for file in files],
         "range": list(dataset.disparity_range),
         "code": code,
     }
     if settings["kind"] == FOLDER:
         made_of["nodata"] = dataset.nodata
-        maker: _Results | _Runs = _Results(name, Path(settings["folder"]), dataset.nodata)
+        maker: _Results | _Runs = _Results(name, settings, dataset.nodata)
     else:
         maker = _Runs(name, settings, dataset.disparity_range, workers)
     ledger = Ledger(work / "done")
-    found = {}
-    for pair in progress(pairs, len(pairs), f"{name}: pairs matched"):
-        file = work / f"{pair.name}.tiff"
+    found, keys, seen, missing = {}, {}, {}, []
+    for pair in pairs:
         sources = maker.sources(pair)
-        here = marks(sources)
-        key = digest(made_of | {"images": [file_sha256(source) for source in sources]})
-        piece = ledger.find(pair.name, key, {"disparity": file})
+        seen[pair.name] = marks(sources)
+        keys[pair.name] = digest(made_of | {"images": [file_sha256(source) for source in sources]})
+        piece = ledger.find(pair.name, keys[pair.name], _maps(work, pair))
         if piece is None:
-            disparity, made = maker(pair)
-            _check(disparity, pair, name)
-            write_disparity(file, disparity)
-            refuse_replaced(before | here)
-            piece = ledger.put(pair.name, key, {"disparity": file}, vars(made))
-        found[pair.name] = Prediction(**piece.result)
+            missing.append(pair)
+        else:
+            found[pair.name] = Prediction(**piece.result)
+    made = progress(maker(missing), len(missing), f"{name}: pairs matched")
+    for pair, result in zip(missing, made, strict=True):
+        places = _maps(work, pair)
+        _check(result, pair, name)
+        write_disparity(places["disparity"], result.disparity)
+        if result.uncertainty is not None:
+            write_disparity(places[UNCERTAINTY], result.uncertainty)
+        refuse_replaced(before | seen[pair.name])
+        took = Prediction(result.seconds and round(result.seconds, 6), result.memory_mb)
+        ledger.put(pair.name, keys[pair.name], places, vars(took))
+        found[pair.name] = took
     record = {
         "dataset": dataset.name,
         "split": split,
         "method": name,
         "settings": dict(settings),
+        "identity": identity(settings, files, code),
+        "machine": machine(),
         "disparity_range": list(dataset.disparity_range),
         "device": maker.device,
         "threads": workers,
         **_summary(found),
-        "pairs": {pair: vars(of) for pair, of in found.items()},
+        "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
     with whole_folder(out) as scratch:
         for pair in pairs:
-            link(work / f"{pair.name}.tiff", scratch / f"{pair.name}.tiff")
+            for source, target in zip(*(_maps(top, pair).values() for top in (work, scratch))):
+                if source.exists():
+                    link(source, target)
         (scratch / RECORD).write_text(text, encoding="utf-8")
     ledger.keep_only(set(found))
-    for file in work.glob("*.tiff"):
+    for file in work.rglob("*.tiff"):
         if file.stem not in found:
             file.unlink()
     return record
@@ -133,28 +147,42 @@ class _Runs:
     ) -> None:
         self._range = range_px
         self._matcher: Matcher = make_method(name, settings, workers)
-        self._warm = False
         self.device = str(getattr(self._matcher, "device", f"CPU, {platform.machine()}"))
 
     def sources(self, pair: Pair) -> list[Path]:
         """The files that the disparity of a pair follows from."""
         return [pair.left, pair.right]
 
-    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
-        """Disparity of a pair, and what it took."""
-        left, right = read_image(pair.left), read_image(pair.right)
-        if left.shape != right.shape or left.dtype != right.dtype:
-            raise InputError(
-                f"left image is {left.shape} {left.dtype}, right one {right.shape} {right.dtype}",
-                file=pair.right,
-                remedy="give images of one size and type",
-            )
-        for _ in range(1 if self._warm else 2):
-            start = time.perf_counter()
-            disparity = self._matcher(left, right, self._range)
-            seconds = time.perf_counter() - start
-        self._warm = True
-        return disparity, Prediction(round(seconds, 6), round(peak_memory_mb(), 1))
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[Matched]:
+        """Disparities of pairs, and what they took."""
+        images = (ImagePair(pair.name, *_images(pair)) for pair in pairs)
+        if isinstance(self._matcher, BatchMatcher):
+            yield from self._matcher.many(images, self._range)
+            return
+        for number, (_, left, right) in enumerate(images):
+            for _ in range(1 if number else 2):
+                start = time.perf_counter()
+                disparity, uncertainty = self._matched(left, right)
+                seconds = time.perf_counter() - start
+            yield Matched(disparity, seconds, round(peak_memory_mb(), 1), uncertainty)
+
+    def _matched(
+        self, left: NDArray[Any], right: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        if isinstance(self._matcher, UncertainMatcher):
+            return self._matcher.with_uncertainty(left, right, self._range)
+        return self._matcher(left, right, self._range), None
+
+
+def _images(pair: Pair) -> tuple[NDArray[Any], NDArray[Any]]:
+    left, right = read_image(pair.left), read_image(pair.right)
+    if left.shape != right.shape or left.dtype != right.dtype:
+        raise InputError(
+            f"left image is {left.shape} {left.dtype}, right one {right.shape} {right.dtype}",
+            file=pair.right,
+            remedy="give images of one size and type",
+        )
+    return left, right
 
 
 class _Results:
@@ -162,49 +190,64 @@ class _Results:
 
     device = ""
 
-    def __init__(self, name: str, folder: Path, nodata: float) -> None:
+    def __init__(self, name: str, settings: Mapping[str, Any], nodata: float) -> None:
+        if moved := [key for key in MOVED if key in settings]:
+            raise InputError(
+                f"method {name!r}: {' and '.join(moved)} cannot change a folder of results",
+                remedy="take it away: results are x_left − x_right as they are",
+            )
+        folder = Path(settings["folder"])
         self._name, self._folder, self._nodata = name, folder, nodata
         if not folder.is_dir():
             raise InputError(
                 f"method {name!r}: no such folder", file=folder, remedy="name a folder of results"
             )
 
-    def _file(self, pair: Pair) -> Path:
-        candidates = (self._folder / f"{pair.name}{end}" for end in SUFFIXES)
-        file = next(filter(Path.is_file, candidates), None)
+    def _file(self, name: str) -> Path | None:
+        candidates = (self._folder / f"{name}{end}" for end in SUFFIXES)
+        return next(filter(Path.is_file, candidates), None)
+
+    def sources(self, pair: Pair) -> list[Path]:
+        """The file with the result of a pair, and that of its uncertainty if there is one."""
+        file = self._file(pair.name)
         if file is None:
             raise InputError(
                 f"method {self._name!r}: no result for pair {pair.name} ({' or '.join(SUFFIXES)})",
                 file=self._folder,
                 remedy=f"put {pair.name}.tif there",
             )
-        return file
+        uncertainty = self._file(f"{pair.name}_{UNCERTAINTY}")
+        return [file] if uncertainty is None else [file, uncertainty]
 
-    def sources(self, pair: Pair) -> list[Path]:
-        """The file with the result of a pair."""
-        return [self._file(pair)]
-
-    def __call__(self, pair: Pair) -> tuple[NDArray[np.float32], Prediction]:
-        """Disparity of a pair."""
-        file = self._file(pair)
-        if file.suffix in (".tif", ".tiff"):
-            return read_disparity(file, self._nodata), Prediction(None, None)
-        values = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), -1)
-        if values is None:
-            raise InputError("no image that can be read", file=file, remedy="write it anew")
-        values = values.astype(np.float32)
-        values[~np.isfinite(values) | (values == np.float32(self._nodata))] = np.nan
-        return values, Prediction(None, None)
+    def __call__(self, pairs: Sequence[Pair]) -> Iterator[Matched]:
+        """Disparities of pairs."""
+        for pair in pairs:
+            disparity, *uncertainty = (
+                read_result(file, self._nodata) for file in self.sources(pair)
+            )
+            yield Matched(disparity, None, None, *uncertainty)
 
 
-def _check(disparity: NDArray[np.float32], pair: Pair, name: str) -> None:
-    shape = image_shape(pair.left)
-    if disparity.shape != shape:
+def _maps(folder: Path, pair: Pair) -> dict[str, Path]:
+    """The files of a pair in a folder of predictions."""
+    file = f"{pair.name}.tiff"
+    return {"disparity": folder / file, UNCERTAINTY: folder / UNCERTAINTY / file}
+
+
+def _check(result: Matched, pair: Pair, name: str) -> None:
+    shape, uncertainty = image_shape(pair.left), result.uncertainty
+    for what, values in (("disparity", result.disparity), (UNCERTAINTY, uncertainty)):
+        if values is not None and values.shape != shape:
+            raise InputError(
+                f"method {name!r}: {what} of pair {pair.name} is {values.shape}, its image {shape}",
+                file=pair.left,
+                remedy=f"give the {what} of each pixel of the left image",
+            )
+    if uncertainty is not None and np.any(uncertainty < 0):
         raise InputError(
-            f"method {name!r}: disparity of pair {pair.name} is {disparity.shape}, "
-            f"its image {shape}",
+            f"method {name!r}: the uncertainty of pair {pair.name} is below 0 in places",
             file=pair.left,
-            remedy="give the disparity of each pixel of the left image",
+            remedy="give standard uncertainties in px, NaN where there is none",
         )
 
 

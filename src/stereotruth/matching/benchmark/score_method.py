@@ -3,7 +3,9 @@
 scores.csv   a row per tile
 cities.csv   a row per city, and one of all, with 95 % confidence intervals
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
-scores.json  all of it but the tiles, with settings, time and memory
+scores.json  all of it but the tiles, with settings, time and memory, and of methods that state
+             uncertainties what :mod:`.confidence` says of them by stratum
+sparsification.csv  of such methods: mean errors by the share of pixels taken away
 panels/      pictures of tiles: left, right, truth, disparity, error
 """
 
@@ -21,8 +23,9 @@ from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
 from ...products.files import whole_folder, write_table
 from ...products.rasters import read_image
+from .confidence import SHARES, Confidence
 from .panels import Column, draw_columns
-from .prediction_files import read_prediction, read_record
+from .prediction_files import read_prediction, read_record, read_uncertainty
 from .scores import ALL, Collector, Scorer, Scores
 from .strata import Products, exact_truth, label_strata
 
@@ -56,13 +59,26 @@ def score(
     record = read_record(predictions)
     scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
     collector = Collector(thresholds_px)
+    confidences: dict[str, Confidence] = {}
     drawn = {pair.name for pair in choose(pairs, panels)}
     with whole_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
             found, truth = read_prediction(predictions, pair), dataset.labels(pair)
-            sums = scorer.sums(found, truth, label_strata(pair, truth, products))
-            for stratum, exact in exact_truth(pair, products).items():
+            strata_of_labels = label_strata(pair, truth, products)
+            exact_of_pair = exact_truth(pair, products)
+            sums = scorer.sums(found, truth, strata_of_labels)
+            for stratum, exact in exact_of_pair.items():
                 sums[stratum] = scorer.sums(found, exact)[ALL]
+            sigma = read_uncertainty(predictions, pair)
+            if sigma is not None:
+                by_stratum = {
+                    ALL: truth,
+                    **{name: np.where(of, truth, np.nan) for name, of in strata_of_labels.items()},
+                    **exact_of_pair,
+                }
+                for stratum, exact in by_stratum.items():
+                    counted = np.where(scorer.counted(exact), exact, np.nan)
+                    confidences.setdefault(stratum, Confidence()).add(found, sigma, counted)
             collector.add(pair.name, pair.city, sums)
             if pair.name in drawn:
                 shown = np.where(scorer.counted(truth), truth, np.float32(np.nan))
@@ -91,6 +107,7 @@ def score(
             "all": total,
             "cities": cities,
             "strata": strata,
+            "confidence": [{"stratum": s, **of.figures()} for s, of in confidences.items()],
         }
         tiles = [
             {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
@@ -99,6 +116,8 @@ def score(
         write_table(scratch / "scores.csv", tiles)
         write_table(scratch / "cities.csv", [*cities, total])
         write_table(scratch / "strata.csv", strata)
+        if confidences:
+            write_table(scratch / "sparsification.csv", _sparsification(confidences))
         text = json.dumps(summary, indent=2) + "\n"
         (scratch / "scores.json").write_text(text, encoding="utf-8")
     log.info("%s: %s", label, describe(summary))
@@ -144,6 +163,20 @@ def _cities(scores: Scores) -> list[str]:
 
 def _only(count: int, index: int) -> np.ndarray:
     return np.arange(count) == index
+
+
+def _sparsification(confidences: Mapping[str, Confidence]) -> list[dict[str, Any]]:
+    return [
+        {
+            "stratum": stratum,
+            "removed_share": round(float(share), 2),
+            "epe_px": round(float(stated), 6),
+            "oracle_epe_px": round(float(oracle), 6),
+        }
+        for stratum, of in confidences.items()
+        if of.count
+        for share, stated, oracle in zip(SHARES, *of.curves())
+    ]
 
 
 def _row(

@@ -13,7 +13,11 @@ import pytest
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.benchmark.prediction_files import read_prediction, read_record
+from stereotruth.matching.benchmark.prediction_files import (
+    read_prediction,
+    read_record,
+    read_uncertainty,
+)
 from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.products.rasters import read_disparity
 
@@ -98,6 +102,9 @@ def test_only_what_a_pair_is_made_of_has_it_matched_again(dataset):
     first = read_record("out")
     write(Path("data/test/disp/KM_disparity_2.tiff"), np.zeros(SHAPE, np.float32))  # a label
     assert run(dataset, **files) == first and calls() == []
+    told = run(dataset, METHOD | {"licence": "MIT", "version": "3"}, **files)
+    assert told["identity"]["licence"] == "MIT" and calls() == []
+    assert list(told["identity"]["files"]) == ["mine.py"] and told["machine"]["cores"] >= 1
     run(dataset, **files, code="other")
     assert len(calls()) == 4
     Path("mine.py").write_text(CODE + "\n# another")
@@ -135,8 +142,11 @@ def test_what_a_folder_lacks_is_told(dataset):
     with pytest.raises(InputError, match="no result for pair KM_2"):
         run(dataset, settings)
     write(Path("theirs/KM_2.tif"), np.zeros((3, 3), np.float32))
+    write(Path("theirs/KM_3.tif"), np.zeros(SHAPE, np.float32))
     with pytest.raises(InputError, match=r"KM_2 is \(3, 3\), its image \(8, 12\)"):
         run(dataset, settings)
+    with pytest.raises(InputError, match="polarity cannot change a folder"):
+        run(dataset, settings | {"polarity": "positive"})
 
 
 def test_images_that_do_not_fit_each_other_are_refused(dataset):
@@ -163,3 +173,53 @@ def test_peak_memory_is_that_of_the_process_alone():
     before, after = map(float, run.stdout.split())
     assert ballast.nbytes / 2**20 > before > 10
     assert after - before == pytest.approx(200, abs=30)
+
+
+UNCERTAIN = """
+import numpy as np
+
+def match(left, right, disparity_range, stated=True):
+    disparity = left.astype(np.float32) / 8
+    uncertainty = np.where(left > 20, np.nan, disparity + 1)
+    return (disparity, uncertainty) if stated else disparity
+
+def negative(left, right, disparity_range):
+    return left * 0.0, left * 0.0 - 1
+"""
+
+
+def test_uncertainties_are_kept_beside_the_disparities(dataset):
+    Path("mine.py").write_text(UNCERTAIN)
+    for moved in ({}, {"polarity": "positive"}):
+        run(dataset, METHOD | moved)
+        for number, pair in enumerate(dataset.pairs(), start=1):
+            shift = 8 * bool(moved)  # of the range, which begins at -8 px
+            assert np.all(read_prediction("out", pair)[:, 4:] == number / 8 - shift)
+            found = read_uncertainty("out", pair)
+            assert np.isnan(found[:, 3]).all() and np.all(found[:, 4:] == number / 8 + 1)
+    Path("out/predictions.json").unlink()
+    before = Path("out/uncertainty/KM_2.tiff").read_bytes()
+    Path("out/uncertainty/KM_2.tiff").unlink()
+    run(dataset, METHOD | {"polarity": "positive"})
+    assert Path("out/uncertainty/KM_2.tiff").read_bytes() == before
+    # one that states none leaves none of an earlier one
+    run(dataset, METHOD | {"options": {"stated": False}})
+    assert not Path("out/uncertainty").exists() and read_uncertainty("out", pair) is None
+    with pytest.raises(InputError, match="uncertainty of pair KM_1 is below 0"):
+        run(dataset, {"kind": "function", "function": "mine.py:negative"})
+
+
+def test_a_folder_may_have_uncertainties(dataset):
+    for n in (1, 2, 3):
+        write(Path(f"theirs/KM_{n}.tif"), np.zeros(SHAPE, np.float32))
+    np.save("theirs/KM_2_uncertainty.npy", np.full(SHAPE, 0.5))
+    run(dataset, {"kind": "folder", "folder": "theirs"})
+    first, second, _ = dataset.pairs()
+    assert read_uncertainty("out", first) is None
+    assert np.all(read_uncertainty("out", second) == 0.5)
+    np.save("theirs/KM_2_uncertainty.npy", np.full(SHAPE, 0.25))
+    run(dataset, {"kind": "folder", "folder": "theirs"})
+    assert np.all(read_uncertainty("out", second) == 0.25)
+    np.save("theirs/KM_2_uncertainty.npy", np.full((2, 2), 0.25))
+    with pytest.raises(InputError, match=r"uncertainty of pair KM_2 is \(2, 2\)"):
+        run(dataset, {"kind": "folder", "folder": "theirs"})

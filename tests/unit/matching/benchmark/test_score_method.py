@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereotruth.dataset.stereo_dataset import Pair, StereoDataset
+from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.matching.benchmark.score_method import choose, describe, score
 
-from ....synthetic.toy_benchmark import CITIES, rows, settings
+from ....synthetic.images import write
+from ....synthetic.toy_benchmark import CITIES, SHAPE, rows, settings
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -46,6 +49,32 @@ def test_scoring_again_gives_the_same_bytes(compared, tmp_path):
     for file in files:
         other = tmp_path / "again" / file.relative_to(compared / "benchmark/half")
         assert file.read_bytes() == other.read_bytes(), file.name
+
+
+def test_stated_uncertainties_are_held_against_the_errors(compared, tmp_path):
+    dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
+    rng = np.random.default_rng(3)
+    for pair in dataset.pairs("test"):
+        error = rng.normal(0, 1, SHAPE).astype(np.float32)
+        write(tmp_path / f"theirs/{pair.name}.tif", dataset.labels(pair) + error)
+        write(tmp_path / f"theirs/{pair.name}_uncertainty.tif", np.abs(error))
+    entry = {"kind": "folder", "folder": str(tmp_path / "theirs")}
+    predict(dataset, "test", "sure", entry, tmp_path / "match", work=tmp_path / "work")
+    summary = score(dataset, "test", "Sure", tmp_path / "match", tmp_path / "out", **settings())
+    found = {row["stratum"]: row for row in summary["confidence"]}
+    assert list(found) == ["all", "near_step", "match_inside", "match_outside"]
+    assert found["all"]["pixels"] == summary["all"]["labelled"]
+    assert found["match_inside"]["pixels"] < found["all"]["pixels"]
+    assert found["all"]["epe_px"] == pytest.approx(summary["all"]["epe_px"], abs=1e-6)
+    assert abs(found["all"]["ause_px"]) < 1e-4 and found["all"]["ause_random_px"] > 0.1
+    assert found["all"]["interval_50_percent_coverage_share"] < 0.01  # errors of all but one sigma
+    curve = [row for row in rows(tmp_path / "out/sparsification.csv") if row["stratum"] == "all"]
+    epe = [float(row["epe_px"]) for row in curve]
+    assert epe[0] == pytest.approx(summary["all"]["epe_px"], abs=1e-6)
+    assert epe == sorted(epe, reverse=True) and epe[-1] < 0.02
+    none = json.loads((compared / "benchmark/half/scores.json").read_text())
+    assert none["confidence"] == []
+    assert not (compared / "benchmark/half/sparsification.csv").exists()
 
 
 def test_pictures_are_chosen_of_all_cities():

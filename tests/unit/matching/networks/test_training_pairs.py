@@ -33,9 +33,14 @@ def test_pairs_are_scaled_and_unlabelled_pixels_are_nan(dataset: StereoDataset) 
     assert (disparity[SIZE // 4 :] == -6).all()
 
 
-def test_the_three_lines_of_the_readme(dataset: StereoDataset, tmp_path, monkeypatch) -> None:
-    text = (Path(__file__).parents[4] / "README.md").read_text(encoding="utf-8")
-    (lines,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Labelled" in b)
+def test_the_three_lines_of_the_documentation(
+    dataset: StereoDataset, tmp_path, monkeypatch
+) -> None:
+    page = Path(__file__).parents[4] / "docs" / "how-to" / "pytorch.md"
+    blocks = re.findall(
+        r"```[{}a-z -]*python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
+    )
+    (lines,) = (block for block in blocks if "Labelled" in block)
     assert len(list(filter(None, lines.splitlines()))) == 3
     (tmp_path / "dataset").symlink_to(dataset.root)
     monkeypatch.chdir(tmp_path)
