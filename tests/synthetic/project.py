@@ -8,10 +8,11 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
+from stereotruth.command.example_city import DEMO
+from stereotruth.simulate.cities import SceneSpec
 
 from .planner import planner
 
@@ -27,25 +28,9 @@ SHEET_COLUMNS = [
     "gcps",
 ]
 
-TINY = CitySpec(
+TINY = replace(
+    DEMO,
     name="Tiny",
-    lon=114.3,
-    lat=30.6,
-    epsg=32650,
-    base_height_m=20.0,
-    world_seed=7,
-    character=Character(
-        relief_m=8,
-        valley=0.2,
-        wavelength_m=900,
-        max_slope_deg=10,
-        river_m=0,
-        lakes=0,
-        zones={"slabs": 3, "lowrise": 2, "park": 1},
-        towers_m=(30, 40),
-        trees=0.4,
-        zone_m=150.0,
-    ),
     scenes=(
         SceneSpec("Tiny-1", (0.0, 0.0), 560, 560, 5, lidar_grid=(2, 1), ragged_m=(20.0, 20.0)),
     ),
