@@ -48,6 +48,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.locks",
         "products.provenance",
         "products.publication",
+        "products.records",
         "products.runs",
         "settings",
     }
