@@ -77,7 +77,7 @@ def label_window(
     if vertices is not None:
         return _on_surface(scene, points, local, vertices, left, right, wide)
     use, edge = np.ones(points.points.size, dtype=np.bool_), None
-    if settings.uses_seen_surface:
+    if settings.representative == "top":
         use, edge = seen_surface(points, settings.edge_margin_px)
     seen, correlation = use, None
     if settings.method == "correlation":
@@ -85,7 +85,7 @@ def label_window(
         use = use & (correlation >= settings.correlation_threshold)
     pixels = condense(scene.pair.model, local, points, use, correlation, settings.representative)
     status = _test_points(settings, points, seen, pixels)
-    if edge is not None and settings.representative == "top":
+    if edge is not None:
         status[(status == Status.LABELLED) & edge] = Status.EDGE_IN_PIXEL
     labels = _labels(scene, pixels, status == Status.LABELLED, wide)
     few = (status == Status.LABELLED) & (pixels.count < settings.min_points)

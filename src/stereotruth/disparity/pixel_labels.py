@@ -42,14 +42,13 @@ RIDGE = 0.1  # px², keeps planes through places in a line level across it
 class Pixels:
     """What the points of each pixel come to; arrays [h, w], NaN (0) where a pixel has none.
 
-    ``sums`` int64[h * w, 4]: number of points, exact sums of their lattice coordinates; ``count``;
-    ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the representative point;
-    ``highest`` (m); ``correlation`` mean of the points'; ``surface_class`` ASPRS class of the
-    highest point; ``moments`` [h, w, 6]: sums over the points, about their mean, of uu, uv, vv, uz,
+    ``count`` of the points used; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the
+    representative point; ``highest`` (m); ``correlation`` mean of the points'; ``surface_class``
+    ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points, about their mean,
+    of uu, uv, vv, uz,
     vz, zz, with (u, v) the place in the left grid and z the disparity, px².
     """
 
-    sums: NDArray[np.int64]
     count: NDArray[np.int64]
     x: Floats
     y: Floats
@@ -162,7 +161,6 @@ def condense(
         lon, lat = (sums[found, axis] / sums[found, 0] / _PER_DEG for axis in (1, 2))
         place[:, found] = model.ground_to_epipolar(lon, lat, highest[found])
     return Pixels(
-        sums=sums,
         count=sums[:, 0].reshape(shape),
         x=place[0].reshape(shape),
         y=place[1].reshape(shape),

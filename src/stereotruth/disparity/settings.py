@@ -100,11 +100,6 @@ class Settings(Representative, Occlusion):
         ]
 
     @property
-    def uses_seen_surface(self) -> bool:
-        """Whether points off the surface that the centre sees count as hidden from the left."""
-        return self.uses_geometry or self.representative == "top"
-
-    @property
     def uses_geometry(self) -> bool:
         """Whether the surface of the points tells what is seen."""
         return self.method in ("geometric", "both")

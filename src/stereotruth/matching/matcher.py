@@ -68,6 +68,16 @@ class Matched(NamedTuple):
 class UncertainMatcher(Matcher, Protocol):
     """A stereo method that may state the standard uncertainty of its disparities."""
 
+    def __call__(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> NDArray[np.float32]:
+        """The disparity alone."""
+        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
+
     def with_uncertainty(
         self,
         left: NDArray[Any],

@@ -47,7 +47,7 @@ def widened(image: NDArray[Any], before: int, after: int) -> NDArray[Any]:
     return np.pad(image, more, mode="edge")
 
 
-class PositiveMethod:
+class PositiveMethod(UncertainMatcher):
     """A method that sees no negative disparities, as a Matcher of any range.
 
     ``method``: the one that is asked. ``invalid_outside``: disparities whose match lies outside the
@@ -64,16 +64,6 @@ class PositiveMethod:
     def scaling(self, left: Any, right: Any) -> Any:
         """What the method says of whole images, without the columns that are added."""
         return self._method.scaling(left, right)
-
-    def __call__(
-        self,
-        left: NDArray[Any],
-        right: NDArray[Any],
-        disparity_range: DisparityRange,
-        scaling: Any = None,
-    ) -> NDArray[np.float32]:
-        """Disparity float32[h, w] px of the range, which may have both signs."""
-        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
 
     def with_uncertainty(
         self,

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .kinds import words_of
-from .matcher import DisparityRange, ImagePair, Matched, called
+from .matcher import DisparityRange, ImagePair, Matched, UncertainMatcher, called
 from .result_files import SUFFIXES, read_result
 
 MARGIN_PX = 128  # of a program that states none
@@ -53,7 +53,7 @@ MB = 1 << 20
 NEEDED = {"each": ("{left}", "{right}", "{out}"), "file": ("{pairs}",)}
 
 
-class CommandMethod:
+class CommandMethod(UncertainMatcher):
     """A program as a Matcher, also of many pairs; see the module."""
 
     device = "a program of its own"
@@ -92,16 +92,6 @@ class CommandMethod:
 
     def scaling(self, left: Any, right: Any) -> None:
         """None: nothing is known of what the program does."""
-
-    def __call__(
-        self,
-        left: NDArray[Any],
-        right: NDArray[Any],
-        disparity_range: DisparityRange,
-        scaling: Any = None,
-    ) -> NDArray[np.float32]:
-        """The program's disparity; raises InputError if it fails, or gives none of this size."""
-        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
 
     def with_uncertainty(
         self,

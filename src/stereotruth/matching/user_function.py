@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .kinds import place_of
-from .matcher import DisparityRange, Matcher, called
+from .matcher import DisparityRange, Matcher, UncertainMatcher, called
 
 MARGIN_PX = 128  # of a function that states none
 
 
-class FunctionMethod:
+class FunctionMethod(UncertainMatcher):
     """A plain function ``(left, right, disparity_range) -> disparity`` as a Matcher.
 
     It may return a tuple of the disparity and its standard uncertainty.
@@ -39,16 +39,6 @@ class FunctionMethod:
         self.function = function
         self.margin_px = margin_px
         self.name = name
-
-    def __call__(
-        self,
-        left: NDArray[Any],
-        right: NDArray[Any],
-        disparity_range: DisparityRange,
-        scaling: Any = None,
-    ) -> NDArray[np.float32]:
-        """The function's disparity; raises InputError if it is none of the images' size."""
-        return self.with_uncertainty(left, right, disparity_range, scaling)[0]
 
     def with_uncertainty(
         self,
