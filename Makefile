@@ -66,7 +66,7 @@ lint: $(READY)
 
 # Resolves again, keeping the pins that still fit; needs uv.
 lock:
-	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster --extra docs \
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster --extra docs --extra pandora --extra storage \
 	  --universal --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 
