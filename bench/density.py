@@ -1,7 +1,7 @@
 """Labels between points by density of the points, against exact truth. See README.md beside this.
 
-One block of a synthetic scene is projected with its points thinned to several densities; the truth
-is that of rule grid_truth. Nothing is written.
+One block of a synthetic scene is projected with its points thinned to several densities, in either
+view; the truth of its grid is that of rule grid_truth. Nothing is written.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
@@ -21,16 +22,18 @@ from stereotruth.disparity.project import MAX_POINTS, SHARD
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.evaluation.labels_against_truth import (
     CLASSES,
     ROOF_EDGE,
     TREE_EDGE,
     WATER,
     Truth,
-    open_truth,
 )
 from stereotruth.lidar.lattice import DEGREE_M
 from stereotruth.lidar.point_store import Points, PointStore
+from stereotruth.simulate.cities import CITIES
 
 TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1 px at most, %
     4: (95, 0.2, 0.03),
@@ -92,9 +95,18 @@ class Block:
         at = self.results
         self.images = [at / "rectify" / city / self.scene / f"{v}.zarr" for v in ("left", "right")]
         self.paths = sorted((at / "ingest" / city / self.scene).glob("*.zarr"))
-        store = open_truth(at / "truth" / city / f"{self.scene}.zarr")
-        self.truth = Truth.read(store, self.rows, self.cols)
+        self.truth = self.true(at / "rectify" / city / self.scene / "epipolar.json", city)
         self.density = density([PointStore(path) for path in self.paths])
+
+    def true(self, epipolar_json: Path, city: str) -> Truth:
+        """The exact truth of the block, by rays through its pixels."""
+        made, model = CITIES[city], EpipolarModel.load(epipolar_json)
+        window = truth_window(
+            model, made, made.scene(self.scene), self.rows, self.cols, self.view
+        )  # fmt: skip
+        layers = xr.Dataset({name: (("y", "x"), array) for name, array in window.items()})
+        height, width = window["disparity"].shape
+        return Truth.read(layers, slice(0, height), slice(0, width))
 
     def job(self, points_per_m2: float | None, fill: str, method: str = "both") -> SceneInputs:
         """What labels the block; ``points_per_m2`` None: all points."""
@@ -107,11 +119,12 @@ class Block:
     def labels(self, job: SceneInputs) -> dict[str, NDArray]:
         """The layers of the block, put together from its windows."""
         out: dict[str, NDArray] = {}
-        for rows, cols in self.windows(job):
-            found = label_window(job, rows, cols)
+        for rows, seen in self.windows(job):
+            found = label_window(job, rows, seen)
             if found is None:
                 continue
-            for name, part in found[0].items():
+            cols = job.pair.cols(seen)
+            for name, part in job.pair.arrays(found[0]).items():
                 whole = out.setdefault(
                     name,
                     np.full(self.truth.kind.shape, np.nan if part.dtype.kind == "f" else 0)
@@ -124,14 +137,14 @@ class Block:
         return out
 
     def windows(self, job: SceneInputs) -> list[tuple[slice, slice]]:
-        """Of the blocks of stage project, as far as they lie in this one."""
+        """Of the blocks of stage project, as far as they lie in this one, as the pair sees them."""
         return [
             window
             for r in range(self.rows.start, self.rows.stop, SHARD)
             for c in range(self.cols.start, self.cols.stop, SHARD)
             for window in job.windows.parts(
                 slice(r, min(r + SHARD, self.rows.stop)),
-                slice(c, min(c + SHARD, self.cols.stop)),
+                job.pair.cols(slice(c, min(c + SHARD, self.cols.stop))),
                 MAX_POINTS,
             )
         ]
@@ -238,18 +251,20 @@ def main() -> None:
     parser.add_argument("--fill", nargs="+", default=["none", "surface", "surface_and_images"])
     parser.add_argument("--first", type=int, nargs=2, default=(1024, 1024), help="row, column")
     parser.add_argument("--size", type=int, default=1024, help="px; 0: to the end of the grid")
+    parser.add_argument("--view", choices=("left", "right"), default="left")
     parser.add_argument("--kinds", action="store_true", help="statuses by kind of surface")
     parser.add_argument("--figure", type=Path, help="PNG of the shares by density")
     options = parser.parse_args()
     drawn: dict[str, dict[float, dict[str, Any]]] = {}
     city = options.scene.rsplit("-", 1)[0]
-    shape = open_truth(options.results / "truth" / city / f"{options.scene}.zarr")["visible"].shape
+    rectified = options.results / "rectify" / city / options.scene
+    shape = EpipolarModel.load(rectified / "epipolar.json").shape
     rows, cols = (
         slice(at, min(at + (options.size or end), end)) for at, end in zip(options.first, shape)
     )
     megapixels = (rows.stop - rows.start) * (cols.stop - cols.start) / 1e6
-    block = Block(options.scene, options.results, rows, cols)
-    print(f"{options.scene}: {block.density:.2f} first returns per m²")
+    block = Block(options.scene, options.results, rows, cols, options.view)
+    print(f"{options.scene}, {options.view}: {block.density:.2f} first returns per m²")
     for fill in options.fill:
         for target in options.densities:
             job = block.job(None if target >= block.density else target, fill)

@@ -75,16 +75,31 @@ def height_edges(disparity: NDArray[np.float64], built: NDArray[np.bool_]) -> ND
 
 
 def truth_window(
-    model: EpipolarModel, city: CitySpec, scene: SceneSpec, rows: slice, cols: slice
+    model: EpipolarModel,
+    city: CitySpec,
+    scene: SceneSpec,
+    rows: slice,
+    cols: slice,
+    view: str = "left",
 ) -> dict[str, NDArray]:
-    """The layers of LAYERS in a window [rows, cols] of the left epipolar grid."""
+    """The layers of LAYERS in a window [rows, cols] of the left epipolar grid.
+
+    With the ``view`` "right", the window is of the right grid; ``visible`` and ``hidden`` tell of
+    the left image then, signs are the same.
+    """
     y, x = np.mgrid[rows.start - 1 : rows.stop + 1, cols.start - 1 : cols.stop + 1].astype(float)
-    found = truth_at(city, scene, *model.epipolar_to_left(x, y))
-    x_right, y_right = model.right_to_epipolar(found["right_col"], found["right_row"])
-    disparity, surface = x - x_right, found["surface"]
+    to_image, to_grid = (
+        (model.epipolar_to_left, model.right_to_epipolar)
+        if view == "left"
+        else (model.epipolar_to_right, model.left_to_epipolar)
+    )
+    found = truth_at(city, scene, *to_image(x, y), view)
+    x_there, y_there = to_grid(found["right_col"], found["right_row"])
+    sign = 1.0 if view == "left" else -1.0
+    disparity, surface = sign * (x - x_there), found["surface"]
     layers = {
         "disparity": disparity.astype(np.float32),
-        "y_parallax": (y_right - y).astype(np.float32),
+        "y_parallax": (sign * (y_there - y)).astype(np.float32),
         "visible": found["visible_right"],
         "hidden": found["hidden_right"],
         **{name: found[name] for name in ("changed", "changed_right", "covered", "surface")},

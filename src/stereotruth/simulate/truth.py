@@ -1,4 +1,4 @@
-"""The exact truth of a scene: what each left pixel shows, and where the right image has it."""
+"""The exact truth of a scene: what each pixel shows, and where the other image has it."""
 
 from __future__ import annotations
 
@@ -64,12 +64,25 @@ def seen_from(s, above, x, y, z, line, view, tolerance):
 
 @kernel
 def _truth_points(
-    s, above_left, above_right, left, right, frame, cover, size, image_col, image_row, real, flags
+    s,
+    is_left,
+    above_left,
+    above_right,
+    left,
+    right,
+    frame,
+    cover,
+    size,
+    image_col,
+    image_row,
+    real,
+    flags,
 ):
     """The truth at left image positions [n]; neighbours should follow each other.
 
     ``size``: left cols, rows, right cols, rows. real[5, n] and flags[6, n]: values of LAYERS in
-    their order. Positions outside the left frame, in its collar, or NaN get NaN and 0.
+    their order. Positions outside the left frame, in its collar, or NaN get NaN and 0. Without
+    ``is_left``, the image of the positions is the right one, and what is called right the left.
     """
     line, other = np.empty(12), np.empty(12)
     guess = 0.0
@@ -79,7 +92,7 @@ def _truth_points(
         c, row = image_col[k], image_row[k]
         if not (
             c >= -0.5 and row >= -0.5 and c <= size[0] - 0.5 and row <= size[1] - 0.5
-        ) or in_collar(True, c, row, size[0], size[1]):
+        ) or in_collar(is_left, c, row, size[0], size[1]):
             real[:, k] = np.nan
             flags[:, k] = 0
             continue
@@ -100,7 +113,7 @@ def _truth_points(
             and right_row >= 0
             and col <= size[2] - 1
             and right_row <= size[3] - 1
-            and not in_collar(False, col, right_row, size[2], size[3])
+            and not in_collar(not is_left, col, right_row, size[2], size[3])
         )
         scanned, _, _, _, _, _, _ = cast(s, above_left, ax, ay, bx, by, IN_LIDAR, True, guess)
         changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
@@ -119,22 +132,25 @@ def _truth_points(
 
 
 def truth_at(
-    city: CitySpec, scene: SceneSpec, col: np.ndarray, row: np.ndarray
+    city: CitySpec, scene: SceneSpec, col: np.ndarray, row: np.ndarray, view: str = "left"
 ) -> dict[str, np.ndarray]:
     """The layers of LAYERS at positions (col, row) of the left image, px, of any one shape.
 
     Rays go through the very positions given, by the rigorous camera. Where the left image shows
-    nothing (outside its frame, in its collar, NaN) the layers hold NaN and 0.
+    nothing (outside its frame, in its collar, NaN) the layers hold NaN and 0. With the ``view``
+    "right", positions are of the right image, and the layers named right tell of the left one.
     """
     ready = prepare(city, scene)
     left, right = ready.left, ready.right
+    if view == "right":
+        left, right = right, left
     size = np.array([left.cols, left.rows, right.cols, right.rows], dtype=np.float64)
     at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
     real = np.empty((len(REALS), at[0].size))
     flags = np.empty((len(LAYERS) - len(REALS), at[0].size), np.uint8)
     _truth_points(
-        ready.surfaces, left.horizon, right.horizon, left.cam, right.cam, ready.frame.packed(),
-        coverage(city, scene), size, *at, real, flags,
+        ready.surfaces, view == "left", left.horizon, right.horizon, left.cam, right.cam,
+        ready.frame.packed(), coverage(city, scene), size, *at, real, flags,
     )  # fmt: skip
     return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
 

@@ -16,7 +16,7 @@ from stereotruth.evaluation.epipolar_truth import height_edges, truth_window, wr
 from stereotruth.simulate.camera import locate, project, rays
 from stereotruth.simulate.render import prepare
 from stereotruth.simulate.surfaces import terrain_heights
-from stereotruth.simulate.truth import open_truth, simulate_truth
+from stereotruth.simulate.truth import open_truth, simulate_truth, truth_at
 
 from ...synthetic.small_cities import ONE_BOX, TOWN
 from ...synthetic.surveyed_pair import linear_rpc
@@ -97,6 +97,29 @@ def test_box_and_ground_by_hand() -> None:
     edge = found["edge"] > 0
     assert 100 < edge.sum() < 1500 and not (found["edge"] == 2).any()
     assert edge[found["surface"] == ROOF].mean() == pytest.approx(0.09, abs=0.05)
+
+
+def test_right_view_comes_back_to_itself() -> None:
+    """What a right pixel shows lies where the left view's own truth has it in the right grid."""
+    scene = TOWN.scenes[0]
+    model = turned(TOWN, (0.37, -0.21))
+    window = slice(100, 228), slice(100, 228)
+    right = truth_window(model, TOWN, scene, *window, view="right")
+    y, x = np.mgrid[window].astype(float)
+    seen = right["visible"] == 1
+    assert 0.5 < seen.mean() < 1.0 and right["hidden"].any()
+    at = x + right["disparity"], y - right["y_parallax"]
+    left = truth_at(TOWN, scene, *model.epipolar_to_left(*at))
+    x_back, y_back = model.right_to_epipolar(left["right_col"], left["right_row"])
+    assert (left["surface"] == right["surface"])[seen].mean() > 0.999
+    assert (left["visible_right"] == 1)[seen].mean() > 0.999
+    same = seen & (left["surface"] == right["surface"])
+    # where a ray grazes a surface, 2 cm of tolerance are more along it
+    for back, here in ((x_back, x), (y_back, y)):
+        off = np.abs(back - here)[same]
+        assert np.quantile(off, 0.99) < 2e-3 and off.max() < 0.1
+    hidden = right["hidden"] == 1
+    assert (np.abs(x_back - x)[hidden] > 0.01).mean() > 0.99
 
 
 def test_pixel_centres_that_are_raw_centres_hold_the_raw_truth(tmp_path: Path) -> None:
