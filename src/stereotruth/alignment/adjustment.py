@@ -19,9 +19,7 @@ Floats = NDArray[np.float64]
 
 
 MATCHING = 0.01  # px, what even the best match may be off
-SYSTEMATIC = (
-    0.01  # px that all tie points are taken to share where they are weighed against a prior
-)
+SYSTEMATIC = 0.01  # px that all tie points are taken to share, to weigh them against a prior
 CLASSES = 5  # of matches, from the best to the poorest
 FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
 TUKEY = 4.685  # deviations at which an observation has lost all weight
@@ -127,18 +125,24 @@ def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s:
 def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
     """Standard deviation px of an error that all observations [n] share, in their weighted mean.
 
-    Poor matches are not only noisier, they are off to one side where the surface is not what the
-    points say. So classes of like ``own`` differ by more than their scatter explains; by how much
-    is the variance between studies of a meta-analysis (DerSimonian & Laird 1986).
+    Poor matches are not only noisier: they are off to one side, where the surface is not what the
+    points say. So classes of like ``own`` differ by more than their scatter explains. By how much
+    is the variance between studies of a meta-analysis (DerSimonian & Laird 1986); as it is known
+    from few classes only, Student's t takes the place of the normal distribution.
     """
     classes = np.argsort(np.argsort(own, kind="stable"), kind="stable") * CLASSES // own.size
     weight = np.bincount(classes, information)
-    mean = np.bincount(classes, information * residuals)[weight > 0.0] / weight[weight > 0.0]
-    weight = weight[weight > 0.0]
+    told = weight > 0.0
+    mean = np.bincount(classes, information * residuals)[told] / weight[told]
+    weight = weight[told]
+    freedom = weight.size - 1
+    if freedom < 3:  # of less, the variance of Student's t is infinite
+        return 0.0
     total, squares = weight.sum(), np.sum(weight**2)
     scatter = np.sum(weight * (mean - np.sum(weight * mean) / total) ** 2)
-    between = max(scatter - (weight.size - 1), 0.0) / max(total - squares / total, 1e-12)
-    return float(np.sqrt(between * squares) / total)
+    between = max(scatter - freedom, 0.0) / (total - squares / total)
+    of_mean = between * squares / total**2
+    return float(np.sqrt(of_mean * freedom / (freedom - 2)))
 
 
 def estimate(
