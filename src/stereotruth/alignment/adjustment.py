@@ -19,7 +19,8 @@ Floats = NDArray[np.float64]
 
 
 MATCHING = 0.01  # px, what even the best match may be off
-SYSTEMATIC = 0.01  # px that all tie points may have in common, along and across the rows
+SYSTEMATIC = 0.01  # px that all tie points are taken to share, to weigh them against a prior
+CLASSES = 5  # of matches, from the best to the poorest
 FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
 TUKEY = 4.685  # deviations at which an observation has lost all weight
 
@@ -46,9 +47,9 @@ class Estimate:
     """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on.
 
     ``ratio``, ``site_ratio`` [2]: standard deviation of a match along and across the rows, and the
-    part that a site shares, in units of the match's own. ``statistic``: chi-square of the
-    observations against no change, ``contradiction``: that of the observations against the prior,
-    the uncertainties of both counted.
+    part that a site shares, in units of the match's own; ``shared`` [2] px: of what all share.
+    ``statistic``: chi-square of the observations against no change, ``contradiction``: that of the
+    observations against the prior, the uncertainties of both counted.
 
     ``root`` [12, r]: a root of the prior's covariance; ``normal`` [r, r]: information of the
     observations about parameters / root; ``alone`` [12]: what they say by themselves.
@@ -59,6 +60,7 @@ class Estimate:
     weights: Floats
     ratio: Floats
     site_ratio: Floats
+    shared: Floats
     statistic: float
     freedom: int
     contradiction: float
@@ -120,6 +122,29 @@ def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s:
     )
 
 
+def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
+    """Standard deviation px of an error that all observations [n] share, in their weighted mean.
+
+    Poor matches are not only noisier: they are off to one side, where the surface is not what the
+    points say. So classes of like ``own`` differ by more than their scatter explains. By how much
+    is the variance between studies of a meta-analysis (DerSimonian & Laird 1986); as it is known
+    from few classes only, Student's t takes the place of the normal distribution.
+    """
+    classes = np.argsort(np.argsort(own, kind="stable"), kind="stable") * CLASSES // own.size
+    weight = np.bincount(classes, information)
+    told = weight > 0.0
+    mean = np.bincount(classes, information * residuals)[told] / weight[told]
+    weight = weight[told]
+    freedom = weight.size - 1
+    if freedom < 3:  # of less, the variance of Student's t is infinite
+        return 0.0
+    total, squares = weight.sum(), np.sum(weight**2)
+    scatter = np.sum(weight * (mean - np.sum(weight * mean) / total) ** 2)
+    between = max(scatter - freedom, 0.0) / (total - squares / total)
+    of_mean = between * squares / total**2
+    return float(np.sqrt(of_mean * freedom / (freedom - 2)))
+
+
 def estimate(
     design: Floats, observed: Floats, own: Floats, sites: NDArray[np.int64], prior: Floats
 ) -> Estimate:
@@ -128,6 +153,9 @@ def estimate(
     ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
     poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
     is the covariance about zero. Observations of one site, int[n], share errors.
+
+    All are weighed as if they shared SYSTEMATIC px, which decides between them and the prior only;
+    the covariance is that of this estimate under the errors that the observations show.
     """
     root = _root(prior)
     sites = np.unique(sites, return_inverse=True)[1]
@@ -160,6 +188,7 @@ def estimate(
         right = np.einsum("nap,na->p", weighted, observed)
         shared = weighted.sum(axis=0).T  # [r, 2], with what all observations have in common
         total = information.sum(axis=0) + SYSTEMATIC**-2.0
+        single = normal.copy()
         normal -= (shared / total) @ shared.T
         right -= (shared / total) @ np.sum(information * observed, axis=0)
         last = z
@@ -173,13 +202,20 @@ def estimate(
     values, vectors = np.linalg.eigh(normal)
     seen = values > 1e-9 * values.max()
     values, squares = values[seen], (vectors[:, seen].T @ right) ** 2
-    covariance = root @ np.linalg.inv(np.eye(rank) + normal) @ root.T
+    own = expected[:, 0]
+    common = np.array([_shared_sigma(residuals[:, k], information[:, k], own) for k in (0, 1)])
+    # That of the right side, by errors of the observations that have this in common:
+    floor = SYSTEMATIC**-2.0
+    single -= (shared * (total + floor - (common * floor) ** 2) / total**2) @ shared.T
+    to_parameters = root @ np.linalg.inv(np.eye(rank) + normal)
+    covariance = to_parameters @ (np.eye(rank) + single) @ to_parameters.T
     return Estimate(
         np.round(root @ z, 8),  # so that the count of threads leaves no trace
         np.round(covariance, 14),
         weights,
         sigma,
         site_sigma,
+        common,
         float(np.sum(squares / values)),
         int(seen.sum()),
         float(np.sum(squares / (values + values**2))),

@@ -9,8 +9,9 @@ settle the relative part, and the rest as far as they see it.
 
 Blunders (moved or built since, vegetation, water, repetition) get no weight (Tukey's biweight).
 Thousands of matches do not pretend thousandths of a pixel: neighbours share errors, by an amount
-that is estimated from the scatter between sites, and all share SYSTEMATIC px at least. If the tie
-points do not contradict the alignment, it is left exactly as it is.
+that is estimated from the scatter between sites, and all share one, that is estimated from how much
+good and poor matches differ. If the tie points do not contradict the alignment, it is left exactly
+as it is.
 """
 
 from __future__ import annotations
@@ -31,7 +32,6 @@ from ..error_statistics import median_and_nmad
 from ..errors import InputError
 from ..lidar.point_store import PointStore, open_stores
 from .adjustment import (
-    SYSTEMATIC,
     Estimate,
     Observations,
     epipolar_model,
@@ -133,7 +133,7 @@ def _record(
         "probability_by_chance": _chance(found),
         "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
         "shared_in_a_site": found.site_ratio.round(3).tolist(),
-        "sigma_shared_by_all_px": SYSTEMATIC,
+        "sigma_shared_by_all_px": found.shared.round(4).tolist(),
         **spreads,
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),

@@ -104,8 +104,9 @@ def damaged_block(path: Path, workers: int = 1) -> str:
             return f"block {halves[0] + 1} of {offsets.size} has a place or a size, but not both"
         compression = int(tags.get(COMPRESSION, [PLAIN])[0])
         if compression == PLAIN and (wanted := _plain_bytes(tags, offsets.size)) is not None:
-            wrong = np.flatnonzero((counts > 0) & ((counts < wanted) | (counts > 2 * wanted)))
-            if wrong.size:  # some programs pad
+            most = 2 * wanted.max()  # some programs pad, or write the last strip in full
+            wrong = np.flatnonzero((counts > 0) & ((counts < wanted) | (counts > most)))
+            if wrong.size:
                 k = wrong[0]
                 return f"block {k + 1} has {counts[k]} bytes, its pixels take {wanted[k]}"
         if compression not in DEFLATE:

@@ -164,8 +164,8 @@ def with_shifts(shifts: np.ndarray):
 def sure() -> Estimate:
     nothing = np.zeros(12)
     return Estimate(
-        nothing, np.eye(12) * 1e-4, nothing, nothing, nothing, 0.0, 12, 0.0, 12, np.eye(12),
-        np.eye(12), nothing,
+        nothing, np.eye(12) * 1e-4, nothing, nothing, nothing, nothing, 0.0, 12, 0.0, 12,
+        np.eye(12), np.eye(12), nothing,
     )  # fmt: skip
 
 

@@ -105,3 +105,17 @@ def test_sparse_files_and_other_formats_pass(tmp_path) -> None:
     assert damaged_block(path) == ""
     (tmp_path / "b.png").write_bytes(b"\x89PNG")
     assert damaged_block(tmp_path / "b.png") == ""
+
+
+def test_a_last_strip_that_is_written_in_full_is_no_damage(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", blockysize=66)  # the last of four strips has two rows
+    data = path.read_bytes()
+    full, last = 66 * 300 * 2, 2 * 300 * 2
+    kind = next(k for k in "HI" if struct.pack(f"<4{k}", full, full, full, last) in data)
+    sizes = struct.pack(f"<4{kind}", full, full, full, last)
+    path.write_bytes(data.replace(sizes, struct.pack(f"<4{kind}", *[full] * 4)) + bytes(full))
+    assert damaged_block(path) == ""
+    with open_raster(path) as dataset:
+        assert (dataset.read(1) == GREY).all()
+    path.write_bytes(data.replace(sizes, struct.pack(f"<4{kind}", full, last, full, last)))
+    assert "block 2 has 1200 bytes" in damaged_block(path)
