@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..products import pictures
@@ -20,6 +21,7 @@ Picture = NDArray[np.uint8]
 
 
 CONTACT_TILES = 16  # most tiles on the contact sheet
+CASING = [withStroke(linewidth=3.6, foreground="white")]  # of the frames of tiles
 
 
 def draw_coverage(
@@ -58,7 +60,7 @@ def draw_contact_sheet(
     contact_sheet(path, title, tiles, limits)
 
 
-SPLIT_COLOURS = {"train": "#d62728", "val": "#ff9f1c", "test": "#8e44ad", "none": "#7f7f7f"}
+SPLIT_COLOURS = {"train": "#0072b2", "val": "#e69f00", "test": "#6f0952", "none": "#8a8a8a"}
 
 
 def coverage_figure(
@@ -95,6 +97,7 @@ def coverage_figure(
                         linestyle="-" if complete else "--",
                         edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
                         zorder=3 if complete else 2,
+                        path_effects=CASING if complete else None,
                     )
                 )
         axis.set(title=scene, xlabel="x in px of the epipolar grid", ylabel="y in px")
@@ -128,7 +131,7 @@ def contact_sheet(
             axis.set_title(f"{caption}, {name}" if name == "left" else name, fontsize=8)
         trio[2].imshow(colours(disparity, limits))
         trio[2].set_title("disparity", fontsize=8)
-    mappable = ScalarMappable(cmap="turbo")
+    mappable = ScalarMappable(cmap=pictures.DISPARITIES)
     mappable.set_clim(*limits)
     figure.colorbar(
         mappable, ax=axes, fraction=0.02, aspect=50, label="disparity, px (offset removed)"
