@@ -279,7 +279,9 @@ def _draw_sift(
             axis = figure.add_subplot(grid[line, column])
             axis.set_facecolor("0.85")
             extent = (0, -(-cols // CELL_PX) * CELL_PX, -(-rows // CELL_PX) * CELL_PX, 0)
-            shown = axis.imshow(values, cmap=pictures.DIFFERENCES, vmin=-0.5, vmax=0.5, extent=extent)
+            shown = axis.imshow(
+                values, cmap=pictures.DIFFERENCES, vmin=-0.5, vmax=0.5, extent=extent
+            )
             axis.set(xlabel="x in px of the epipolar grid", ylabel="y in px")
             axis.set_title(f"{scene}: {title}, median of {CELL_PX} × {CELL_PX} px", fontsize=10)
             figure.colorbar(shown, ax=axis, label="px")

@@ -17,6 +17,7 @@ from .files import replacing
 from .html_tables import gate, minus, words
 
 SHARED = Path(__file__).parent  # of what all pages share
+INDEX = Path("results/report/index.html")  # of all pages of a folder
 PAPER = "https://doi.org/10.1109/TGRS.2023.3245205"
 FILTERS: Mapping[str, Callable[..., Any]] = {"words": words, "minus": minus, "gate": gate}
 

@@ -109,7 +109,9 @@ def _of_images(
         found.append(Headline("SIFT matches less labels", f"{spread(errors, '.2f')} px", note))
     if medians := values("y_parallax_median_px"):
         text = f"{spread(medians, '+.2f')} px"
-        note = _and(of(len(medians)), f"median; rms {spread(values('y_parallax_rms_px'), '.2f')} px")
+        note = _and(
+            of(len(medians)), f"median; rms {spread(values('y_parallax_rms_px'), '.2f')} px"
+        )
         found.append(Headline("y-parallax of matches", text, note))
     if known := values("warp_correlation"):
         note = _and(of(len(known)), "correlation over the labelled pixels")

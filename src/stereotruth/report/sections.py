@@ -162,7 +162,9 @@ def tile_index(rows: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
                 "y": y - top,
                 "size": size,
                 "complete": row["complete"] == "yes",
-                "colour": quick_looks.SPLIT_COLOURS.get(row["split"], quick_looks.SPLIT_COLOURS[NONE]),
+                "colour": quick_looks.SPLIT_COLOURS.get(
+                    row["split"], quick_looks.SPLIT_COLOURS[NONE]
+                ),
                 "bad": bool(missed(row)),
             }
             for row, (x, y, size) in zip(here, boxes)

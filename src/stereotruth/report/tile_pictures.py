@@ -120,7 +120,9 @@ def tile_pictures(
     large = {
         "slider_left": _shown(left, limits),
         "slider_warped": np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
-        "slider_difference": pictures.colours(tile.left - matched, (-spread, spread), pictures.DIFFERENCES),
+        "slider_difference": pictures.colours(
+            tile.left - matched, (-spread, spread), pictures.DIFFERENCES
+        ),
         "slider_disparity": coloured,
     }
     large["slider_warped"][nothing] = NO_MATCH
