@@ -116,7 +116,8 @@ def write_report(
     georeferenced pictures of the left images by scene; ``alignments``, ``refinements``:
     alignment.json by scene, after the fit to the GCPs and after refinement;
     ``refinement_figures``: refinement.png by scene; ``truth``, ``truth_table``: truth.json and
-    truth.csv; ``table4``, ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG). ``sliders``: most tiles with large pictures.
+    truth.csv; ``table4``, ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG).
+    ``sliders``: most tiles with large pictures.
     Whatever is None or missing leaves its section out.
 
     Raises InputError if there is no manifest.
