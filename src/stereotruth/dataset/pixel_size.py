@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from .orientation import evaluate
+from .polynomials import evaluate
 
 DEGREE_M = 111_320.0  # of latitude, near enough for two digits
 

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..products import pictures
@@ -21,7 +20,6 @@ Picture = NDArray[np.uint8]
 
 
 CONTACT_TILES = 16  # most tiles on the contact sheet
-CASING = [withStroke(linewidth=3.6, foreground="white")]  # of the frames of tiles
 
 
 def draw_coverage(
@@ -85,21 +83,26 @@ def coverage_figure(
         rows, cols = grey.shape
         axis.imshow(picture, extent=(-0.5, cols * scale - 0.5, rows * scale - 0.5, -0.5))
         for where, row0, col0, size, split, complete in tiles:
-            if where == scene:
-                inset = size / 80  # neighbours do not hide each other's colour
+            if where != scene:
+                continue
+            inset = size / 80  # neighbours do not hide each other's colour
+            corner, side = (col0 - 0.5 + inset, row0 - 0.5 + inset), size - 2 * inset
+            if complete:  # a white casing, below the frames of all tiles
                 axis.add_patch(
-                    Rectangle(
-                        (col0 - 0.5 + inset, row0 - 0.5 + inset),
-                        size - 2 * inset,
-                        size - 2 * inset,
-                        fill=False,
-                        linewidth=1.8 if complete else 1.0,
-                        linestyle="-" if complete else "--",
-                        edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
-                        zorder=3 if complete else 2,
-                        path_effects=CASING if complete else None,
-                    )
+                    Rectangle(corner, side, side, fill=False, linewidth=3.6, edgecolor="w")
                 )
+            axis.add_patch(
+                Rectangle(
+                    corner,
+                    side,
+                    side,
+                    fill=False,
+                    linewidth=1.8 if complete else 1.0,
+                    linestyle="-" if complete else "--",
+                    edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
+                    zorder=3 if complete else 2,
+                )
+            )
         axis.set(title=scene, xlabel="x in px of the epipolar grid", ylabel="y in px")
     legend = [Patch(fill=False, edgecolor=colour, label=s) for s, colour in SPLIT_COLOURS.items()]
     legend.append(Patch(fill=False, edgecolor="0.75", linestyle="--", label="incomplete pair"))

@@ -147,7 +147,7 @@ def metres(value_px: float, height_m_per_px: float | None, *, what: str = "heigh
     if height_m_per_px is None:
         return ""
     value = abs(value_px) * height_m_per_px
-    text = f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+    text = f"{value:.0f}" if value >= 10 else f"{value:#.2g}"
     return f"{text} m of {what}"
 
 

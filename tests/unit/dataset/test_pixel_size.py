@@ -7,15 +7,17 @@ import json
 import numpy as np
 import pytest
 
-from stereotruth.dataset.orientation import GROUND_TOLERANCE, fit
+from stereotruth.dataset.orientation import GROUND_TOLERANCE
 from stereotruth.dataset.pixel_size import DEGREE_M, PixelSize
+from stereotruth.dataset.polynomials import fit
 
 GSD, RATIO, LAT = 0.7, 0.62, 30.0  # m, base to height, degrees
 
 
 def orientation(gsd: float = GSD) -> dict:
     """A tile of 100 px on flat ground: columns to the north-east, a height as its disparity."""
-    x, y, d = (v.ravel() for v in np.meshgrid(*(np.linspace(0, 100, 6),) * 2, np.linspace(-5, 20, 6)))
+    side, depth = np.linspace(0, 100, 6), np.linspace(-5, 20, 6)
+    x, y, d = (v.ravel() for v in np.meshgrid(side, side, depth))
     height = 40 + d * gsd / RATIO
     east, north = (gsd * (x * c + y * s) for c, s in ((0.8, 0.6), (0.6, -0.8)))
     lon = 114 + east / (DEGREE_M * np.cos(np.radians(LAT)))
