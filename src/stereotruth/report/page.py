@@ -196,7 +196,6 @@ def write_report(
         "split_colours": quick_looks.SPLIT_COLOURS,
         "disparities": pictures.gradient(pictures.DISPARITIES),
         "diverging": pictures.gradient(pictures.DIFFERENCES),
-        "no_value": f"rgb{pictures.NO_VALUE}",
         "no_match": f"rgb{tile_pictures.NO_MATCH}",
         "no_difference": f"rgb{tile_pictures.NO_DIFFERENCE}",
         "coverage": embedded(coverage, COVERAGE_PX),
