@@ -118,7 +118,9 @@ def _benchmarks(root: Path, out: Path) -> Table | None:
                     _link(out, page, folder.name) if page.is_file() else Cell(folder.name, ""),
                     _link(out, file.parent / "cities.csv", of["label"]),
                     _value(total["filled_epe_px"], ".3f", unit=" px"),
-                    _value(total[f"filled_d1_{limit:g}_px_share"], ".2f", 100, " %"),
+                    _value(
+                        total[f"filled_d1_{limit:g}_px_share"], ".2f", 100, f" % ({limit:g} px)"
+                    ),
                     _value(total["valid_share"], ".1f", 100, " %"),
                     _value(of["tiles"], "d"),
                 )

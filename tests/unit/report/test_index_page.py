@@ -66,9 +66,9 @@ def test_figures_are_those_of_the_files(folder):
         [re.sub("<.*?>", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)]
         for row in text.split("<tr>")
     ]
-    assert ["own", "NET", "0.500 px", "4.21 %", "90.0 %", "7"] in rows
-    assert rows.index(["own", "NET", "0.500 px", "4.21 %", "90.0 %", "7"]) < rows.index(
-        ["own", "SGM", "1.250 px", "4.21 %", "90.0 %", "7"]
+    assert ["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"] in rows
+    assert rows.index(["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"]) < rows.index(
+        ["own", "SGM", "1.250 px", "4.21 % (3 px)", "90.0 %", "7"]
     )
     assert ["own", "12", "9", "2", "1", "pairs.csv"] in rows
 
