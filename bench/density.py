@@ -34,6 +34,7 @@ from stereotruth.evaluation.labels_against_truth import (
 from stereotruth.lidar.lattice import DEGREE_M
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.simulate.cities import CITIES
+from stereotruth.products.pictures import SERIES
 
 TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1 px at most, %
     4: (95, 0.2, 0.03),
@@ -231,8 +232,9 @@ def draw(path: Path, scene: str, figures: dict[str, dict[float, dict[str, Any]]]
         "hidden": "hidden pixels with a label, %",
     }
     for panel, (name, title) in zip(panels, titles.items()):
-        for fill, found in figures.items():
-            panel.plot(list(found), [f[name] for f in found.values()], "o-", ms=4, label=fill)
+        for fill, found, colour, shape in zip(figures, figures.values(), SERIES, "os^D"):
+            shares = [f[name] for f in found.values()]
+            panel.plot(list(found), shares, f"{shape}-", color=colour, ms=4, label=fill)
         panel.set_xscale("log", base=2)
         densities = sorted({d for found in figures.values() for d in found})
         panel.set_xticks(densities, [f"{d:.2g}" for d in densities])

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import cycle
 from pathlib import Path
 
 import laspy
@@ -24,6 +25,7 @@ from numba import njit
 from rasterio.rpc import RPC
 from rasterio.windows import Window
 
+from stereotruth.products.pictures import SERIES
 from stereotruth.simulate.camera import aim, locate, project
 from stereotruth.simulate.geodesy import LocalFrame
 from stereotruth.simulate.rpcs import draw_bias, fit_rpc
@@ -285,12 +287,12 @@ def draw(path: Path, samples: list[tuple], blocks: dict[str, list[float]], start
     """Memory over time, and blocks done over time."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
     at = np.array([s[0] for s in samples]) - start
-    above.plot(at, [s[1] for s in samples], label="all processes")
-    above.plot(at, [s[2] for s in samples], label="largest job")
+    above.plot(at, [s[1] for s in samples], color=SERIES[0], label="all processes")
+    above.plot(at, [s[2] for s in samples], color=SERIES[1], label="largest job")
     above.set_ylabel("memory (PSS), MiB")
     above.legend()
-    for name, times in blocks.items():
-        below.plot(np.array(times) - start, np.arange(1, len(times) + 1), label=name)
+    for (name, times), colour in zip(blocks.items(), cycle(SERIES)):
+        below.plot(np.array(times) - start, np.arange(1, len(times) + 1), color=colour, label=name)
     below.set_ylabel("blocks done")
     below.set_xlabel("s")
     below.legend()

@@ -41,6 +41,7 @@ from stereotruth.evaluation.labels_against_truth import (
 )
 from stereotruth.products.files import replacing
 from stereotruth.products.grids import blocks, open_grid
+from stereotruth.products.pictures import SERIES
 from stereotruth.products.provenance import source_digest
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
@@ -52,7 +53,7 @@ WAYS: dict[str, tuple[str, str, tuple[float | None, ...]]] = {
     "geometric, top surface": ("geometric", "top", (None,)),
 }
 STYLES = ("o-", "s", "o-", "*")
-COLOURS = ("#7f7f7f", "#1f77b4", "#d62728", "#000000")
+COLOURS = ("#8a8a8a", *SERIES[:2], "#000000")
 Window = tuple[slice, slice]
 Rows = list[dict[str, Any]]
 
@@ -136,7 +137,7 @@ def draw(rows: Rows, path: Path) -> None:
     figure = Figure(figsize=(4.2 * columns, 3.6 * lines), layout="constrained")
     axes = np.ravel(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False))
     for ax, city in zip(axes, cities):
-        ax.fill_between([0.1, 1], 98.5, 100, color="#2ca02c", alpha=0.2, lw=0, label="aim")
+        ax.fill_between([0.1, 1], 98.5, 100, color="0.8", alpha=0.6, lw=0, label="aim")
         for way, style, colour in zip(WAYS, STYLES, COLOURS):
             here = [row for row in rows if row["city"] == city and row["way"] == way]
             x, y = (100 * np.array([row[key] for row in here]) for key in ("hidden", "visible"))

@@ -317,11 +317,11 @@ def shown(model: EpipolarModel, raster: Raster, truth: np.ndarray) -> np.ndarray
 
 
 def shaded(heights: np.ndarray, resolution: float, limits: tuple[float, float]) -> np.ndarray:
-    """Heights in colour, light from the north-west at 45 degrees; NaN is dark."""
+    """Heights in colour, light from the north-west at 45 degrees; NaN is light grey."""
     south, east = np.gradient(heights, resolution)
     light = (1.0 + east + south) / np.sqrt(1.0 + east**2 + south**2) / np.sqrt(3.0)
     light = np.where(np.isfinite(light), np.clip(0.25 + light, 0.0, 1.3), 1.0)
-    return np.clip(colours(heights, limits, "terrain") * light[..., None], 0, 255).astype(np.uint8)
+    return np.clip(colours(heights, limits, "cividis") * light[..., None], 0, 255).astype(np.uint8)
 
 
 def draw(path: Path, folder: Path, methods: list[str], truth: np.ndarray, side: int = 760) -> None:

@@ -41,7 +41,7 @@ html_theme = "furo"
 html_title = "stereotruth"
 html_copy_source = False
 html_static_path = ["static"]
-html_css_files = ["wide_tables.css"]
+html_css_files = ["site.css"]
 
 # What lies beside the files that it tells of, and its page here.
 HOMES = {

@@ -22,7 +22,7 @@ rule audit:
         settings=asdict(SETTINGS.audit),
         measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),
         code=source_digest("evaluation.audit.audit"),
-        template=file_sha256(PACKAGE / "evaluation" / "audit" / "page.html.jinja"),
+        templates=templates_of("evaluation", "audit", "page.html.jinja"),
     message:
         "Auditing dataset {wildcards.dataset}"
     script:

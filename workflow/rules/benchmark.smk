@@ -110,7 +110,7 @@ rule benchmark_tables:
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.compare_methods"),
-        template=file_sha256(PACKAGE / "matching" / "benchmark" / "page.html.jinja"),
+        templates=templates_of("matching", "benchmark", "page.html.jinja"),
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

@@ -75,6 +75,12 @@ def making_of(rule, wildcards):
     return made_of(rule.output[0].format(**wildcards))
 
 
+def templates_of(*parts):
+    """Digests of a page's template and of what all pages share."""
+    shared = sorted((PACKAGE / "products").glob("*.jinja"))
+    return [file_sha256(file) for file in (PACKAGE.joinpath(*parts), *shared)]
+
+
 def content_of(script):
     """Digest of a rule's script: the time of its file counts for nothing (profiles/default)."""
     return script_digest(RULES / script)

@@ -2,6 +2,7 @@ rule report_city:
     input:
         tiles="tiles/{city}",
         coverage="results/export/{city}/coverage.png",
+        looks="results/export/{city}/quick_looks",
         alignments=lambda w: [
             f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
         ],
@@ -36,7 +37,7 @@ rule report_city:
         script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),
-        template=file_sha256(PACKAGE / "report" / "page.html.jinja"),
+        templates=templates_of("report", "page.html.jinja"),
     message:
         "Writing the page of {wildcards.city}"
     script:
@@ -48,3 +49,8 @@ rule report:
         lambda w: expand("results/report/{city}/index.html", city=cities_of_report()),
     message:
         "Pages of all cities"
+
+
+rule index:
+    message:
+        "Index of the pages that there are, as at the end of each run"

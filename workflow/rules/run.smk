@@ -63,7 +63,17 @@ def made():
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
     ]
-    return "\n".join(["", *last_lines(products), *left_out])
+    index = list_pages()
+    return "\n".join(
+        ["", *last_lines(products), *left_out, *([f"All pages: {index}"] if index else [])]
+    )
+
+
+def list_pages():
+    """Write the index of all pages, of this run and of earlier ones; its path, if there are any."""
+    from stereotruth.report.index_page import write_index
+
+    return write_index()
 
 
 def say(text):
@@ -79,4 +89,5 @@ onsuccess:
 
 onerror:
     save_metadata()
+    list_pages()
     say(complaints(log))

@@ -4,6 +4,7 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
+from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
@@ -19,4 +20,5 @@ if __name__ == "__main__":
             work=f"results/audit/{name}",
             workers=snakemake.threads,
             code=params.measuring,
+            index=INDEX,
         )

@@ -5,6 +5,7 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
+from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
@@ -20,4 +21,5 @@ if __name__ == "__main__":
             snakemake.input.predictions,
             Path(snakemake.output.page).parent,
             seed=params.seed,
+            index=INDEX,
         )

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from stereotruth.job import job
+from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
 from stereotruth.report.page import write_report
 
@@ -21,7 +22,12 @@ if __name__ == "__main__":
             city,
             given.tiles,
             snakemake.output[0],
+            index=INDEX,
             coverage=given.coverage,
+            looks={
+                scene: Path(given.looks, f"{scene}_left.tif")
+                for scene in by_scene(given.alignments)
+            },
             alignments=by_scene(given.alignments),
             refinements=by_scene(given.refinements),
             refinement_figures=by_scene(given.refinement_figures),

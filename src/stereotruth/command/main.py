@@ -209,14 +209,14 @@ def open_pages(
     ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only say where they are.")] = False,
 ) -> None:
-    """Open the pages that there are: reports of cities, benchmarks, audits."""
+    """Open the index of all pages (cities, benchmarks, audits), or those that are named."""
     from .pages import pages
 
     found = pages(words or [])
     for page in found:
         typer.echo(str(page))
-        if not listed:
-            typer.launch(page.absolute().as_uri())
+    for page in [] if listed else found if words else found[:1]:
+        typer.launch(page.absolute().as_uri())
 
 
 def main() -> None:

@@ -6,18 +6,20 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import InputError
-
-PAGES = ("results/report/*/index.html", "benchmark/*/index.html", "audit/*/index.html")
+from ..report.index_page import pages_of, write_index
 
 
 def pages(words: Iterable[str] = ()) -> list[Path]:
-    """Pages of this folder with one of the words in their path, all without words, sorted.
+    """Pages of this folder with one of the words in their path; without words all, the
+    index of them first.
 
     Raises InputError if there is none.
     """
     words = list(words)
-    found = sorted(page for pattern in PAGES for page in Path().glob(pattern))
-    chosen = [page for page in found if not words or any(word in str(page) for word in words)]
+    index, found = write_index(), pages_of(Path())
+    chosen = [page for page in found if any(word in str(page) for word in words)]
+    if not words and index:
+        chosen = [index, *found]
     if not chosen:
         there = f"; there are {', '.join(map(str, found))}" if found else ""
         raise InputError(

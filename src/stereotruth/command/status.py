@@ -18,7 +18,7 @@ from rich.table import Table
 from ..dataset.manifest import read_manifest
 from ..errors import InputError
 from ..project import configured, read_scenes, sheet
-from .pages import PAGES
+from ..report.index_page import PAGES
 from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does

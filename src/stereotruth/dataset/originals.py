@@ -31,7 +31,7 @@ from ..products.files import whole_folder, write_table
 from ..products.provenance import file_sha256
 from ..products.ungeoreferenced import open_raster
 from .manifest import read_manifest
-from .orientation import evaluate
+from .polynomials import evaluate
 
 MARGIN_PX = 16  # of the crops around what the tiles show
 README = """Crops of the original images, with corrected RPCs

@@ -58,7 +58,7 @@ def draw_contact_sheet(
     contact_sheet(path, title, tiles, limits)
 
 
-SPLIT_COLOURS = {"train": "#d62728", "val": "#ff9f1c", "test": "#8e44ad", "none": "#7f7f7f"}
+SPLIT_COLOURS = {"train": "#0072b2", "val": "#e69f00", "test": "#6f0952", "none": "#8a8a8a"}
 
 
 def coverage_figure(
@@ -83,20 +83,26 @@ def coverage_figure(
         rows, cols = grey.shape
         axis.imshow(picture, extent=(-0.5, cols * scale - 0.5, rows * scale - 0.5, -0.5))
         for where, row0, col0, size, split, complete in tiles:
-            if where == scene:
-                inset = size / 80  # neighbours do not hide each other's colour
+            if where != scene:
+                continue
+            inset = size / 80  # neighbours do not hide each other's colour
+            corner, side = (col0 - 0.5 + inset, row0 - 0.5 + inset), size - 2 * inset
+            if complete:  # a white casing, below the frames of all tiles
                 axis.add_patch(
-                    Rectangle(
-                        (col0 - 0.5 + inset, row0 - 0.5 + inset),
-                        size - 2 * inset,
-                        size - 2 * inset,
-                        fill=False,
-                        linewidth=1.8 if complete else 1.0,
-                        linestyle="-" if complete else "--",
-                        edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
-                        zorder=3 if complete else 2,
-                    )
+                    Rectangle(corner, side, side, fill=False, linewidth=3.6, edgecolor="w")
                 )
+            axis.add_patch(
+                Rectangle(
+                    corner,
+                    side,
+                    side,
+                    fill=False,
+                    linewidth=1.8 if complete else 1.0,
+                    linestyle="-" if complete else "--",
+                    edgecolor=SPLIT_COLOURS[split] if complete else "0.75",
+                    zorder=3 if complete else 2,
+                )
+            )
         axis.set(title=scene, xlabel="x in px of the epipolar grid", ylabel="y in px")
     legend = [Patch(fill=False, edgecolor=colour, label=s) for s, colour in SPLIT_COLOURS.items()]
     legend.append(Patch(fill=False, edgecolor="0.75", linestyle="--", label="incomplete pair"))
@@ -128,7 +134,7 @@ def contact_sheet(
             axis.set_title(f"{caption}, {name}" if name == "left" else name, fontsize=8)
         trio[2].imshow(colours(disparity, limits))
         trio[2].set_title("disparity", fontsize=8)
-    mappable = ScalarMappable(cmap="turbo")
+    mappable = ScalarMappable(cmap=pictures.DISPARITIES)
     mappable.set_clim(*limits)
     figure.colorbar(
         mappable, ax=axes, fraction=0.02, aspect=50, label="disparity, px (offset removed)"

@@ -256,7 +256,7 @@ def _draw_sift(
     grid = figure.add_gridspec(1 + len(maps), 2)
     axis = figure.add_subplot(grid[0, :])
     bins = np.arange(-2.0, 2.001, 0.05)
-    for kind, colour in ((BUILDING, "#d62728"), (VEGETATION, "#2ca02c")):
+    for kind, colour in zip((BUILDING, VEGETATION), pictures.SERIES):
         errors = np.concatenate([np.empty(0), *by_kind[kind]])
         if errors.size:
             outside = (np.abs(errors) > 2.0).mean()
@@ -279,7 +279,9 @@ def _draw_sift(
             axis = figure.add_subplot(grid[line, column])
             axis.set_facecolor("0.85")
             extent = (0, -(-cols // CELL_PX) * CELL_PX, -(-rows // CELL_PX) * CELL_PX, 0)
-            shown = axis.imshow(values, cmap="RdBu", vmin=-0.5, vmax=0.5, extent=extent)
+            shown = axis.imshow(
+                values, cmap=pictures.DIFFERENCES, vmin=-0.5, vmax=0.5, extent=extent
+            )
             axis.set(xlabel="x in px of the epipolar grid", ylabel="y in px")
             axis.set_title(f"{scene}: {title}, median of {CELL_PX} × {CELL_PX} px", fontsize=10)
             figure.colorbar(shown, ax=axis, label="px")
@@ -310,7 +312,7 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
         for axis, image, title, style in (
             (line[0], tile.left, f"{tile.name} ({row['class']}): left", gray),
             (line[1], scaled, "right", gray),
-            (line[2], tile.disparity, "disparity (px)", {"cmap": "turbo"}),
+            (line[2], tile.disparity, "disparity (px)", {"cmap": pictures.DISPARITIES}),
             (
                 line[3],
                 tile.sums.match(tile.warped),
@@ -321,10 +323,10 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
                 line[4],
                 difference,
                 "left − warped right",
-                {"cmap": "RdBu", "vmin": -spread, "vmax": spread},
+                {"cmap": pictures.DIFFERENCES, "vmin": -spread, "vmax": spread},
             ),
         ):
-            axis.set_facecolor("black")
+            axis.set_facecolor("black" if style is gray else np.array(pictures.NO_VALUE) / 255)
             axis.set(xticks=[], yticks=[])
             shown = axis.imshow(image[::step, ::step], interpolation="nearest", **style)
             axis.set_title(title, fontsize=9)

@@ -13,6 +13,7 @@ from ..epipolar.warping import CorrelationSum, agreement, warp_window
 from ..errors import InputError
 from ..products.files import replacing
 from ..products.grids import blocks, open_grid
+from ..products.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
 
 BLOCK = 1024  # px
 
@@ -83,12 +84,12 @@ def draw_panels(tile: WarpedTile, path: str | Path) -> None:
         (
             difference,
             "left − warped right, brought to its brightness",
-            {"cmap": "RdBu", "vmin": -spread, "vmax": spread},
+            {"cmap": DIFFERENCES, "vmin": -spread, "vmax": spread},
         ),
-        (tile.disparity, "disparity (px)", {"cmap": "turbo"}),
+        (tile.disparity, "disparity (px)", {"cmap": DISPARITIES}),
     )
     for ax, (image, title, style) in zip(axes.ravel(), panels):
-        ax.set_facecolor("black")
+        ax.set_facecolor("black" if style is gray else np.array(NO_VALUE) / 255)
         shown = ax.imshow(image, interpolation="nearest", **style)
         ax.set_title(f"{tile.name}: {title}")
         if style is not gray:

@@ -13,12 +13,27 @@ ABBREVIATIONS = {"gcp": "GCP", "sift": "SIFT", "lidar": "LiDAR", "nmad": "NMAD"}
 
 
 @dataclass(frozen=True)
+class Headline:
+    """One of the figures on top: what, how much, a remark, and whether it misses a limit."""
+
+    title: str
+    value: str
+    note: str = ""
+    bad: bool = False
+
+
+@dataclass(frozen=True)
 class Cell:
-    """A value of a table: what is shown, what it is sorted by, and whether it misses a limit."""
+    """A value of a table: what is shown, what it is sorted by, whether it misses a limit.
+
+    ``best``: whether it is the best of its kind; ``href``: where a click leads.
+    """
 
     text: str
     key: str
     bad: bool = False
+    best: bool = False
+    href: str = ""
 
 
 @dataclass(frozen=True)
@@ -125,6 +140,15 @@ def missed(row: Mapping[str, Any]) -> list[str]:
     """Names of the quality gates that a tile of the manifest misses."""
     text = row.get("quality") or "ok"
     return [] if text == "ok" else [name.strip() for name in text.split(";") if name.strip()]
+
+
+def metres(value_px: float, height_m_per_px: float | None, *, what: str = "height") -> str:
+    """A disparity in px as metres of height, to two digits; nothing where the ratio is unknown."""
+    if height_m_per_px is None:
+        return ""
+    value = abs(value_px) * height_m_per_px
+    text = f"{value:.0f}" if value >= 10 else f"{value:#.2g}"
+    return f"{text} m of {what}"
 
 
 def spread(values: Iterable[float | None], form: str) -> str:

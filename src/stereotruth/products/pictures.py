@@ -1,6 +1,8 @@
 """Arrays to 8-bit pictures, pictures to data URIs, figures to files.
 
-Disparities are drawn in ``turbo``; pixels without a value are dark grey.
+Disparities are drawn in ``DISPARITIES``, differences in ``DIFFERENCES``: maps of colours that tell
+without red and green, and whose lightness alone tells in print. Pixels without a value are light
+grey.
 """
 
 from __future__ import annotations
@@ -21,7 +23,10 @@ from .files import replacing
 Picture = NDArray[np.uint8]
 
 
-NO_VALUE = (64, 64, 64)
+DISPARITIES, DIFFERENCES, ERRORS = "viridis", "RdBu", "inferno"
+NO_VALUE = (226, 229, 233)
+# Of methods, kinds and the like: apart for all eyes, on white as on black, and by lightness
+SERIES = ("#0259cb", "#bc6e19", "#5db6f9", "#f9be00", "#2a643c", "#914f8b")
 
 
 def stretch(
@@ -42,9 +47,9 @@ def stretch(
 
 
 def colours(
-    values: ArrayLike, limits: tuple[float, float] | None = None, cmap: str = "turbo"
+    values: ArrayLike, limits: tuple[float, float] | None = None, cmap: str = DISPARITIES
 ) -> Picture:
-    """Colour picture uint8[h, w, 3]; NaN is dark grey, limits default to percentiles 1 and 99."""
+    """Colour picture uint8[h, w, 3]; NaN is light grey, limits default to percentiles 1 and 99."""
     values = np.asarray(values, dtype=np.float32)
     valid = np.isfinite(values)
     if limits is None:

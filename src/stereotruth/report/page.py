@@ -13,16 +13,19 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from ..dataset import quick_looks
 from ..dataset.manifest import read_manifest
+from ..dataset.pixel_size import PixelSize
 from ..job import progress
 from ..products import pictures
-from ..products.files import read_table, replacing
-from ..products.html_tables import gate, minus, missed, table, words
+from ..products.files import read_table
+from ..products.html_page import way, write_page
+from ..products.html_tables import missed, table
 from . import drawings, sections, tile_pictures
+from .ground_map import ground_map
+from .headlines import headlines
 from .settings import Settings
 
 PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
@@ -32,6 +35,7 @@ COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
 # At most, however few there are:
 FIGURE_BYTES, THUMBNAIL_BYTES, SLIDER_BYTES = 600_000, 24_000, 200_000
 KINDS = ("left", "right", "disparity", "status")
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
 LARGE = ("slider_left", "slider_warped", "slider_difference", "slider_disparity")
 
 
@@ -62,12 +66,38 @@ def _allowance(share: str, count: int, most: int) -> int:
     return min(most, int(PICTURE_BYTES * BASE64 * SHARES[share] / max(count, 1)))
 
 
+def _files(
+    page: str | Path,
+    tiles: Path,
+    truth: str | Path | None,
+    table4: str | Path | None,
+    sift: str | Path | None,
+) -> list[tuple[str, str, str]]:
+    """Name, way and meaning of the files that the page is made of, those that are there."""
+    every = (
+        (tiles, "tiles", "left, right, disp, status, orientation"),
+        (tiles / "manifest.csv", "manifest.csv", "one row per tile"),
+        (tiles / "footprints.geojson", "footprints.geojson", "with a style for QGIS"),
+        (tiles / "export.json", "export.json", "figures, limits, parameters"),
+        (truth, "truth.csv", "labels against the exact truth"),
+        (table4, "table4.csv", "SIFT matches, as table 4 of the paper"),
+        (sift, "sift.csv", "the same by scene and tile"),
+    )
+    return [
+        (name, str(way(page, file)), text)
+        for file, name, text in every
+        if file is not None and Path(file).exists()
+    ]
+
+
 def write_report(
     city: str,
     tiles: str | Path,
     out: str | Path,
     *,
+    index: str | Path | None = None,
     coverage: str | Path | None = None,
+    looks: Mapping[str, str | Path] | None = None,
     alignments: Mapping[str, str | Path] | None = None,
     refinements: Mapping[str, str | Path] | None = None,
     refinement_figures: Mapping[str, str | Path] | None = None,
@@ -82,10 +112,12 @@ def write_report(
 ) -> None:
     """Write the page of a city from its exported ``tiles``.
 
-    ``coverage`` is the coverage map (PNG); ``alignments``, ``refinements``: alignment.json by
-    scene, after the fit to the GCPs and after refinement; ``refinement_figures``: refinement.png
-    by scene; ``truth``, ``truth_table``: truth.json and truth.csv; ``table4``, ``sift``: table4.csv
-    and sift.csv with their ``sift_figure`` (PNG). ``sliders``: most tiles with large pictures.
+    ``index``: the page of all pages; ``coverage`` is the coverage map (PNG); ``looks``:
+    georeferenced pictures of the left images by scene; ``alignments``, ``refinements``:
+    alignment.json by scene, after the fit to the GCPs and after refinement;
+    ``refinement_figures``: refinement.png by scene; ``truth``, ``truth_table``: truth.json and
+    truth.csv; ``table4``, ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG).
+    ``sliders``: most tiles with large pictures.
     Whatever is None or missing leaves its section out.
 
     Raises InputError if there is no manifest.
@@ -127,7 +159,20 @@ def write_report(
             for name, share in sections.status_shares(row).items():
                 total[name] += share / len(labelled)
 
-    wide = [coverage, sift_figure, *(refinement_figures or {}).values()]
+    looks = {scene: Path(file) for scene, file in (looks or {}).items() if Path(file).is_file()}
+    orientations = {
+        scene: [
+            folder / row["orientation"]
+            for row in rows
+            if row["scene"] == scene and row["complete"] == "yes" and row.get("orientation")
+        ]
+        for scene in dict.fromkeys(row["scene"] for row in rows)
+    }
+    sizes = {
+        scene: size for scene, of in orientations.items() if (size := PixelSize.mean(of[:20:4]))
+    }
+    height = max((size.height_m for size in sizes.values()), default=None)
+    wide = [coverage, *looks.values(), sift_figure, *(refinement_figures or {}).values()]
     allowed = _allowance("figures", len(wide), FIGURE_BYTES)
 
     def embedded(file: str | Path | None, side: int) -> str | None:
@@ -137,7 +182,11 @@ def write_report(
 
     values = {
         "city": city,
-        "headlines": sections.headlines(rows, records, refined, truth_rows, quality),
+        "index": way(out, index),
+        "headlines": headlines(rows, records, refined, truth_rows, quality, height),
+        "sizes": sizes,
+        "height_m_per_px": height,
+        "links": _files(out, folder, truth_table, table4, sift),
         "rows": rows,
         "made": made,
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
@@ -145,12 +194,13 @@ def write_report(
         "total": total,
         "status_colours": tile_pictures.status_colours(statuses),
         "split_colours": quick_looks.SPLIT_COLOURS,
-        "turbo": pictures.gradient("turbo"),
-        "diverging": pictures.gradient("RdBu"),
+        "disparities": pictures.gradient(pictures.DISPARITIES),
+        "diverging": pictures.gradient(pictures.DIFFERENCES),
         "no_match": f"rgb{tile_pictures.NO_MATCH}",
         "no_difference": f"rgb{tile_pictures.NO_DIFFERENCE}",
         "coverage": embedded(coverage, COVERAGE_PX),
-        "index": sections.tile_index(rows),
+        "windows": sections.tile_index(rows),
+        "ground": ground_map(folder, rows, looks.values(), allowed),
         "residuals": sections.residuals(
             records,
             refined,
@@ -180,13 +230,4 @@ def write_report(
         "few_large": len(large) < len(labelled),
         "large_count": len(large),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"words": words, "minus": minus, "gate": gate}
-    with replacing(out) as scratch, scratch.open("w", encoding="utf-8") as stream:
-        environment.get_template("page.html.jinja").stream(values).dump(stream)
+    write_page(out, TEMPLATE, values)

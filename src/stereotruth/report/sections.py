@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,18 +11,7 @@ import numpy as np
 from ..dataset import quick_looks
 from ..dataset.manifest import Tile
 from ..dataset.split_names import NONE, SPLITS
-from ..products.html_tables import (
-    Table,
-    cells_of,
-    columns_of,
-    limit,
-    minus,
-    missed,
-    number,
-    spread,
-    table,
-    words,
-)
+from ..products.html_tables import Table, cells_of, columns_of, limit, missed, table, words
 from . import drawings
 from .tile_pictures import TilePictures
 
@@ -44,126 +32,6 @@ PUBLISHED = (
     ("Hengyang", "building", 22, 1139, -0.03, 0.32),
     ("US3D", "building", 49, 3750, -0.20, 0.89),
 )
-
-
-@dataclass(frozen=True)
-class Headline:
-    """One of the figures on top: what, how much, a remark, and whether it misses a limit."""
-
-    title: str
-    value: str
-    note: str = ""
-    bad: bool = False
-
-
-def headlines(
-    rows: Sequence[Mapping[str, str]],
-    alignments: Mapping[str, Mapping[str, Any]],
-    refined: Mapping[str, Mapping[str, Any]],
-    truth: Sequence[Mapping[str, str]],
-    quality: Mapping[str, Any],
-) -> list[Headline]:
-    """The figures on top of the page; those whose input is missing are left out."""
-    labelled = [row for row in rows if row["complete"] == "yes"]
-    counts = [(s, sum(row["split"] == s for row in labelled)) for s in (*SPLITS, NONE)]
-    found = [
-        Headline(
-            "labelled pairs",
-            str(len(labelled)),
-            ", ".join(f"{n} {s}" for s, n in counts if n),
-        )
-    ]
-    if len(rows) > len(labelled):
-        found.append(Headline("pairs without full labels", str(len(rows) - len(labelled))))
-    shares = [number(row["labelled_share"]) for row in labelled]
-    known = [s for s in shares if s is not None]
-    if known:
-        percent = spread([100 * s for s in known], ".0f")
-        found.append(
-            Headline("pixels labelled", f"{100 * np.mean(known):.1f} %", f"per tile {percent} %")
-        )
-    low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
-    high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
-    if low and high:
-        found.append(
-            Headline("disparities", minus(f"{min(low):.0f} … {max(high):.0f} px"), "of the tiles")
-        )
-    if alignments:
-
-        def rms(records: Mapping[str, Mapping[str, Any]], which: str) -> str:
-            values = [
-                record.get(view, {}).get("rms", {}).get(which)
-                for record in records.values()
-                for view in ("left", "right")
-            ]
-            return spread(values, ".2f")
-
-        note = f"{rms(alignments, 'before')} px before"
-        if refined:
-            note += f", {rms(refined, 'after')} px after refinement"
-        found.append(Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note))
-
-    ties = [record.get("refinement", {}) for record in refined.values()]
-    if any(tie.get("after") for tie in ties):
-
-        def parallax(when: str) -> str:
-            values = [tie.get(when, {}).get("y_parallax", {}).get("rms") for tie in ties]
-            return spread(values, ".2f")
-
-        note = f"rms; {parallax('before')} px before refinement"
-        found.append(Headline("y-parallax of tie points", f"{parallax('after')} px", note))
-
-    def column(name: str) -> list[float]:
-        return [v for row in labelled if (v := number(row.get(name, ""))) is not None]
-
-    if column("y_parallax_rms_px"):
-        values = column("y_parallax_rms_px")
-        found.append(
-            Headline(
-                "y-parallax of matches",
-                f"{np.median(values):.2f} px",
-                f"rms, median of tiles; {spread(values, '.2f')} px",
-            )
-        )
-    if column("sift_mean_absolute_error_px"):
-        values = column("sift_mean_absolute_error_px")
-        count = int(sum(column("sift_matches")))
-        found.append(
-            Headline(
-                "SIFT, mean absolute error",
-                f"{np.mean(values):.2f} px",
-                f"mean of {len(values)} tiles, {count} matches",
-            )
-        )
-    if column("warp_correlation"):
-        values = column("warp_correlation")
-        found.append(
-            Headline(
-                "left and warped right",
-                f"{np.median(values):.3f}",
-                f"correlation, median of tiles; {spread(values, '.3f')}",
-            )
-        )
-    by_scope = {row["scope"]: row for row in truth}
-    best = by_scope.get("tiles") or by_scope.get("scene") or {}
-    for title, name, form, factor, unit, note in (
-        ("error against the truth", "mean_absolute_px", ".3f", 1, " px", "mean absolute"),
-        ("off by more than 1 px", "share_over_1_px", ".3f", 100, " %", "of the labels, by truth"),
-        ("visible pixels labelled", "share_of_visible_labelled", ".2f", 100, " %", "by truth"),
-        ("hidden pixels labelled", "share_of_hidden_labelled", ".2f", 100, " %", "by truth"),
-        ("y-parallax", "y_parallax_rms_px", ".3f", 1, " px", "rms, by truth"),
-        ("within uncertainty", "share_below_1_uncertainty", ".1f", 100, " %", "68.3 % is right"),
-    ):
-        value = number(best.get(name, ""))
-        if value is not None:
-            found.append(Headline(title, minus(format(factor * value, form)) + unit, note))
-    if rows and "quality" in rows[0]:
-        bad = sum(bool(missed(row)) for row in labelled)
-        scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
-        note = f"and {', '.join(scenes)} as a whole" if scenes else ""
-        text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
-        found.append(Headline("quality gates", text, note, bool(bad or scenes)))
-    return found
 
 
 def residuals(
@@ -294,7 +162,9 @@ def tile_index(rows: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
                 "y": y - top,
                 "size": size,
                 "complete": row["complete"] == "yes",
-                "colour": quick_looks.SPLIT_COLOURS.get(row["split"], "#7f7f7f"),
+                "colour": quick_looks.SPLIT_COLOURS.get(
+                    row["split"], quick_looks.SPLIT_COLOURS[NONE]
+                ),
                 "bad": bool(missed(row)),
             }
             for row, (x, y, size) in zip(here, boxes)

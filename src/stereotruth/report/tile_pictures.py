@@ -18,21 +18,20 @@ NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
 GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
 DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
-STATUS_COLOURS = {
-    "labelled": "#e8f1f8",
-    "no_points": "#26262b",
-    "hidden_in_left": "#f5a55a",
-    "hidden_in_right": "#d1495b",
-    "low_correlation": "#6a4c93",
-    "changed": "#edd03c",
-    "out_of_frame": "#8d99a6",
-    "masked": "#3d5a80",
-    "below_minimum_count": "#9c6b4f",
-    "edge_in_pixel": "#2a9d8f",
-    "labelled_between": "#bcd4e6",
-    "labelled_by_images": "#d9c8e8",
+STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
+    "labelled": "#eef3f7",
+    "no_points": "#1c1c22",
+    "hidden_in_left": "#d09230",
+    "hidden_in_right": "#a2006a",
+    "low_correlation": "#5e41ed",
+    "changed": "#effa51",
+    "out_of_frame": "#b7928d",
+    "masked": "#172d93",
+    "below_minimum_count": "#6a6028",
+    "edge_in_pixel": "#2183d5",
+    "labelled_between": "#aab1dc",
+    "labelled_by_images": "#ffe9b8",
 }
-OTHER_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#937860", "#da8bc3", "#8c8c8c")
 
 
 @dataclass
@@ -54,7 +53,7 @@ class TilePictures:
 def status_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
     unknown = [name for name in names if name not in STATUS_COLOURS]
-    other = {name: OTHER_COLOURS[k % len(OTHER_COLOURS)] for k, name in enumerate(unknown)}
+    other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
     return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
 
 
@@ -121,7 +120,9 @@ def tile_pictures(
     large = {
         "slider_left": _shown(left, limits),
         "slider_warped": np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
-        "slider_difference": pictures.colours(tile.left - matched, (-spread, spread), "RdBu"),
+        "slider_difference": pictures.colours(
+            tile.left - matched, (-spread, spread), pictures.DIFFERENCES
+        ),
         "slider_disparity": coloured,
     }
     large["slider_warped"][nothing] = NO_MATCH

@@ -8,6 +8,7 @@ import pytest
 
 from stereotruth.command.pages import pages
 from stereotruth.errors import InputError
+from stereotruth.products.html_page import INDEX
 
 
 def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
@@ -18,7 +19,8 @@ def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
     for page in there:
         page.parent.mkdir(parents=True)
         page.touch()
-    assert pages() == there
+    assert pages() == [INDEX, *there]  # the index first, which is what opens
+    assert "us3d" in INDEX.read_text(encoding="utf-8")
     assert pages(["A"]) == there[1:]
     with pytest.raises(InputError, match="no page of B"):
         pages(["B"])

@@ -12,7 +12,7 @@ from rasterio.features import rasterize
 from rasterio.transform import from_bounds
 
 from stereotruth.dataset.footprints import FOOTPRINTS, STYLE, read_footprints
-from stereotruth.dataset.orientation import evaluate
+from stereotruth.dataset.polynomials import evaluate
 from stereotruth.dataset.quick_looks import SPLIT_COLOURS
 from stereotruth.dataset.verify import defects
 

@@ -42,7 +42,7 @@ def test_a_quick_look_shows_what_is_there(tmp_path, colour) -> None:
         assert dataset.transform == to_map
         known = dataset.read(4) > 0
         assert known.mean() == pytest.approx(0.9 * shown.mean(), abs=0.05)
-        low, high = (dataset.read(k)[known].astype(float) for k in (3, 1))  # turbo: blue to red
+        green = dataset.read(2)[known].astype(float)  # of viridis it grows throughout
     rows, cols = np.nonzero(known)
     height = terrain(*back.transform(*(to_map * (cols + 0.5, rows + 0.5))))
-    assert abs(np.corrcoef(high - low, height)[0, 1]) > 0.8
+    assert np.corrcoef(green, height)[0, 1] > 0.8

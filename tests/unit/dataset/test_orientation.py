@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.dataset.orientation import evaluate
+from stereotruth.dataset.polynomials import evaluate
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rpc import RPC

@@ -10,8 +10,8 @@ import pytest
 import rasterio
 from rasterio.transform import RPCTransformer
 
-from stereotruth.dataset.orientation import evaluate
 from stereotruth.dataset.originals import write_originals
+from stereotruth.dataset.polynomials import evaluate
 from stereotruth.dataset.verify import defects
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc

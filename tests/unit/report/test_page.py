@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
+from stereotruth.products.html_page import PAPER
 from stereotruth.report import page
 
 from ...browser import look, needs_chromium, screenshot
@@ -40,7 +41,7 @@ def refinement(path: Path, applied: bool) -> Path:
 def made(tmp_path_factory) -> Path:
     """A page with everything that may be there, of 5 labelled tiles."""
     folder = tmp_path_factory.mktemp("city")
-    sift = [0.3, 0.4, 0.5, 0.2, 0.1, ""]
+    sift = [0.3, 0.4, 0.5, 0.2, 0.1, ""]  # of tiles
     write_city(
         folder / "tiles",
         5,
@@ -48,6 +49,10 @@ def made(tmp_path_factory) -> Path:
         sift_mean_absolute_error_px=sift,
         sift_matches=[10, 20, 30, 40, 50, ""],
     )
+    scene = {"sift_matches": 150, "sift_mean_absolute_error_px": 0.2667, "quality": "ok"}
+    export = json.loads((folder / "tiles/export.json").read_text())
+    export |= {"quality": {"scenes": {"S-1": scene}}}
+    (folder / "tiles/export.json").write_text(json.dumps(export))
     coverage = folder / "coverage.png"
     cv2.imwrite(str(coverage), np.full((60, 90, 3), 200, np.uint8))
     (folder / "truth.csv").write_text(
@@ -74,6 +79,7 @@ def made(tmp_path_factory) -> Path:
         CITY,
         folder / "tiles",
         out,
+        index=folder / "index.html",
         coverage=coverage,
         alignments={"S-1": alignment(folder / "alignment.json")},
         refinements={"S-1": refinement(folder / "refined.json", applied=True)},
@@ -115,8 +121,13 @@ def test_nothing_on_the_page_asks_for_a_file_or_the_network(made):
     text = made.read_text()
     sources = re.findall(r"""(?:src|href|srcset|data|action)\s*=\s*["']([^"']*)""", text)
     assert sources
-    assert all(s.startswith(("data:image/webp;base64,", "#")) for s in sources)
-    assert not re.search(r"https?://|url\((?!#)|@import|<link|fetch\(|XMLHttp", text)
+    links = re.findall(r'<a (?:class="[^"]*" )?href="([^"#][^"]*)"', text)  # asked for by a click
+    others = [s for s in sources if s not in links]
+    assert all(s.startswith(("data:image/webp;base64,", "#")) for s in others)
+    here = [link for link in links if link != PAPER]
+    assert here and all((made.parent / link).exists() for link in here if link != "../index.html")
+    assert not re.search(r"url\((?!#)|@import|<link|fetch\(|XMLHttp", text)
+    assert set(re.findall(r"https?://[^\"<]*", text)) == {PAPER}
 
 
 def test_text_is_escaped(made):
@@ -141,9 +152,9 @@ def test_headlines_and_tables_say_what_the_files_say(made):
     text = made.read_text()
     heads = dict(re.findall(r'<dt>(.*?)</dt><dd class="value">(.*?)</dd>', text))
     assert heads["labelled pairs"] == "5"
-    assert heads["pairs without full labels"] == "1"
+    assert "1 more without full labels" in text
     assert heads["GCP residuals, rms"] == "0.79 px"
-    assert heads["SIFT, mean absolute error"] == "0.30 px"  # of 0.3, 0.4, 0.5, 0.2, 0.1
+    assert heads["SIFT matches less labels"] == "0.27 px"  # of the scene, not the mean of tiles
     assert heads["error against the truth"] == "0.125 px"  # of the tiles, not the whole scene
     assert "hidden pixels labelled" not in heads  # empty for the tiles
     status = re.search(r"What became of the pixels.*?</table>", text, re.DOTALL)[0]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.dataset.quick_looks import SPLIT_COLOURS
 from stereotruth.products.rasters import write_tiff
 from stereotruth.report import tile_pictures
 
+from ...synthetic.colour_vision import nearest, rgb
 from ...synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -43,3 +45,8 @@ def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
     )
     assert made.correlation < 0.9
     assert picture(made.uris["slider_difference"])[40:, 20:80].min(axis=2).mean() < 150
+
+
+def test_colours_of_status_and_splits_are_apart_for_all_eyes():
+    assert nearest([rgb(colour) for colour in tile_pictures.STATUS_COLOURS.values()]) > 20
+    assert nearest([rgb(colour) for colour in SPLIT_COLOURS.values()]) > 20

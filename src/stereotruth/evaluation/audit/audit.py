@@ -29,10 +29,11 @@ from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
 from ...products.files import replacing, whole_folder, write_table
 from ...products.finished_pieces import Ledger
+from ...products.html_page import way
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
-from .page import write_page
+from .page import write_audit
 from .pair import measure
 from .settings import Limits, Settings
 from .sharing import Features, Shared, features, find_shared
@@ -50,11 +51,14 @@ def audit(
     work: str | Path,
     workers: int = 1,
     code: str = "",
+    index: str | Path | None = None,
 ) -> dict[str, Any]:
     """Audit all pairs of a dataset into the folder ``out``; returns the summary.
 
     ``work``: where what was measured of each pair stays, for runs after a kill, with other limits
-    or with more pairs. Raises InputError if the dataset has no pairs or a file cannot be read.
+    or with more pairs; ``index``: the page of all pages, for a link.
+
+    Raises InputError if the dataset has no pairs or a file cannot be read.
     """
     out, work, limits = Path(out), Path(work), settings.limits
     pairs = dataset.pairs()
@@ -69,7 +73,8 @@ def audit(
         write_table(scratch / "pairs.csv", table_rows(audited))
         (scratch / "summary.json").write_text(text, encoding="utf-8")
         (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
-        write_page(scratch / "index.html", dataset, audited, summary, limits, settings.worst)
+        page, to_index = scratch / "index.html", way(out / "index.html", index)
+        write_audit(page, dataset, audited, summary, limits, settings.worst, index=to_index)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary

@@ -1,23 +1,25 @@
-"""The page of an audit: pooled figures, the worst pairs in pictures, a table of all pairs."""
+"""The page of an audit: all pairs in one picture, the worst in large, a table of all of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...dataset.stereo_dataset import StereoDataset
 from ...products import pictures
-from ...products.html_tables import minus, table
-from ...products.pictures import encode, gradient
+from ...products.charts import HEIGHT, SHAPES, WIDTH, Axis, Chart, Point, Series
+from ...products.html_page import write_page
+from ...products.html_tables import Cell, Column, Headline, Table, minus, table, words
+from ...products.pictures import SERIES, encode, gradient
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
-from .pair import EXTRA_PX
+from .pair import EXTRA_PX, estimate
 from .settings import Limits
 from .summary import Audited, table_rows
 from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED
@@ -29,6 +31,8 @@ DOT_PX = 3  # radius in the shown picture
 LIMIT_PX = 3.0  # ends of the colours of label less match
 ROW_LIMIT_PX = 1.5  # and of the vertical parallax
 ERRORS = "RdYlBu_r"
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
+LOOKS = {GOOD: (SERIES[0], 0), UNDECIDED: ("#8a8a8a", 1), FAULT: (SERIES[1], SHAPES - 1)}
 COLUMNS = (
     "pair",
     "city",
@@ -47,54 +51,56 @@ COLUMNS = (
 )
 
 
-def write_page(
+def write_audit(
     path: Path,
     dataset: StereoDataset,
     audited: Sequence[Audited],
     summary: Mapping[str, Any],
     limits: Limits,
     worst: int,
+    *,
+    index: str | None = None,
 ) -> None:
-    """Write the page; ``worst``: pairs that are shown in pictures."""
+    """Write the page; ``worst``: pairs that are shown in pictures; ``index``: the way to all pages.
+
+    ``path`` lies beside the audit's other files.
+    """
     order = sorted(audited, key=lambda a: (-a.severity(limits), a.pair.name))
     chosen = order[:worst]
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("stereotruth.evaluation.audit", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    rows = table_rows(audited)
-    html = environment.get_template("page.html.jinja").render(
-        name=dataset.name,
-        summary=summary,
-        headlines=_headlines(summary),
-        checks=[(CHECKS[name], counts) for name, counts in summary["checks"].items()],
-        pooled=table(_pooled_rows(summary)),
-        tiles=[_tile(dataset, a) for a in chosen],
-        pairs=table(rows, COLUMNS),
-        words=(FAULT, UNDECIDED, GOOD),
-        errors=gradient(ERRORS),
-        turbo=gradient("turbo"),
-        limit=LIMIT_PX,
-        row_limit=ROW_LIMIT_PX,
-    )
-    path.write_text(html, encoding="utf-8")
+    shown = {a.pair.name for a in chosen}
+    values = {
+        "index": index,
+        "name": dataset.name,
+        "summary": summary,
+        "links": [
+            ("pairs.csv", "pairs.csv", "every figure of every pair"),
+            ("summary.json", "summary.json", "the dataset as a whole"),
+            ("README.txt", "README.txt", "the same in words"),
+        ],
+        "headlines": headlines(summary),
+        "checks": _checks(summary),
+        "chart": all_pairs(audited, limits, shown),
+        "pooled": table(_pooled_rows(summary)),
+        "shared": _shared(summary),
+        "conventions": [
+            (words(name), ", ".join(f"{value} ({n} pairs)" for value, n in counts.items()))
+            for name, counts in summary["conventions"].items()
+        ],
+        "tiles": [_tile(dataset, a) for a in chosen],
+        "pairs": _pairs(audited, shown),
+        "errors": gradient(ERRORS),
+        "disparities": gradient(pictures.DISPARITIES),
+    }
+    write_page(path, TEMPLATE, values)
 
 
-def _headlines(summary: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Title, value, note, whether it is bad."""
+def headlines(summary: Mapping[str, Any]) -> list[Headline]:
+    """The figures on top."""
     verdicts, pooled = summary["verdicts"], summary["pooled"]
     faulty = verdicts[FAULT]
-    found = [
-        (
-            "pairs without fault",
-            f"{verdicts[GOOD]} of {summary['pairs']}",
-            f"{faulty} faulty, {verdicts[UNDECIDED]} undecided",
-            faulty > 0,
-        )
-    ]
+    value = f"{verdicts[GOOD]} of {summary['pairs']}"
+    note = f"{faulty} faulty, {verdicts[UNDECIDED]} undecided"
+    found = [Headline("pairs without fault", value, note, faulty > 0)]
     limits = summary["limits"]
     for name, title, tolerance, share in (
         ("parallax_px", "vertical parallax", limits["parallax_px"], False),
@@ -109,15 +115,113 @@ def _headlines(summary: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
             value = ends[0] if ends[0] == ends[1] else " … ".join(ends)
             note = f"mean {form(of['mean'])}; tolerance {form(tolerance).lstrip('+')}"
             bad = max(abs(of["least"]), abs(of["most"])) > tolerance
-            found.append((title, minus(value), minus(note), bad))
+            found.append(Headline(title, minus(value), minus(note), bad))
     return found
+
+
+def all_pairs(audited: Sequence[Audited], limits: Limits, linked: set[str]) -> Chart | None:
+    """All pairs that have both: label bias over vertical parallax, px; the box is tolerated.
+
+    ``linked``: names of pairs that the page shows in large.
+    """
+    at = {
+        a.pair.name: tuple(
+            estimate(a.figures, *where).value for where in (("rows", "parallax"), ("bias", "bias"))
+        )
+        for a in audited
+    }
+    at = {name: values for name, values in at.items() if np.isfinite(values).all()}
+    if not at:
+        return None
+    tolerances = limits.parallax_px, limits.label_bias_px
+    ends = [
+        1.3 * max(3 * tolerance, *(abs(values[k]) for values in at.values()))
+        for k, tolerance in enumerate(tolerances)
+    ]
+    x = Axis(-ends[0], ends[0], WIDTH, linear_to=tolerances[0] / 3)
+    y = Axis(-ends[1], ends[1], HEIGHT, turned=True, linear_to=tolerances[1] / 3)
+    series = []
+    for word, (colour, shape) in LOOKS.items():
+        points = tuple(
+            Point(
+                x.at(at[a.pair.name][0]),
+                y.at(at[a.pair.name][1]),
+                minus(
+                    f"{a.pair.name}: parallax {at[a.pair.name][0]:+.2f} px, "
+                    f"labels less matches {at[a.pair.name][1]:+.2f} px"
+                ),
+                href=f"#pair-{a.pair.name}" if a.pair.name in linked else "",
+            )
+            for a in audited
+            if a.verdict.word == word and a.pair.name in at
+        )
+        if points:
+            series.append(Series(f"{word}: {len(points)}", colour, shape, points=points))
+    left, right = x.at(-tolerances[0]), x.at(tolerances[0])
+    top, bottom = y.at(tolerances[1]), y.at(-tolerances[1])
+    without = len(audited) - len(at)
+    return Chart(
+        title="all pairs: labels less matches over vertical parallax",
+        caption="A mark is a pair; within the box both are tolerated (faults of other kinds may "
+        "lie there, too). Linear near zero, logarithmic beyond."
+        + (f" {without} pairs have not both figures." if without else ""),
+        x_title="vertical parallax, px",
+        y_title="labels less matches, px",
+        x_ticks=x.ticks(),
+        y_ticks=y.ticks(),
+        series=tuple(series),
+        band=(left, top, round(right - left, 1), round(bottom - top, 1)),
+    )
+
+
+def _checks(summary: Mapping[str, Any]) -> Table:
+    lines = tuple(
+        (
+            Cell(CHECKS[name], CHECKS[name]),
+            Cell(str(counts[FAULT]), str(counts[FAULT]), bad=counts[FAULT] > 0),
+            Cell(str(counts[UNDECIDED]), str(counts[UNDECIDED])),
+        )
+        for name, counts in summary["checks"].items()
+    )
+    titles = ("what a pair must have", "pairs without", "undecided")
+    return Table(tuple(Column(t, k > 0) for k, t in enumerate(titles)), (("", lines),))
+
+
+def _shared(summary: Mapping[str, Any]) -> Table | None:
+    rows = [
+        {
+            "pair": of["first"],
+            "split": of["first_split"],
+            "other pair": of["second"],
+            "its split": of["second_split"],
+            "matches": str(of["matches"]),
+            "share_of_the_ground": str(of["share"]),
+        }
+        for of in summary["shared"]
+    ]
+    return table(rows)
+
+
+def _pairs(audited: Sequence[Audited], shown: set[str]) -> Table:
+    """The table of all pairs; each fault has its line, and a click leads to the pictures."""
+    rows = table_rows(audited)
+    for row, a in zip(rows, audited):
+        row["faults"] = minus("\n".join(f.text.replace("; ", "\n") for f in a.verdict.of(FAULT)))
+    found = table(rows, COLUMNS)
+    assert found is not None
+    ((heading, lines),) = found.groups
+    linked = (
+        (replace(name, href=f"#pair-{name.text}" if name.text in shown else ""), *others)
+        for name, *others in lines
+    )
+    return Table(found.columns, ((heading, tuple(linked)),))
 
 
 def _pooled_rows(summary: Mapping[str, Any]) -> list[dict[str, str]]:
     rows = []
     for name, of in summary["pooled"].items():
         text = {k: "" if of[k] is None else f"{of[k]:.4f}" for k in of if k != "pairs"}
-        rows.append({"figure": name, "pairs": str(of["pairs"]), **text})
+        rows.append({"figure": words(name), "pairs": str(of["pairs"]), **text})
     return rows
 
 
@@ -145,9 +249,10 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         "split": a.pair.split,
         "word": a.verdict.word,
         "findings": [
-            (f.level, minus(f.text))
+            (f.level, minus(text))
             for level in (FAULT, UNDECIDED, NOTE)
             for f in a.verdict.of(level)
+            for text in f.text.split("; ")
         ],
         "pictures": [],
     }
@@ -162,7 +267,7 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
     if labels is not None and np.isfinite(labels).any():
         low, high = (float(v) for v in np.nanpercentile(labels, (1, 99)))
         coloured = pictures.colours(labels, (low, high))
-        add("labels", coloured, (minus(f"{low:.0f} px"), "turbo", minus(f"{high:.0f} px")))
+        add("labels", coloured, (minus(f"{low:.0f} px"), "labels", minus(f"{high:.0f} px")))
     if "rows" not in a.figures:
         return found
     reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX

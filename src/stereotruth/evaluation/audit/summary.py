@@ -169,7 +169,7 @@ def _conventions(audited: Sequence[Audited]) -> dict[str, Any]:
 
 def _figure(figures: Mapping[str, Any], share: bool) -> str:
     def show(value: float) -> str:
-        return f"{100 * value:.1f} %" if share else f"{value:+.2f} px".replace("-", "−")
+        return (f"{100 * value:.1f} %" if share else f"{value:+.2f} px").replace("-", "−")
 
     text = f"{show(figures['mean'])} in the mean"
     if figures["low"] is not None:

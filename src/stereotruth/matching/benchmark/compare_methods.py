@@ -11,7 +11,7 @@ import numpy as np
 from ...dataset.stereo_dataset import StereoDataset
 from ...products.rasters import read_image
 from .differences import differences
-from .page import write_page
+from .page import write_benchmark
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction
 from .score_method import choose
@@ -32,11 +32,12 @@ def compare(
     out: str | Path,
     *,
     seed: int,
+    index: str | Path | None = None,
 ) -> None:
     """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
 
     ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
-    intervals of differences come from.
+    intervals of differences come from; ``index``: the page of all pages, for a link.
     """
     out = Path(out)
     methods = read_scores(scores)
@@ -61,12 +62,9 @@ def compare(
             )
         )
     draw_columns(out / "figure10.png", columns)
-    panels = {
-        of["label"]: sorted((Path(folder) / "panels").glob("*.png"))
-        for of, folder in zip(methods, scores)
-    }
-    panels = {label: files for label, files in panels.items() if files}
-    write_page(out / "index.html", dataset.name, methods, tables, out / "figure10.png", panels)
+    write_benchmark(
+        out / "index.html", dataset.name, methods, tables, scores, out / "figure10.png", index=index
+    )
     for line in tables[0].markdown().splitlines():
         if line.startswith("|"):
             log.info(line)

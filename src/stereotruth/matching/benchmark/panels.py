@@ -1,6 +1,6 @@
 """Pictures of disparity maps beside each other, after figure 10 of the paper.
 
-All disparities of a figure have one colour scale, all errors another. What has no value is dark
+All disparities of a figure have one colour scale, all errors another. What has no value is light
 grey; in maps of errors, a labelled pixel without a disparity has a colour of its own.
 """
 
@@ -17,7 +17,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ...products.pictures import NO_VALUE, colours, save_figure, shrink, stretch
+from ...products.pictures import (
+    DISPARITIES,
+    ERRORS,
+    NO_VALUE,
+    colours,
+    save_figure,
+    shrink,
+    stretch,
+)
 
 Disparity = NDArray[np.float32]
 Picture = NDArray[np.uint8]
@@ -27,7 +35,6 @@ SIDE_PX = 400  # of a picture
 INCHES, DPI = 3.2, 120
 ERROR_PX = 6.0  # end of the scale of errors: twice the threshold of D1
 INVALID = (60, 190, 255)
-ERRORS = "inferno"
 
 
 @dataclass(frozen=True)
@@ -128,7 +135,7 @@ def _legend(
     if errors:
         patches.append(Patch(color=np.array(INVALID) / 255, label="labelled, without disparity"))
     for cmap, ends, label, of in (
-        ("turbo", limits, "disparity, px", shown),
+        (DISPARITIES, limits, "disparity, px", shown),
         (ERRORS, (0.0, ERROR_PX), "absolute error, px", errors),
     ):
         if of:

@@ -5,6 +5,7 @@ cities.csv   a row per city, and one of all, with 95 % confidence intervals
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
 scores.json  all of it but the tiles, with settings, time and memory, and of methods that state
              uncertainties what :mod:`.confidence` says of them by stratum
+cumulative.csv  the distribution of errors (see :mod:`.cumulative`)
 sparsification.csv  of such methods: mean errors by the share of pixels taken away
 panels/      pictures of tiles: left, right, truth, disparity, error
 """
@@ -24,10 +25,11 @@ from ...job import progress
 from ...products.files import whole_folder, write_table
 from ...products.rasters import read_image
 from .confidence import SHARES, Confidence
+from .cumulative import Cumulative
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction, read_record, read_uncertainty
 from .scores import ALL, Collector, Scorer, Scores
-from .strata import Products, exact_truth, label_strata
+from .strata import Products, exact_truth, height_m_per_px, label_strata
 
 log = logging.getLogger("stereotruth")
 
@@ -60,12 +62,15 @@ def score(
     scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
     collector = Collector(thresholds_px)
     confidences: dict[str, Confidence] = {}
+    cumulative = Cumulative(thresholds_px)
     drawn = {pair.name for pair in choose(pairs, panels)}
     with whole_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
             found, truth = read_prediction(predictions, pair), dataset.labels(pair)
             strata_of_labels = label_strata(pair, truth, products)
             exact_of_pair = exact_truth(pair, products)
+            here = scorer.counted(truth)
+            cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
             sums = scorer.sums(found, truth, strata_of_labels)
             for stratum, exact in exact_of_pair.items():
                 sums[stratum] = scorer.sums(found, exact)[ALL]
@@ -104,6 +109,7 @@ def score(
             "tiles": len(pairs),
             "thresholds_px": list(scores.thresholds_px),
             "bootstrap": bootstrap,
+            "height_m_per_px": height_m_per_px(pairs, products),
             "all": total,
             "cities": cities,
             "strata": strata,
@@ -116,6 +122,7 @@ def score(
         write_table(scratch / "scores.csv", tiles)
         write_table(scratch / "cities.csv", [*cities, total])
         write_table(scratch / "strata.csv", strata)
+        write_table(scratch / "cumulative.csv", cumulative.rows())
         if confidences:
             write_table(scratch / "sparsification.csv", _sparsification(confidences))
         text = json.dumps(summary, indent=2) + "\n"

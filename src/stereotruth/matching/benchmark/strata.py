@@ -18,6 +18,7 @@ the tile, scene and window; what is missing is left out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ import zarr
 from numpy.typing import NDArray
 
 from ...dataset.manifest import Tile
+from ...dataset.pixel_size import PixelSize
 from ...dataset.stereo_dataset import Pair, match_inside
 from ...products.grids import require_complete
 from ...products.rasters import read_flags
@@ -68,6 +70,19 @@ class Products:
             return None
         store = folder / pair.city / f"{pair.row['scene']}.zarr"
         return require_complete(store) if store.is_dir() else None
+
+
+def height_m_per_px(pairs: Sequence[Pair], products: Products) -> float | None:
+    """Metres of height for one px of disparity, mean of the pairs; None where no tile tells."""
+    if products.tiles is None:
+        return None
+    files = (
+        products.tiles / pair.city / "orientation" / f"{pair.row['tile']}.json"
+        for pair in pairs
+        if pair.row
+    )
+    size = PixelSize.mean(files)
+    return None if size is None else round(size.height_m, 4)
 
 
 def label_strata(pair: Pair, labels: NDArray[np.float32], products: Products) -> dict[str, Bools]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
+import re
 import warnings
 from dataclasses import replace
 
@@ -18,7 +20,10 @@ from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
+from stereotruth.products.html_page import PAPER
+from stereotruth.products.html_tables import minus
 
+from ....browser import CHROMIUM, look
 from ....synthetic.pair_with_block import make
 
 LIMITS = Settings(0.3, 0.3, 0.05, 0.01, 0.01)
@@ -139,10 +144,54 @@ def test_what_is_written(audited):
         "summary.json",
     ]
     page = (out / "index.html").read_text()
-    assert page.count("<section") == 3 and "data:image/webp" in page
-    assert "http" not in page.replace("http-equiv", "")
+    assert page.count('<article class="tile"') == 3 and "data:image/webp" in page
+    assert "http" not in page.replace("http-equiv", "").replace(PAPER, "")
     assert not list(out.parent.glob(".*"))
     assert summary["verdicts"] == {"good": 0, "undecided": 0, "fault": 11}
+
+
+def test_the_page_shows_all_pairs_in_one_picture(audited):
+    """A mark stands on the side of its label bias and parallax, beyond the box if it is a fault."""
+    rows, _ = read(audited[1])
+    page = (audited[1] / "index.html").read_text()
+    chart = re.search(r'<figure class="chart">.*?</figure>', page, re.DOTALL)[0]
+    said = dict(re.findall(r"<title>(\w+): (.*?)</title>", chart))
+    both = {name for name, row in rows.items() if row["parallax_px"] and row["label_bias_px"]}
+    assert set(said) == both and len(both) >= 8
+    for name in both:
+        parallax, bias = (float(rows[name][key]) for key in ("parallax_px", "label_bias_px"))
+        text = f"parallax {parallax:+.2f} px, labels less matches {bias:+.2f} px"
+        assert said[name] == minus(text)
+    marks = re.findall(r'<title>(\w+): .*?</title><path d="M([\d.]+) ([\d.]+)l8 8', chart)
+    at = {name: (float(x) + 4, float(y) + 4) for name, x, y in marks}
+    box = re.search(r'<rect x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)" class="band"', chart)
+    left, top, width, height = map(float, box.groups())
+    assert top <= at["KM_2"][1] <= top + height and at["KM_2"][0] > left + width
+    assert left <= at["KM_1"][0] <= left + width and at["KM_1"][1] < top
+
+
+def test_each_fault_has_its_line_and_a_click_sorts(audited, tmp_path):
+    rows, _ = read(audited[1])
+    page = (audited[1] / "index.html").read_text()
+    table = page[page.index('<section id="pairs">') :]
+    for name in ("KM_4", "KM_6"):
+        line = re.search(rf">{name}(?:</a>)?</td>.*?</tr>", table, re.DOTALL)[0]
+        faults = line.rpartition("<td")[2].partition(">")[2].partition("</td>")[0]
+        expected = rows[name]["faults"].replace("; ", "\n")
+        assert html.unescape(faults) == re.sub(r"-(?=\d)", "−", expected)
+    assert any("; " in row["faults"] for row in rows.values())
+    if CHROMIUM:
+        script = """
+        const table = document.querySelector("#pairs table");
+        const heads = [...table.tHead.rows[0].cells];
+        const column = heads.findIndex((c) => c.innerText == "label bias, px");
+        heads[column].querySelector("button").click();
+        const keys = [...table.tBodies[0].rows].map((r) => r.cells[column].dataset.key);
+        return keys.filter((key) => key).map(Number);
+        """
+        seen = look(audited[1] / "index.html", tmp_path, script)
+        assert seen.wrong == [] and seen.requests == []
+        assert len(seen.found) >= 8 and seen.found == sorted(seen.found)
 
 
 def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import rasterio
@@ -12,10 +14,13 @@ from stereotruth.disparity.status import Status
 from stereotruth.matching.benchmark.strata import (
     Products,
     exact_truth,
+    height_m_per_px,
     label_strata,
     match_in_tile,
     near_step,
 )
+
+from ....synthetic.flat_orientation import GSD, RATIO, orientation
 
 SIZE = 40
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -136,3 +141,13 @@ def test_what_is_missing_is_left_out(own, tmp_path):
     assert list(label_strata(pair, labels, Products())) == of_any_dataset
     assert exact_truth(bare, products) == exact_truth(pair, Products()) == {}
     assert exact_truth(pair, Products(truth=tmp_path / "none")) == {}
+
+
+def test_metres_of_height_come_from_the_orientation_of_the_tiles(own):
+    pair, products, _ = own
+    assert height_m_per_px([pair], products) is None  # no tile tells
+    file = products.tiles / pair.city / "orientation" / f"{pair.row['tile']}.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps(orientation()))
+    assert height_m_per_px([pair], products) == pytest.approx(GSD / RATIO, abs=1e-4)
+    assert height_m_per_px([pair], Products()) is None

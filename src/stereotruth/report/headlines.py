@@ -1,0 +1,146 @@
+"""The figures on top of a city's page, most important first; the page folds all but six.
+
+What images and control points say of a scene is as ``export.json`` has it and as the last lines of
+a run print it: over all matches and all labelled pixels of a scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..dataset.split_names import NONE, SPLITS
+from ..products.html_tables import Headline, metres, minus, missed, number, spread
+
+Rows = Sequence[Mapping[str, str]]
+Records = Mapping[str, Mapping[str, Any]]
+TRUTH = (  # title, column of the truth's table, form, factor, unit, remark
+    ("off by more than 1 px", "share_over_1_px", ".3f", 100, " %", "of the labels, by truth"),
+    ("visible pixels labelled", "share_of_visible_labelled", ".2f", 100, " %", "by truth"),
+    ("hidden pixels labelled", "share_of_hidden_labelled", ".2f", 100, " %", "by truth"),
+    ("y-parallax", "y_parallax_rms_px", ".3f", 1, " px", "rms, by truth"),
+    ("within uncertainty", "share_below_1_uncertainty", ".1f", 100, " %", "68.3 % is right"),
+)
+
+
+def headlines(
+    rows: Rows,
+    alignments: Records,
+    refined: Records,
+    truth: Rows,
+    quality: Mapping[str, Any],
+    height_m_per_px: float | None = None,
+) -> list[Headline]:
+    """The figures of a city; those whose input is missing are left out.
+
+    ``rows`` of the manifest, ``truth`` of truth.csv, ``quality`` of export.json; ``alignments``,
+    ``refined`` by scene; ``height_m_per_px``: metres of height for one px of disparity.
+    """
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    scenes = list(quality.get("scenes", {}).values())
+    found = [_pairs(rows, labelled)]
+    shares = [s for row in labelled if (s := number(row["labelled_share"])) is not None]
+    if shares:
+        note = f"per tile {spread([100 * s for s in shares], '.0f')} %"
+        found.append(Headline("pixels labelled", f"{100 * np.mean(shares):.1f} %", note))
+    if "quality" in rows[0]:
+        found.append(_gates(labelled, quality))
+    by_scope = {row["scope"]: row for row in truth}
+    best = by_scope.get("tiles") or by_scope.get("scene") or {}
+    error = number(best.get("mean_absolute_px", ""))
+    if error is not None:
+        note = _and("mean absolute", metres(error, height_m_per_px))
+        found.append(Headline("error against the truth", f"{error:.3f} px", note))
+    found += _of_images(scenes, height_m_per_px)
+    if alignments:
+        found.append(_gcps(alignments, refined))
+    low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
+    high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
+    if low and high:
+        text = minus(f"{min(low):.0f} … {max(high):.0f} px")
+        note = metres(max(high) - min(low), height_m_per_px) or "of the tiles"
+        found.append(Headline("disparities", text, note))
+    found += _ties(refined)
+    for title, name, form, factor, unit, note in TRUTH:
+        value = number(best.get(name, ""))
+        if value is not None:
+            found.append(Headline(title, minus(format(factor * value, form)) + unit, note))
+    return found
+
+
+def _and(*parts: str) -> str:
+    return "; ".join(part for part in parts if part)
+
+
+def _pairs(rows: Rows, labelled: Rows) -> Headline:
+    counts = [(s, sum(row["split"] == s for row in labelled)) for s in (*SPLITS, NONE)]
+    note = ", ".join(f"{n} {s if s != NONE else 'of no split'}" for s, n in counts if n)
+    if more := len(rows) - len(labelled):
+        note = _and(note, f"{more} more without full labels")
+    return Headline("labelled pairs", str(len(labelled)), note)
+
+
+def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
+    bad = sum(bool(missed(row)) for row in labelled)
+    scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
+    note = f"and {', '.join(scenes)} as a whole" if scenes else ""
+    text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
+    return Headline("quality gates", text, note, bool(bad or scenes))
+
+
+def _of_images(
+    scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None
+) -> list[Headline]:
+    """What the images say of the labels, scene by scene."""
+    found = []
+
+    def values(name: str) -> list[float]:
+        return [float(of[name]) for of in scenes if of.get(name) is not None]
+
+    def of(count: int) -> str:
+        return "" if count == 1 else f"{count} scenes"
+
+    if errors := values("sift_mean_absolute_error_px"):
+        matches = f"{sum(values('sift_matches')):.0f} matches, mean absolute"
+        height = metres(max(errors), height_m_per_px)
+        note = _and(of(len(errors)), matches, height and f"≤ {height}" if errors[1:] else height)
+        found.append(Headline("SIFT matches less labels", f"{spread(errors, '.2f')} px", note))
+    if medians := values("y_parallax_median_px"):
+        text = f"{spread(medians, '+.2f')} px"
+        note = _and(
+            of(len(medians)), f"median; rms {spread(values('y_parallax_rms_px'), '.2f')} px"
+        )
+        found.append(Headline("y-parallax of matches", text, note))
+    if known := values("warp_correlation"):
+        note = _and(of(len(known)), "correlation over the labelled pixels")
+        found.append(Headline("left and warped right", spread(known, ".3f"), note))
+    return found
+
+
+def _gcps(alignments: Records, refined: Records) -> Headline:
+    def rms(records: Records, which: str) -> str:
+        values = [
+            record.get(view, {}).get("rms", {}).get(which)
+            for record in records.values()
+            for view in ("left", "right")
+        ]
+        return spread(values, ".2f")
+
+    note = f"{rms(alignments, 'before')} px before"
+    if refined:
+        note += f", {rms(refined, 'after')} px after refinement"
+    return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
+
+
+def _ties(refined: Records) -> list[Headline]:
+    ties = [record.get("refinement", {}) for record in refined.values()]
+    if not any(tie.get("after") for tie in ties):
+        return []
+
+    def parallax(when: str) -> str:
+        return spread([tie.get(when, {}).get("y_parallax", {}).get("rms") for tie in ties], ".2f")
+
+    note = f"rms; {parallax('before')} px before refinement"
+    return [Headline("y-parallax of tie points", f"{parallax('after')} px", note)]

@@ -1,0 +1,82 @@
+"""The figures on top of a city's page: those of the last lines of a run, and in metres."""
+
+from __future__ import annotations
+
+import re
+
+from stereotruth.dataset.summary import summary_lines
+from stereotruth.report.headlines import headlines
+
+SCENE = {
+    "gcp_rms_px": 0.3,
+    "sift_matches": 1315,
+    "sift_mean_error_px": 0.0274,
+    "sift_mean_absolute_error_px": 0.2416,
+    "sift_median_error_px": 0.014,
+    "y_parallax_median_px": -0.0131,
+    "y_parallax_rms_px": 0.3132,
+    "warp_correlation": 0.98283,
+    "quality": "ok",
+}
+ROW = {
+    "tile": "A_0",
+    "complete": "yes",
+    "split": "train",
+    "labelled_share": "0.829",
+    "disparity_min_px": "-5.5",
+    "disparity_max_px": "33.3",
+    # of the tile alone: another figure than the scene's
+    "sift_mean_absolute_error_px": "0.32",
+    "quality": "ok",
+}
+
+
+def cards(scenes, height=None, rows=(ROW,), truth=()):
+    found = headlines(rows, {}, {}, truth, {"scenes": scenes}, height)
+    return {card.title: card for card in found}
+
+
+def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
+    summary = {
+        "city": "A",
+        "labelled_pairs": 1,
+        "unlabelled_pairs": 0,
+        "size_px": 256,
+        "splits": {"realised": {"train": 1}},
+        "share_of_pixels": {"labelled": 0.829, "no_points": 0.171},
+        "disparity_px": {"min": -5.5, "max": 33.3},
+        "disparity_rounding": {"largest_px": 0.0005},
+        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}},
+    }
+    said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
+    found = cards({"A-1": SCENE})
+    assert found["SIFT matches less labels"].value == "0.24 px"
+    for title in (
+        "SIFT matches less labels",
+        "y-parallax of matches",
+        "left and warped right",
+        "pixels labelled",
+    ):
+        assert re.search(rf"(?<![\d.]){re.escape(found[title].value)}(?!\d)", said), title
+    assert "1315 matches" in found["SIFT matches less labels"].note
+
+
+def test_several_scenes_have_their_range():
+    other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
+    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT matches less labels"]
+    assert card.value == "0.24–0.31 px"
+    assert card.note == "2 scenes; 1400 matches, mean absolute; ≤ 0.62 m of height"
+
+
+def test_metres_stand_beside_px_where_the_geometry_is_known():
+    truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
+    found = cards({"A-1": SCENE}, height=1.03, truth=truth)
+    assert found["SIFT matches less labels"].note.endswith("0.25 m of height")
+    assert found["error against the truth"].note == "mean absolute; 0.022 m of height"
+    assert found["disparities"].note == "40 m of height"
+    assert cards({"A-1": SCENE})["disparities"].note == "of the tiles"
+
+
+def test_a_missed_gate_is_among_the_first_six():
+    found = headlines([ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"scenes": {}})
+    assert any(card.bad for card in found[:6])
