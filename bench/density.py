@@ -33,8 +33,8 @@ from stereotruth.evaluation.labels_against_truth import (
 )
 from stereotruth.lidar.lattice import DEGREE_M
 from stereotruth.lidar.point_store import Points, PointStore
-from stereotruth.simulate.cities import CITIES
 from stereotruth.products.pictures import SERIES
+from stereotruth.simulate.cities import CITIES
 
 TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1 px at most, %
     4: (95, 0.2, 0.03),
