@@ -34,11 +34,15 @@ if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, m
 else:
     keep_metadata(begin=False)
     settle_times()
+    if STORAGE.default_storage_provider:
+        MIRROR = record_mirror()
 
 
 onstart:
     refuse_second_run()
     keep_metadata(begin=True)
+    if MIRROR:
+        keep_mirrored(MIRROR)
     end_older_jobs()
     begin_run()
 
@@ -74,6 +78,7 @@ def say(text):
 
 onsuccess:
     save_metadata()
+    tidy_copies()
     say(made())
 
 
