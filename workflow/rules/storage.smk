@@ -5,13 +5,23 @@ import shutil
 STORAGE = workflow.storage_settings
 
 
+def copies():
+    """The folder in which jobs have the products of the bucket while they run."""
+    return STORAGE.local_storage_prefix / STORAGE.default_storage_provider
+
+
+def product_name(path):
+    """What users call a product that a job has written: its path, or its URL in the bucket."""
+    if STORAGE.default_storage_provider and Path(path).is_relative_to(copies()):
+        return f"{STORAGE.default_storage_provider}://{Path(path).relative_to(copies())}"
+    return path
+
+
 def record_mirror():
-    """The records of the products in the bucket, brought here; None if products stay here."""
+    """The records of the products in the bucket, brought here."""
     from stereotruth.products.record_mirror import RecordMirror
 
-    prefix = STORAGE.default_storage_prefix
-    copies = STORAGE.local_storage_prefix / STORAGE.default_storage_provider
-    mirror = RecordMirror(prefix, copies)
+    mirror = RecordMirror(STORAGE.default_storage_prefix, copies())
     mirror.pull()
     return mirror
 

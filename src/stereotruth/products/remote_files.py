@@ -73,7 +73,8 @@ def _file_system(scheme: str) -> Any:
         import fsspec
 
         # listings are asked for each time: files come and go
-        return fsspec.filesystem(scheme, **({"use_listings_cache": False} if scheme == "s3" else {}))
+        how = {"use_listings_cache": False} if scheme == "s3" else {}
+        return fsspec.filesystem(scheme, **how)
     except ImportError as error:
         raise InputError(
             f"{scheme}:// cannot be read here ({error})",
