@@ -164,6 +164,7 @@ def test_small_jobs_share_one_submission(runs: Runs) -> None:
         assert [job.state for job in jobs] == ["COMPLETED"]
     assert all(job.state == "COMPLETED" for job in runs.jobs if "project" not in job.comment)
 
+
 SMALL = 128  # px, of the blocks that Dask workers make
 
 
