@@ -7,6 +7,7 @@
 # make test-all       set up, then pass all: kills and restarts, browsers, benchmarks, real scenes too
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
+# make test-s3        set up, then pass the tests with object storage (a server of its own)
 # make docs           set up, then build the documentation: docs/_build/html/index.html
 # make networks       set up with PyTorch
 # make lint           format, lint, lock file
@@ -17,7 +18,7 @@ CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup help docs networks test test-all test-networks test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup help docs networks test test-all test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -53,6 +54,9 @@ networks: $(READY)
 
 test-networks: networks
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
+
+test-s3: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py
 
 test-cluster: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" tests/cluster/run.sh

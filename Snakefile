@@ -15,6 +15,7 @@ if Path("config/config.yaml").is_file():  # of the working directory; see common
 include: "workflow/rules/common.smk"
 include: "workflow/rules/inputs.smk"
 include: "workflow/rules/methods.smk"
+include: "workflow/rules/storage.smk"
 include: "workflow/rules/run.smk"
 include: "workflow/rules/simulate.smk"
 include: "workflow/rules/ingest.smk"

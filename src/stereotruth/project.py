@@ -12,6 +12,15 @@ import yaml
 from . import sheets
 from .configuration import Configuration
 from .errors import InputError
+from .products.remote_files import (
+    FOLDER,
+    bring_files,
+    bring_image,
+    bring_table,
+    is_remote,
+    place_of,
+    stand_in,
+)
 from .simulate.cities import CITIES as SYNTHETIC
 from .simulate.cities import lidar_files
 
@@ -90,14 +99,40 @@ def sheet(settings: Configuration, name: str) -> str:
     return here_or_shipped(path) if path == getattr(Configuration, name) else path
 
 
-def read_scenes(settings: Configuration) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene]]:
-    """Cities and scenes by name. Raises InputError that names the sheet and the row."""
+def read_scenes(
+    settings: Configuration, *, ask: bool = True
+) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene]]:
+    """Cities and scenes by name. Raises InputError that names the sheet and the row.
+
+    Where a scene names files by URLs it gets their stand-ins (:mod:`.products.remote_files`).
+    ``ask``: ask their servers what they are now; else take what a call before has found.
+    """
     cities = sheets.read_cities(sheet(settings, "cities"))
     scenes = sheets.read_scenes(sheet(settings, "scenes"), cities)
     for name, scene in scenes.items():
         if is_synthetic(scene):
             scenes[name] = replace(scene, gcps=here_or_shipped(scene.gcps))
+        else:
+            scenes[name] = _with_stand_ins(scene, ask=ask)
     return cities, scenes
+
+
+def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
+    cells = {column: getattr(scene, column) for column in (*sheets.FILES, "lidar")}
+    found = {}
+    for column, cell in cells.items():
+        if not is_remote(cell):
+            continue
+        place = place_of(cell)
+        if ask or not (place.exists() or any(FOLDER.glob(str(place.relative_to(FOLDER))))):
+            if column == "lidar":
+                place = bring_files(cell, sheets.LIDAR_SUFFIXES)
+            elif column == "gcps":
+                place = bring_table(cell)
+            else:
+                place = bring_image(cell) if column.endswith("image") else stand_in(cell)
+        found[column] = str(place)
+    return replace(scene, **found)
 
 
 def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:

@@ -63,13 +63,14 @@ class Scene:
     left_image: Given
     """backward view (reference): GeoTIFF, or another format that holds its pixels (JPEG 2000, NITF,
     PNG, HFA, ENVI …), with RPC metadata in the TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside
-    it"""
+    it. In this and the columns below that name files, URLs may stand, too (`s3://`, `https://`; see
+    docs/how-to/object_storage.md)"""
 
     right_image: Given
     """forward view (target), likewise"""
 
     lidar: Given
-    """a folder or a glob of `.las`, `.laz`, `.copc.laz` files"""
+    """a folder or a glob of `.las`, `.laz`, `.copc.laz` files; of web servers, one file"""
 
     lidar_crs: Text
     """EPSG code or WKT (compound allowed) for files that carry none; else empty"""

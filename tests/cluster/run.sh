@@ -5,4 +5,4 @@ cd "$(dirname "$0")/../.."
 tests/cluster/start.sh
 trap tests/cluster/stop.sh EXIT
 # KILL, since a Snakemake that is asked to end waits for the answers of a cluster
-TEST_CLUSTER=1 timeout --signal=KILL 2400 pytest tests/cluster
+TEST_CLUSTER=1 timeout --signal=KILL 2400 pytest --durations=10 tests/cluster

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Starts munged, slurmctld and two slurmd on 127.0.0.1; waits until both nodes are idle.
+# Starts munged, slurmctld and three slurmd on 127.0.0.1; waits until all nodes are idle.
 # Installs Debian's packages if they are missing. Root only. All files lie in one folder, but for
 # the link /etc/slurm/slurm.conf: srun finds its controller only there once the SLURM plugin's
 # job step has dropped every SLURM_* variable.
@@ -27,7 +27,10 @@ if ! command -v slurmctld slurmd munged > /dev/null; then
     > /dev/null 2>&1 || skip "apt-get cannot install slurm-wlm and munge"
 fi
 
-install --directory --mode=755 "$STATE" "$STATE/controller" "$STATE/n1" "$STATE/n2"
+install --directory --mode=755 "$STATE" "$STATE/controller"
+for node in $NODES; do
+  install --directory --mode=755 "$STATE/$node"
+done
 trap ./stop.sh ERR
 head --bytes=1024 /dev/urandom > "$STATE/munge.key"
 chmod 600 "$STATE/munge.key"
@@ -37,10 +40,11 @@ sed -e "s|@HOST@|$(hostname --short)|" -e "s|@STATE@|$STATE|" slurm.conf.in > "$
 mkdir --parents "$(dirname "$LINK")"
 ln --symbolic "$STATE/slurm.conf" "$LINK"
 slurmctld
-slurmd -N n1
-slurmd -N n2
+for node in $NODES; do
+  slurmd -N "$node"
+done
 for _ in $(seq 100); do
-  [ "$(sinfo --noheader --Node --format=%t 2> "$STATE/sinfo.err")" = $'idle\nidle' ] && exit 0
+  [ "$(sinfo --noheader --Node --format=%t 2> "$STATE/sinfo.err")" = $'idle\nidle\nidle' ] && exit 0
   sleep 0.2
 done
 tail --lines=20 "$STATE"/*.log "$STATE/sinfo.err" >&2

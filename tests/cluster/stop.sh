@@ -19,7 +19,7 @@ if [ "$(readlink "$LINK")" = "$STATE/slurm.conf" ]; then
   done
 fi
 left=0
-for name in n1 n2 slurmctld munged; do
+for name in $NODES slurmctld munged; do
   [ -s "$STATE/$name.pid" ] || continue
   pid=$(cat "$STATE/$name.pid")
   kill "$pid" 2> /dev/null

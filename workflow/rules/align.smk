@@ -2,7 +2,7 @@ rule align:
     input:
         left=left_image,
         right=right_image,
-        gcps=lambda w: SCENES[w.scene].gcps or [],
+        gcps=given_in("gcps"),
     output:
         alignment="results/align/{city}/{scene}/alignment.json",
         residuals=report(

@@ -32,7 +32,7 @@ def synthetic_scenes(city):
 
 try:
     SETTINGS = Configuration.of(config)
-    CITIES, SCENES = read_scenes(SETTINGS)
+    CITIES, SCENES = read_scenes(SETTINGS, ask=workflow.is_main_process)
     LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
     check_fixed(SETTINGS, SCENES)
 except InputError as error:
@@ -72,7 +72,7 @@ def scenes_of(city):
 
 def making_of(rule, wildcards):
     """What the making of a job's products is called; other than it was if they are stale."""
-    return made_of(rule.output[0].format(**wildcards))
+    return made_of(str(rule.output[0].apply_wildcards(wildcards)))
 
 
 def templates_of(*parts):

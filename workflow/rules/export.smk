@@ -62,8 +62,8 @@ rule export:
 rule originals:
     input:
         tiles="tiles/{city}",
-        left=lambda w: [s.left_image for s in scenes_of(w.city)],
-        right=lambda w: [s.right_image for s in scenes_of(w.city)],
+        left=lambda w: [with_rpc_files(s, "left")[0] for s in scenes_of(w.city)],
+        right=lambda w: [with_rpc_files(s, "right")[0] for s in scenes_of(w.city)],
     output:
         directory("originals/{city}"),
     log:

@@ -1,7 +1,7 @@
 rule ingest:
     input:
-        lidar=lambda w: LIDAR[w.scene][w.lidar],
-        geoid=lambda w: SCENES[w.scene].geoid or [],
+        lidar=lidar_file,
+        geoid=given_in("geoid"),
     output:
         store=directory("results/ingest/{city}/{scene}/{lidar}.zarr"),
     log:

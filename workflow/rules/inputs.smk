@@ -1,35 +1,44 @@
 """Input functions: which files a stage takes of a scene or a city."""
 
 
-def with_rpc_files(image):
-    """An image and the RPC files beside it, so that an edited RPC is seen."""
-    image = Path(image)
+def given(path):
+    """A file that users give: it lies here, also where the products go to object storage."""
+    return local(str(path))
+
+
+def with_rpc_files(scene, view):
+    """An image of a scene and the RPC files beside it, so that an edited RPC is seen."""
+    image = Path(getattr(scene, f"{view}_image"))
+    if is_synthetic(scene):
+        return [str(image)]
     beside = [image.with_suffix(s) for s in (".RPB", ".rpb")]
     beside += [image.with_name(f"{image.stem}{s}") for s in ("_RPC.TXT", "_rpc.txt", "_RPC.txt")]
     beside += sorted(image.parent.glob("RPC_*.XML"))  # of DIMAP, both views'
-    return [str(image), *(str(file) for file in beside if file.is_file())]
+    return [given(image), *(given(file) for file in beside if file.is_file())]
 
 
 def left_image(wildcards):
-    return with_rpc_files(SCENES[wildcards.scene].left_image)
+    return with_rpc_files(SCENES[wildcards.scene], "left")
 
 
 def right_image(wildcards):
-    return with_rpc_files(SCENES[wildcards.scene].right_image)
+    return with_rpc_files(SCENES[wildcards.scene], "right")
 
 
-def left_mask(wildcards):
-    return SCENES[wildcards.scene].left_mask or []
+def given_in(column):
+    """Input function: the file that a scene's row names in a column, if it names one."""
 
+    def file_of(wildcards):
+        path = getattr(SCENES[wildcards.scene], column)
+        return given(path) if path else []
 
-def right_mask(wildcards):
-    return SCENES[wildcards.scene].right_mask or []
+    return file_of
 
 
 def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
-    if given := SETTINGS.alignment.fixed.get(wildcards.scene):
-        return given
+    if fixed := SETTINGS.alignment.fixed.get(wildcards.scene):
+        return given(fixed)
     stage = "refine" if SETTINGS.alignment.refine else "align"
     return f"results/{stage}/{wildcards.city}/{wildcards.scene}/alignment.json"
 
@@ -51,6 +60,11 @@ def strips_made(wildcards, file):
 def truth_of_city(city, kind):
     """The city's figures against the exact truth (json, csv), if it has synthetic scenes."""
     return [f"results/evaluate/{city}/truth.{kind}"] if synthetic_scenes(city) else []
+
+
+def lidar_file(wildcards):
+    scene, file = SCENES[wildcards.scene], LIDAR[wildcards.scene][wildcards.lidar]
+    return str(file) if is_synthetic(scene) else given(file)
 
 
 def point_stores(wildcards):

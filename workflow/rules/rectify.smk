@@ -2,8 +2,8 @@ rule rectify:
     input:
         left=left_image,
         right=right_image,
-        left_mask=left_mask,
-        right_mask=right_mask,
+        left_mask=given_in("left_mask"),
+        right_mask=given_in("right_mask"),
         alignment=alignment_of,
         strips=lambda w: strips_made(w, "results/rectify/{city}/{scene}/strips/{strip}.json"),
     output:
@@ -40,8 +40,8 @@ rule rectify_strip:
     input:
         left=left_image,
         right=right_image,
-        left_mask=left_mask,
-        right_mask=right_mask,
+        left_mask=given_in("left_mask"),
+        right_mask=given_in("right_mask"),
         alignment=alignment_of,
     output:
         done=temp("results/rectify/{city}/{scene}/strips/{strip}.json"),

@@ -2,8 +2,8 @@ rule refine:
     input:
         left=left_image,
         right=right_image,
-        left_mask=left_mask,
-        right_mask=right_mask,
+        left_mask=given_in("left_mask"),
+        right_mask=given_in("right_mask"),
         alignment=rules.align.output.alignment,
         points=point_stores,
     output:

@@ -34,11 +34,15 @@ if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, m
 else:
     keep_metadata(begin=False)
     settle_times()
+    if STORAGE.default_storage_provider:
+        MIRROR = record_mirror()
 
 
 onstart:
     refuse_second_run()
     keep_metadata(begin=True)
+    if MIRROR:
+        keep_mirrored(MIRROR)
     end_older_jobs()
     begin_run()
 
@@ -58,7 +62,10 @@ def made():
     from stereotruth.last_lines import last_lines  # takes a second, and no plan needs it
 
     products = [
-        path for job in all_records() if job["run"] == Run().name for path in job["outputs"]
+        product_name(path)
+        for job in all_records()
+        if job["run"] == Run().name
+        for path in job["outputs"]
     ]
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
@@ -84,6 +91,7 @@ def say(text):
 
 onsuccess:
     save_metadata()
+    tidy_copies()
     say(made())
 
 

@@ -81,7 +81,12 @@ class _Blocks:
         return digest({"content": content, "points": points})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
-        """Label one block and write it, with its pixels by status and counts of points."""
+        """Label one block and write it, with its pixels by status and counts of points.
+
+        Nothing, if it is there: a Dask worker that is lost takes with it that it had written it.
+        """
+        if out.has((rows, cols), key):
+            return
         here = self.scene.pair.cols(cols)
         shape = rows.stop - rows.start, cols.stop - cols.start
         fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)

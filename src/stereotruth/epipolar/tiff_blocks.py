@@ -14,6 +14,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ..products.remote_files import open_file, size_of
+
 OFFSETS, COUNTS = (273, 324), (279, 325)  # of strips, of tiles
 WIDTH, HEIGHT, BITS, COMPRESSION, SAMPLES, STRIP_ROWS = 256, 257, 258, 259, 277, 278
 PLANAR, TILE_WIDTH, TILE_HEIGHT = 284, 322, 323
@@ -83,8 +85,8 @@ def _inflates(block: bytes) -> bool:
 
 def damaged_block(path: Path, workers: int = 1) -> str:
     """What is wrong with the first strip or tile that is damaged; empty if none is, or no TIFF."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
+    size = size_of(path)
+    with open_file(path) as stream:
         if stream.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
             return ""
         stream.seek(0)

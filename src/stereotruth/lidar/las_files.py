@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..products.remote_files import open_file, size_of
 from .las_layout import check_layout, wrong_count
 
 Floats = NDArray[np.float64]
@@ -59,7 +60,7 @@ def read_header(file: str | Path) -> laspy.LasHeader:
                 remedy="check or replace the file",
             )
         ),
-        file.open("rb") as stream,
+        open_file(file) as stream,
     ):
         header = laspy.LasHeader.read_from(stream, read_evlrs=True)
     by_return = sum(map(int, header.number_of_points_by_return))
@@ -72,7 +73,7 @@ def surplus_of(header: laspy.LasHeader, file: Path) -> str | None:
     """Remark on points after the last that the header counts (a stale header), or None."""
     if header.are_points_compressed or header.version.minor == 3:  # 1.3: waveforms may follow
         return None
-    end = header.start_of_first_evlr if header.number_of_evlrs else file.stat().st_size
+    end = header.start_of_first_evlr if header.number_of_evlrs else size_of(file)
     held = (end - header.offset_to_point_data) // header.point_format.size
     if held <= header.point_count:
         return None
@@ -88,15 +89,19 @@ def read_chunks(
     """
     fields = laspy.DecompressionSelection
     done = 0
-    with laspy.open(
-        file,
-        laz_backend=laspy.LazBackend.Lazrs,  # the parallel one takes all cores there are
-        read_evlrs=False,
-        decompression_selection=fields.XY_RETURNS_CHANNEL
-        | fields.Z
-        | fields.CLASSIFICATION
-        | fields.FLAGS,
-    ) as reader:
+    with (
+        open_file(file) as stream,
+        laspy.open(
+            stream,
+            closefd=False,
+            laz_backend=laspy.LazBackend.Lazrs,  # the parallel one takes all cores there are
+            read_evlrs=False,
+            decompression_selection=fields.XY_RETURNS_CHANNEL
+            | fields.Z
+            | fields.CLASSIFICATION
+            | fields.FLAGS,
+        ) as reader,
+    ):
         while done < header.point_count:
             wanted = min(size, header.point_count - done)
             held = f"decoding failed after {done}"

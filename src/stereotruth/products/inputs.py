@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
+from . import remote_files
 from .provenance import file_sha256
 
 TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
@@ -145,7 +146,10 @@ class Inputs:
         return {path: found for path, (_, found) in self._found.items()}
 
     def refuse_changed(self) -> None:
-        """Raise InputError if one of them was written or replaced, if only for a while."""
+        """Raise InputError if one of them was written or replaced, if only for a while.
+
+        Of files that lie elsewhere, if they are others than when the run began.
+        """
         for path, (before, found) in self._found.items():
             now = stamp(path)
             same = now.place == before.place
@@ -153,6 +157,7 @@ class Inputs:
                 same = checksum(path) == found
             if not same:
                 raise changed(path)
+            remote_files.refuse_changed(path)
 
 
 def changed(path: str | Path) -> InputError:

@@ -85,17 +85,17 @@ class BlockStore:
         refuse_replaced(self.inputs)
         self._done.put(self._name(block), key, self._files(block), result)
 
+    def has(self, block: Block, key: str) -> bool:
+        """Whether a block is there as ``key`` wants it; what else there is of it is removed."""
+        return self._done.find(self._name(block), key, self._files(block)) is not None
+
     def missing(self, blocks: Sequence[Block], keys: Sequence[str], workers: int) -> list[int]:
         """Which of the blocks, by number, are to be made; what is there of them is removed.
 
         ``keys``: what the content of each block follows from, as given to :meth:`write`.
         """
-
-        def there(block: Block, key: str) -> bool:
-            return self._done.find(self._name(block), key, self._files(block)) is not None
-
         with ThreadPoolExecutor(workers) as pool:
-            found = list(pool.map(there, blocks, keys))
+            found = list(pool.map(self.has, blocks, keys))
         if any(found):
             log.info("%d of %d blocks are there from before", sum(found), len(found))
         return [number for number, done in enumerate(found) if not done]

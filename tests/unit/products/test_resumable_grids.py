@@ -192,3 +192,14 @@ def test_records_hold_no_time_or_place(tmp_path) -> None:
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
     layout = json.loads((tmp_path / "a" / ".x.zarr.work" / "layout.json").read_text())
     assert layout["shape"] == list(SHAPE)
+
+
+def test_a_block_tells_whether_it_is_there(tmp_path):
+    """Only if it was made of the same; else what is there of it goes."""
+    with making(tmp_path / "grid.zarr", SHAPE, LAYERS, **SIZES) as store:
+        values = np.ones((32, 32), np.float32)
+        store.write(BLOCKS[0], "a", {"disparity": values}, 1)
+        assert store.has(BLOCKS[0], "a")
+        assert not store.has(BLOCKS[1], "a")
+        assert not store.has(BLOCKS[0], "b")
+        assert not store.has(BLOCKS[0], "a")

@@ -1,0 +1,271 @@
+"""Input that lies elsewhere: files of object storage (``s3://``) and of web servers, read by parts.
+
+A file that a scene's row names by its URL is never fetched as a whole. A stand-in takes its place
+in the working directory, ``results/remote/<scheme>/<host or bucket>/<path>``: its size and what the
+server calls its content (ETag; where there is none, the time of its last change). The stages get
+the stand-in's path, so that digests, records and reruns follow from what stands in it, and open
+what it stands for: images through GDAL's ``/vsis3`` and ``/vsicurl``, LiDAR through fsspec. Small
+files (RPCs, control points) are fetched.
+
+Nothing but what stands in that folder is read from a network, whatever a file contains.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import urlsplit
+
+from ..errors import InputError
+
+FOLDER = Path("results", "remote")
+WEB = ("http", "https")
+SCHEMES = ("s3", *WEB)
+MAX_COPY_BYTES = 10_000_000  # of a file that is fetched; RPCs and control points have some kB
+READ_BYTES = 4 << 20  # of a LiDAR file at once
+_WAYS = "s3://bucket/path and https://host/path can be read"
+
+
+def is_remote(text: str) -> bool:
+    """Whether a cell of the sheet is a URL."""
+    return "://" in text
+
+
+def place_of(url: str) -> Path:
+    """Where the stand-in of a URL lies. Raises InputError for one that cannot be read."""
+    parts = urlsplit(url)
+    path = parts.path.strip("/")
+    if parts.scheme not in SCHEMES or not parts.netloc or not path:
+        raise InputError("no such kind of URL", file=url, remedy=_WAYS)
+    if parts.query or parts.fragment or "@" in parts.netloc or ".." in path.split("/"):
+        raise InputError(
+            "a URL with a query, a password or '..'",
+            file=url,
+            remedy="name the file alone; credentials come from the environment (see "
+            "docs/how-to/object_storage.md)",
+        )
+    return FOLDER / parts.scheme / parts.netloc / path
+
+
+def url_of(path: str | Path) -> str | None:
+    """What a path stands for; None if it is a file itself."""
+    try:
+        inside = Path(path).absolute().relative_to(Path.cwd() / FOLDER)
+    except ValueError:
+        return None
+    scheme, *rest = inside.parts
+    return f"{scheme}://{'/'.join(rest)}" if Path(path).suffix.lower() not in _COPIED else None
+
+
+_COPIED = {".rpb", ".txt", ".csv"}  # files that are fetched
+RPC_ENDINGS = (".RPB", ".rpb", "_RPC.TXT", "_rpc.txt", "_RPC.txt")
+
+
+@cache
+def _file_system(scheme: str) -> Any:
+    try:
+        import fsspec
+
+        # listings are asked for each time: files come and go
+        how = {"use_listings_cache": False} if scheme == "s3" else {}
+        return fsspec.filesystem(scheme, **how)
+    except ImportError as error:
+        raise InputError(
+            f"{scheme}:// cannot be read here ({error})",
+            remedy="pip install 'stereotruth[storage]'",
+        ) from error
+
+
+def bucket(url: str) -> tuple[Any, str]:
+    """The file system (fsspec) that holds a URL, and its name there."""
+    scheme = urlsplit(url).scheme
+    storage = _file_system(scheme)
+    return storage, storage._strip_protocol(url)
+
+
+def _state(info: dict[str, Any], url: str) -> str:
+    """What a stand-in holds. Raises InputError where a server gives no parts of files."""
+    if info.get("size") is None or info.get("partial") is False:
+        raise InputError(
+            "its server tells no size, or gives files as a whole only",
+            file=url,
+            remedy="download it, and name the local file",
+        )
+    known = info.get("ETag") or info.get("Last-Modified") or info.get("LastModified") or ""
+    return json.dumps({"size": int(info["size"]), "content": str(known)}) + "\n"
+
+
+def _look(url: str) -> str | None:
+    """The state of a file; None if there is none. Raises InputError if nobody answers."""
+    storage, name = bucket(url)
+    try:
+        return _state(storage.info(name), url)
+    except FileNotFoundError:
+        return None
+    except InputError:
+        raise
+    except Exception as error:  # clients raise what they like
+        raise InputError(
+            f"its server does not answer as it should ({type(error).__name__}: {error})",
+            file=url,
+            remedy="check the URL, the credentials (AWS_ACCESS_KEY_ID …) and AWS_ENDPOINT_URL",
+        ) from error
+
+
+def _put(place: Path, content: bytes) -> None:
+    """Write a file if it holds something else: its time stays where nothing has changed."""
+    if place.is_file() and place.read_bytes() == content:
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    scratch = place.with_name(f".{place.name}.{os.getpid()}")
+    scratch.write_bytes(content)
+    scratch.replace(place)
+
+
+def _missing(url: str) -> InputError:
+    return InputError("no such file there", file=url, remedy="correct it in scenes.tsv")
+
+
+def stand_in(url: str) -> Path:
+    """Ask for a file's state and write its stand-in. Raises InputError if it is missing."""
+    place = place_of(url)
+    if (state := _look(url)) is None:
+        raise _missing(url)
+    _put(place, state.encode())
+    return place
+
+
+def fetch(url: str) -> Path | None:
+    """Fetch a small file; None if there is none, and none is left here either.
+
+    Raises InputError if it is larger than :data:`MAX_COPY_BYTES`.
+    """
+    place = place_of(url)
+    if (state := _look(url)) is None:
+        place.unlink(missing_ok=True)
+        return None
+    if json.loads(state)["size"] > MAX_COPY_BYTES:
+        raise InputError(
+            f"larger than {MAX_COPY_BYTES / 1e6:g} MB", file=url, remedy="is it the right file?"
+        )
+    storage, name = bucket(url)
+    _put(place, storage.cat_file(name))
+    return place
+
+
+def bring_image(url: str) -> Path:
+    """Stand-in of an image, and copies of the RPC files beside it."""
+    stem = url.removesuffix(Path(url).suffix)
+    with ThreadPoolExecutor(len(RPC_ENDINGS)) as pool:
+        list(pool.map(fetch, (stem + ending for ending in RPC_ENDINGS)))
+    return stand_in(url)
+
+
+def bring_table(url: str) -> Path:
+    """Copy of a table of control points. Raises InputError if it is missing or no CSV."""
+    if not url.lower().endswith(".csv"):
+        raise InputError("its name does not end in .csv", file=url, remedy="name it so")
+    if (found := fetch(url)) is None:
+        raise _missing(url)
+    return found
+
+
+def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
+    """Stand-ins of the files that a URL, a folder or a glob (S3) of them names; the same here.
+
+    Stand-ins of files that are gone go. Raises InputError if a web server is asked for a folder.
+    """
+    place = place_of(url)
+    if url.lower().endswith(suffixes) and "*" not in url:
+        return stand_in(url)
+    if urlsplit(url).scheme in WEB:
+        raise InputError(
+            "web servers list no folders", file=url, remedy="name one file, or use object storage"
+        )
+    storage, name = bucket(url)
+    try:
+        found = storage.glob(name if "*" in name else f"{name.rstrip('/')}/*", detail=True)
+    except Exception as error:
+        raise InputError(
+            f"cannot be listed ({type(error).__name__}: {error})",
+            file=url,
+            remedy="check the URL, the credentials (AWS_ACCESS_KEY_ID …) and AWS_ENDPOINT_URL",
+        ) from error
+    wanted = {
+        place_of(f"s3://{path}"): _state(info, f"s3://{path}")
+        for path, info in found.items()
+        if path.lower().endswith(suffixes)
+    }
+    here = FOLDER.glob(str((place if "*" in name else place / "*").relative_to(FOLDER)))
+    for file in set(here) - set(wanted):
+        if file.is_file():
+            file.unlink()
+    for file, state in wanted.items():
+        _put(file, state.encode())
+    return place
+
+
+def _held(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
+
+
+def size_of(path: str | Path) -> int:
+    """Bytes of a file, or of what it stands for."""
+    path = Path(path)
+    return _held(path)["size"] if url_of(path) else path.stat().st_size
+
+
+@contextmanager
+def open_file(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to read from, or what it stands for, of which the parts asked for are fetched.
+
+    Raises InputError if that is no longer what the stand-in says.
+    """
+    path = Path(path)
+    if (url := url_of(path)) is None:
+        with path.open("rb") as stream:
+            yield stream
+        return
+    refuse_changed(path)
+    storage, name = bucket(url)
+    size = _held(path)["size"]
+    with storage.open(name, "rb", block_size=READ_BYTES, cache_type="readahead", size=size) as file:
+        yield file
+
+
+def refuse_changed(path: str | Path) -> None:
+    """Raise InputError if the file that a path stands for is another one by now."""
+    url = url_of(path)
+    if url is not None and _look(url) != Path(path).read_text():
+        raise InputError(
+            "changed on its server since this run began",
+            file=url,
+            remedy="run again, and leave it alone until the run has ended",
+        )
+
+
+def gdal_name(path: str | Path) -> tuple[str, dict[str, str]]:
+    """How GDAL calls a file or what it stands for, and the options that let it read just that."""
+    if (url := url_of(path)) is None:
+        return os.fspath(path), {}
+    parts = urlsplit(url)
+    name = f"/vsis3/{parts.netloc}{parts.path}" if parts.scheme == "s3" else f"/vsicurl/{url}"
+    options = {
+        "CPL_VSIL_CURL_ALLOWED_FILENAME": name,
+        "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    }
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    if parts.scheme == "s3" and endpoint:
+        where = urlsplit(endpoint)
+        options |= {
+            "AWS_S3_ENDPOINT": where.netloc,
+            "AWS_HTTPS": "YES" if where.scheme == "https" else "NO",
+            "AWS_VIRTUAL_HOSTING": "FALSE",
+        }
+    return name, options
