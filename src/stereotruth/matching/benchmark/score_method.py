@@ -1,7 +1,8 @@
 """A method's predictions of a dataset against its labels: a folder of scores and pictures.
 
 scores.csv   a row per tile
-cities.csv   a row per city, and one of all, with 95 % confidence intervals
+cities.csv   a row per city, and one of all, with 95 % confidence intervals, and the median absolute
+             error of the valid pixels (``median_px``; what is beyond 16 px counts as 16)
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
 scores.json  all of it but the tiles, with settings, time and memory, and of methods that state
              uncertainties what :mod:`.confidence` says of them by stratum
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
+from ...error_statistics import ErrorSum
 from ...job import progress
 from ...products.files import whole_folder, write_table
 from ...products.rasters import read_image
@@ -60,6 +62,7 @@ def score(
     scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
     collector = Collector(thresholds_px)
     confidences: dict[str, Confidence] = {}
+    errors: dict[str, ErrorSum] = {}
     drawn = {pair.name for pair in choose(pairs, panels)}
     with whole_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
@@ -69,6 +72,9 @@ def score(
             sums = scorer.sums(found, truth, strata_of_labels)
             for stratum, exact in exact_of_pair.items():
                 sums[stratum] = scorer.sums(found, exact)[ALL]
+            error = (found - truth)[scorer.counted(truth)]
+            for place in (pair.city, ALL):
+                errors.setdefault(place, ErrorSum()).add(error[np.isfinite(error)])
             sigma = read_uncertainty(predictions, pair)
             if sigma is not None:
                 by_stratum = {
@@ -88,10 +94,13 @@ def score(
                 draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
         scores = collector.scores()
         sampling = {"times": bootstrap, "seed": seed}
+        medians = {place: of.figures()["median_absolute"] for place, of in errors.items()}
         cities = [
-            _row(scores, {"city": city}, sampling, scores.in_city(city)) for city in _cities(scores)
+            _row(scores, {"city": city}, sampling, scores.in_city(city))
+            | {"median_px": medians[city]}
+            for city in _cities(scores)
         ]
-        total = _row(scores, {"city": ALL}, sampling)
+        total = _row(scores, {"city": ALL}, sampling) | {"median_px": medians[ALL]}
         strata = [
             _row(scores, {"stratum": name}, sampling, stratum=name)
             for name in scores.strata

@@ -114,6 +114,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
                     _percent(of["all"], f"filled_d1_{limit:g}_px_share", interval=False)
                     for limit in of["thresholds_px"][1:]
                 ),
+                _number(of["all"].get("median_px"), 1, ".3f"),
                 _px(of["all"], "epe_px", interval=False),
                 _percent(of["all"], d1, interval=False),
                 _percent(of["all"], "valid_share", interval=False),
@@ -127,7 +128,8 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
         "EPE (px)",
         f"D1, {limits[0]:g} px (%)",
         *(f"D1, {limit:g} px (%)" for limit in limits[1:]),
-        "valid only: EPE",
+        "valid only: median (px)",
+        "EPE (px)",
         "D1 (%)",
         "valid (%)",
         "Time (ms)",
