@@ -14,6 +14,8 @@ from .differences import differences
 from .page import write_page
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction
+from .protocols import one_id
+from .published_rows import beside_published
 from .score_method import choose
 from .scores import Scorer
 from .tables import make_tables, read_scores, write_tables
@@ -37,12 +39,17 @@ def compare(
 
     ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
     intervals of differences come from.
+
+    Raises InputError if a method has no scores, or two have theirs by different protocols.
     """
     out = Path(out)
     methods = read_scores(scores)
     trained = [pair.city for pair in dataset.pairs() if pair.split == "train"]
     tables = make_tables(methods, trained, beside_paper=dataset.layout != "us3d")
     tables.append(differences(methods, scores, seed=seed))
+    tables.append(beside_published(methods))
+    protocol = one_id(methods)
+    tables = [table.by(protocol) for table in tables]
     write_tables(tables, out)
     scorer = Scorer(dataset.disparity_range)
     columns = []

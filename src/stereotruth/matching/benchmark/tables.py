@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,11 @@ class Table:
     def columns(self) -> list[str]:
         """Of the CSV file, in order of appearance."""
         return list(dict.fromkeys(key for row in self.rows for key in row)) or ["method"]
+
+    def by(self, protocol: str) -> Table:
+        """The table with the id of the protocol that its scores are made by."""
+        rows = [{"protocol": protocol, **row} for row in self.rows]
+        return replace(self, title=f"{self.title} ({protocol})", rows=rows)
 
     def markdown(self) -> str:
         """What is to be read."""
