@@ -106,9 +106,18 @@ rule benchmark_tables:
     output:
         tables=expand(
             "benchmark/{{dataset}}/{table}.{kind}",
-            table=("table5", "table6", "table7", "strata", "differences", "published"),
+            table=(
+                "table5",
+                "table6",
+                "table7",
+                "strata",
+                "differences",
+                "confidence",
+                "published",
+            ),
             kind=("csv", "md"),
         ),
+        curves="benchmark/{dataset}/confidence.png",
         figure=report(
             "benchmark/{dataset}/figure10.png",
             caption="../report/figure10.rst",
@@ -140,7 +149,10 @@ rule benchmark_tables:
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.compare_methods"),
-        template=file_sha256(PACKAGE / "matching" / "benchmark" / "page.html.jinja"),
+        templates=[
+            file_sha256(file)
+            for file in sorted((PACKAGE / "matching" / "benchmark").glob("*.jinja"))
+        ],
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...dataset.stereo_dataset import StereoDataset
 from ...products.rasters import read_image
+from .confidence_table import confidence_table, draw_curves
 from .differences import differences
 from .page import write_page
 from .panels import Column, draw_columns
@@ -35,7 +36,7 @@ def compare(
     *,
     seed: int,
 ) -> None:
-    """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
+    """Write tables, ``figure10.png``, ``confidence.png`` and ``index.html`` to ``out``.
 
     ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
     intervals of differences come from.
@@ -47,6 +48,7 @@ def compare(
     trained = [pair.city for pair in dataset.pairs() if pair.split == "train"]
     tables = make_tables(methods, trained, beside_paper=dataset.layout != "us3d")
     tables.append(differences(methods, scores, seed=seed))
+    tables.append(confidence_table(methods))
     tables.append(beside_published(methods))
     protocol = one_id(methods)
     tables = [table.by(protocol) for table in tables]
@@ -73,7 +75,10 @@ def compare(
         for of, folder in zip(methods, scores)
     }
     panels = {label: files for label, files in panels.items() if files}
-    write_page(out / "index.html", dataset.name, methods, tables, out / "figure10.png", panels)
+    curves = out / "confidence.png"
+    shown = curves if draw_curves(curves, methods, scores) else None
+    figure = out / "figure10.png"
+    write_page(out / "index.html", dataset.name, methods, tables, figure, panels, shown)
     for line in tables[0].markdown().splitlines():
         if line.startswith("|"):
             log.info(line)

@@ -28,11 +28,12 @@ def write_page(
     tables: Sequence[Table],
     figure: str | Path | None,
     panels: Mapping[str, Sequence[Path]],
+    curves: str | Path | None = None,
 ) -> None:
     """Write the page of a dataset.
 
     ``methods``: their summaries; ``figure``: figure 10; ``panels``: pictures of tiles by the
-    method's label.
+    method's label; ``curves``: the sparsification curves.
     """
     count = sum(map(len, panels.values()))
     allowed = min(400_000, PANELS_BYTES // max(count, 1))
@@ -42,6 +43,7 @@ def write_page(
         "settings": [(of["label"], _settings(of)) for of in methods],
         "tables": tables,
         "figure": None if figure is None else encode_file(Path(figure), FIGURE_BYTES, FIGURE_PX),
+        "curves": None if curves is None else encode_file(Path(curves), FIGURE_BYTES, FIGURE_PX),
         "panels": {
             label: [(file.stem, encode_file(file, allowed, PANEL_PX)) for file in files]
             for label, files in panels.items()
