@@ -15,9 +15,10 @@ from .scores import ALL
 from .tables import Table
 
 Row = Mapping[str, Any]
+Curve = tuple[list[float], list[float], list[float]]
 SHOWN = (50, 68.27, 90, 95)  # percent, of the intervals
 NONE = "No method states the uncertainty of its disparities."
-CURVES = {ALL: "-", "exact_visible": "-", "exact_hidden": ":"}  # of the figure, with their lines
+EXACT = ("exact_visible", "exact_hidden")
 
 
 def confidence_table(methods: Sequence[Row]) -> Table:
@@ -65,39 +66,47 @@ def confidence_table(methods: Sequence[Row]) -> Table:
     return Table("confidence", title, rows, [(caption, heading, lines)])
 
 
+def read_curves(folder: str | Path) -> dict[str, Curve]:
+    """Curves by stratum of a method's ``sparsification.csv``.
+
+    Each has the share of pixels taken away (%), the mean error of the rest, and the oracle's (px).
+    """
+    found: dict[str, Curve] = {}
+    for row in read_table(Path(folder) / "sparsification.csv"):
+        values = (100 * float(row["removed_share"]), row["epe_px"], row["oracle_epe_px"])
+        for column, value in zip(found.setdefault(row["stratum"], ([], [], [])), values):
+            column.append(float(value))
+    return found
+
+
 def draw_curves(path: str | Path, methods: Sequence[Row], folders: Sequence[str | Path]) -> bool:
     """PNG of the sparsification curves; returns whether any method has one.
 
-    ``folders``: of the methods' scores, with ``sparsification.csv``. The oracle's are thin.
+    ``folders``: of the methods' scores. Of synthetic cities, a plot of the visible pixels and one
+    of the hidden ones, by the exact truth; else one of all. The oracle's curves are thin.
     """
-    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
-    axis = figure.subplots()
-    stated = [pair for pair in zip(methods, folders) if pair[0]["confidence"]]
-    for place, (of, folder) in enumerate(stated):
-        colour = colormaps["viridis"](place / max(len(stated), 2))
-        rows = read_table(Path(folder) / "sparsification.csv")
-        known = {row["stratum"] for row in rows}
-        for stratum in [name for name in CURVES if name in known and _apart(name, known)]:
-            curve = [row for row in rows if row["stratum"] == stratum]
-            share = [100 * float(row["removed_share"]) for row in curve]
-            name = f"{of['label']}, {stratum.replace('_', ' ')}"
-            for key, width, label in (("epe_px", 1.8, name), ("oracle_epe_px", 0.7, None)):
-                values = [float(row[key]) for row in curve]
-                axis.plot(share, values, CURVES[stratum], color=colour, lw=width, label=label)
-    axis.set(xlabel="most uncertain pixels taken away, %", ylabel="mean error of the rest, px")
-    axis.set_xlim(0, 100)
-    axis.set_ylim(bottom=0)
-    if stated:
-        axis.legend(title="thin: oracle", fontsize=8, title_fontsize=8, frameon=False)
+    curves = {
+        of["label"]: read_curves(folder) for of, folder in zip(methods, folders) if of["confidence"]
+    }
+    names = [name for name in EXACT if any(name in of for of in curves.values())] or [ALL]
+    figure = Figure(figsize=(5.0 * len(names) + 1.0, 4.2), layout="constrained")
+    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names):
+        for place, (label, of) in enumerate(curves.items()):
+            if name in of:
+                colour = colormaps["viridis"](place / max(len(curves), 2))
+                share, stated, oracle = of[name]
+                axis.plot(share, stated, color=colour, lw=1.8, label=label)
+                axis.plot(share, oracle, color=colour, lw=0.7)
+        axis.set(xlabel="most uncertain pixels taken away, %", ylabel="mean error of the rest, px")
+        axis.set_title(f"pixels: {name.replace('_', ' ')}", fontsize=10)
+        axis.set_xlim(0, 100)
+        axis.set_ylim(bottom=0)
+    if curves:
+        figure.axes[0].legend(title="thin: oracle", fontsize=8, title_fontsize=8, frameon=False)
     else:
-        axis.text(50, 0.5, NONE, ha="center")
+        figure.axes[0].text(50, 0.5, NONE, ha="center")
     save_figure(path, figure, dpi=120)
-    return bool(stated)
-
-
-def _apart(stratum: str, known: set[str]) -> bool:
-    """Whether a curve shows other pixels than those of all: not the visible ones twice."""
-    return stratum != ALL or "exact_visible" not in known
+    return bool(curves)
 
 
 def _form(value: float | None, form: str) -> str:

@@ -340,4 +340,9 @@ def _what(methods: Sequence[Row]) -> str:
     of = methods[0]
     low, high = of["disparity_range"]
     split = f"split {of['split']}" if of["split"] else "all splits"
-    return f"Dataset {of['dataset']}, {split}, {of['tiles']} pairs, disparities [{low}, {high}) px."
+    exact = of.get("protocol", {}).get("truth") == "exact"
+    more = " Labelled: by the exact truth, all that both views see." if exact else ""
+    where = (
+        f"Dataset {of['dataset']}, {split}, {of['tiles']} pairs, disparities [{low}, {high}) px."
+    )
+    return where + more

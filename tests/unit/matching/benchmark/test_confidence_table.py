@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 from stereotruth.matching.benchmark.confidence import Confidence
-from stereotruth.matching.benchmark.confidence_table import NONE, confidence_table, draw_curves
+from stereotruth.matching.benchmark.confidence_table import (
+    NONE,
+    confidence_table,
+    draw_curves,
+    read_curves,
+)
 from stereotruth.products.files import write_table
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -56,12 +62,17 @@ def test_the_curves_are_drawn(tmp_path):
         for k, (a, b) in enumerate(zip(*found.curves()))
     ]
     write_table(tmp_path / "sparsification.csv", curves)
+    (share, stated, oracle) = read_curves(tmp_path)["all"]
+    assert share == pytest.approx(np.arange(100)) and len(stated) == 100
+    assert stated == pytest.approx(found.curves()[0]) and oracle == pytest.approx(found.curves()[1])
     assert draw_curves(tmp_path / "curves.png", [one], [tmp_path])
     assert draw_curves(tmp_path / "again.png", [one], [tmp_path])
     assert (tmp_path / "curves.png").read_bytes() == (tmp_path / "again.png").read_bytes()
     silent = [{"label": "Silent", "confidence": []}]
     draw_curves(tmp_path / "none.png", silent, [tmp_path])
-    assert (tmp_path / "curves.png").read_bytes() != (tmp_path / "none.png").read_bytes()
+    lines = plt.imread(tmp_path / "curves.png")[150:400, 100:400, :3]  # left of the legend
+    assert np.ptp(lines, axis=2).max() > 0.2  # of colour
+    assert np.ptp(plt.imread(tmp_path / "none.png")[..., :3], axis=2).max() == 0
 
 
 def test_pages_of_methods_without_uncertainties_have_no_curves(compared):
