@@ -4,6 +4,7 @@ python bench/matching.py                              # a random texture, 1024 Ã
 python bench/matching.py --dataset dataset --layout stereotruth
 
 Networks are timed where PyTorch is installed, with random weights: time does not depend on them.
+Pandora is where its extra is; its calls take half a minute each.
 """
 
 from __future__ import annotations
@@ -78,6 +79,34 @@ def sgm(left: np.ndarray, right: np.ndarray, mode: str, times: int) -> dict[str,
         },
         times,
     )
+
+
+def pandora(left: np.ndarray, right: np.ndarray, times: int) -> dict[str, Any]:
+    """Pandora as a method, and the bare run on datasets and a pipeline that are ready."""
+    try:
+        import pandora as bare
+        from pandora.state_machine import PandoraMachine
+
+        from stereotruth.matching import pandora_pipeline
+    except ImportError:
+        print("\nPandora is not installed")
+        return {}
+
+    low, high = RANGE
+    method = pandora_pipeline.PandoraMethod(name="pandora")
+    both = [
+        pandora_pipeline.dataset(image.astype(np.float32), searched)
+        for image, searched in ((left, (1 - high, -low)), (right, (low, high - 1)))
+    ]
+    _, pipeline = method.checked(*both)
+
+    def run() -> Any:
+        return bare.run(PandoraMachine(), *both, pipeline)[0]
+
+    found, raw = method(left, right, RANGE), -run()["disparity_map"].data
+    known = np.isfinite(found)
+    assert np.array_equal(found[known], raw[known])
+    return compare({"method": lambda: method(left, right, RANGE), "bare": run}, times)
 
 
 def networks(
@@ -155,10 +184,17 @@ def main() -> None:
         cells = [f"{of[k]['clock_ms']:.0f} / {of[k]['cpu_ms']:.0f}" for k in of]
         ratio = of["method"]["cpu_ms"] / of["bare"]["cpu_ms"]
         print(f"{mode:<6}{cells[0]:>16}{cells[1]:>16}{ratio:>13.3f}{cells[2]:>18}", flush=True)
+    of_pandora = pandora(left, right, given.times)
+    if of_pandora:
+        cells = [
+            f"{of_pandora[k]['clock_ms']:.0f} / {of_pandora[k]['cpu_ms']:.0f}" for k in of_pandora
+        ]
+        ratio = of_pandora["method"]["cpu_ms"] / of_pandora["bare"]["cpu_ms"]
+        print(f"\nPandora: {cells[0]} as a method, {cells[1]} bare, ratio (CPU) {ratio:.3f}")
     chosen = given.network or list(PAPER_MS), given.precision or PRECISIONS
     of_networks = networks(left, right, given.times, given.threads, *chosen)
     if given.json:
-        record = {"sgm": figures, "networks": of_networks}
+        record = {"sgm": figures, "pandora": of_pandora, "networks": of_networks}
         given.json.write_text(json.dumps(record, indent=2) + "\n")
 
 

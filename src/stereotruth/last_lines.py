@@ -81,6 +81,7 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"results/train/([^/]+)/([^/]+)/training\.json": _training,
     r"benchmark/([^/]+)/[^/.]+": _scores,
     r"benchmark/([^/]+)/index\.html": _look,
+    r"submission/[^/]+/[^/]+": _look,
     r"audit/([^/]+)": _audit,
     r"results/predict/.*_dsm\.tif": _look,
 }

@@ -47,10 +47,14 @@ def test_a_threshold_or_the_seed_scores_again_but_matches_nothing(later, tmp_pat
 
 
 def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
-    """The results in the folder are those of SGM, so that their scores must be the same."""
+    """The results in the folder are SGM's as they are submitted, so that scores are the same."""
     scored = later.copy(tmp_path / "scored")
-    predictions = scored.folder / "results/match/synthetic/sgm"
-    shutil.copytree(predictions, scored.folder / "theirs", dirs_exist_ok=True)
+    packed = scored.snakemake("submission/synthetic/sgm", *ARGUMENTS)
+    assert packed.status == 0, packed.text[-4000:]
+    assert packed.jobs == {"submission": 1}
+    submission = scored.folder / "submission/synthetic/sgm"
+    assert (submission / "submission.json").is_file()
+    shutil.copytree(submission, scored.folder / "theirs", dirs_exist_ok=True)
     own = [*ARGUMENTS, "own.yaml"]
     (scored.folder / "own.yaml").write_text("benchmark: {datasets: {faulty: null}}\n")
     run = scored.snakemake("benchmark", *own)
@@ -63,6 +67,8 @@ def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
         rows = list(csv.DictReader(stream))
     assert [row["method"] for row in rows] == ["SGM", "mine", "Theirs"]
     assert rows[0]["median_seconds"] and not rows[2]["median_seconds"]
+    (protocol,) = {row["protocol"] for row in rows}
+    assert protocol == scores(scored, "theirs")["protocol"]["id"]
     picture = cv2.imread(str(folder / "figure10.png"))
     assert picture.shape[0] > 128 and picture.shape[1] > 5 * 128  # images and three methods
     assert picture.std() > 30 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000

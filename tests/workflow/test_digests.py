@@ -40,6 +40,7 @@ REACH = {
     "train": {"matching", "dataset", "products"},
     "match": {"matching", "dataset", "products"},
     "score": {"matching", "dataset", "products"},
+    "submission": {"matching", "dataset", "products"},
     "benchmark_tables": {"matching", "dataset", "products"},
     "predict_scene": {"matching", "products"},
     "dsm": {"matching", "epipolar", "products"},

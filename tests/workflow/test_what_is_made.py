@@ -20,7 +20,7 @@ def folders() -> set[str]:
 
 
 def test_the_folders_are_those_of_the_design():
-    of_design = {"results", "logs", "tiles", "dataset", "benchmark", "audit", "data"}
+    of_design = {"results", "logs", "tiles", "dataset", "benchmark", "audit", "data", "submission"}
     assert folders() == of_design | {"originals"}  # these if the configuration asks for them
 
 

@@ -55,6 +55,7 @@ rule score:
         script=content_of("../scripts/score.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
+        protocol=lambda w: dataset_settings(w.dataset).get("protocol"),
         label=lambda w: method_label(w.method),
         fine_tuned_of=lambda w: method_settings(w.method).get("fine_tuned_of"),
         thresholds_px=list(SETTINGS.benchmark.thresholds_px),
@@ -68,6 +69,35 @@ rule score:
         "../scripts/score.py"
 
 
+rule submission:
+    input:
+        predictions=rules.match.output[0],
+        scores=rules.score.output[0],
+    output:
+        directory("submission/{dataset}/{method}"),
+    log:
+        "logs/submission/{dataset}/{method}.log",
+    benchmark:
+        "logs/submission/{dataset}/{method}.tsv"
+    wildcard_constraints:
+        dataset="[^/]+",
+        method="[^/.]+",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=30,
+    params:
+        made=lambda w: making_of(rules.submission, w),
+        script=content_of("../scripts/submission.py"),
+        code=source_digest("matching.benchmark.submission"),
+    message:
+        "Packing the results of {wildcards.method} on dataset {wildcards.dataset}"
+    script:
+        "../scripts/submission.py"
+
+
 rule benchmark_tables:
     input:
         dataset=lambda w: dataset_folder(w.dataset),
@@ -76,9 +106,18 @@ rule benchmark_tables:
     output:
         tables=expand(
             "benchmark/{{dataset}}/{table}.{kind}",
-            table=("table5", "table6", "table7", "strata", "differences"),
+            table=(
+                "table5",
+                "table6",
+                "table7",
+                "strata",
+                "differences",
+                "confidence",
+                "published",
+            ),
             kind=("csv", "md"),
         ),
+        curves="benchmark/{dataset}/confidence.png",
         figure=report(
             "benchmark/{dataset}/figure10.png",
             caption="../report/figure10.rst",
@@ -110,7 +149,10 @@ rule benchmark_tables:
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.compare_methods"),
-        templates=templates_of("matching", "benchmark", "page.html.jinja"),
+        templates=[
+            templates_of("matching", "benchmark", page)
+            for page in ("page.html.jinja", "confidence.html.jinja")
+        ],
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

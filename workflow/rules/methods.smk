@@ -20,8 +20,9 @@ def dataset_settings(name):
 
 
 def dataset_entry(name):
-    """What a dataset is: its entry without the methods that are compared on it."""
-    return {key: value for key, value in dataset_settings(name).items() if key != "methods"}
+    """What a dataset is: its entry without the methods that are compared on it, and how."""
+    asked = ("methods", "protocol")
+    return {key: value for key, value in dataset_settings(name).items() if key not in asked}
 
 
 def dataset_folder(name):

@@ -26,5 +26,6 @@ if __name__ == "__main__":
             seed=params.seed,
             panels=params.panels,
             fine_tuned_of=params.fine_tuned_of,
+            protocol=params.protocol,
             products=Products(*own) if snakemake.input.strata else None,
         )

@@ -27,6 +27,10 @@ class Settings:
     """whether the larger of two disparities is the higher place (true if it is not given): holes of
     a disparity map are filled with the lower one"""
 
+    protocol: Literal["whu-2023", "us3d-track2", "exact-2026"] | None = None
+    """frozen definition of its scores, see [below](#protocols); null or not given: what the section
+    says"""
+
     methods: Annotated[tuple[Text, ...] | None, Unit("names")] = None
     """methods that the target `benchmark` compares; null or not given: all that need no training
     (no networks without `weights`)"""

@@ -33,6 +33,10 @@ def _weights(settings: Mapping[str, Any]) -> list[Path]:
     return [Path(settings["weights"])] if settings.get("weights") else []
 
 
+def _pipeline(settings: Mapping[str, Any]) -> list[Path]:
+    return [Path(settings["pipeline"])] if settings.get("pipeline") else []
+
+
 def _results(settings: Mapping[str, Any]) -> list[Path]:
     return sorted(file for file in Path(settings.get("folder", "")).glob("*") if file.is_file())
 
@@ -112,7 +116,7 @@ class Kind:
     its methods (None: they cannot run). ``files``: those that a method is made of, from the
     settings of its entry. ``network``: ``module:class`` of this package; such methods are trained.
     ``tiles_at_once``: whether several tiles of a scene are worked on at once, a thread each;
-    else the method itself has all threads.
+    else the method itself has all threads. ``extra``: that this package is installed with for it.
     """
 
     label: str = ""
@@ -120,6 +124,7 @@ class Kind:
     files: Files = _none
     network: str | None = None
     tiles_at_once: bool = False
+    extra: str = ""
 
     @property
     def is_network(self) -> bool:
@@ -135,11 +140,12 @@ class Kind:
 
 def _network(label: str, of: str) -> Kind:
     module = "matching.networks.inference"
-    return Kind(label, module, _weights, network=f"matching.networks.{of}")
+    return Kind(label, module, _weights, f"matching.networks.{of}", extra="networks")
 
 
 KINDS = {
     "sgm": Kind("SGM", "matching.sgm", tiles_at_once=True),
+    "pandora": Kind("Pandora", "matching.pandora_pipeline", _pipeline, extra="pandora"),
     "stereonet": _network("StereoNet", "stereonet:StereoNet"),
     "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
     "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
@@ -179,5 +185,5 @@ def need_pytorch(name: str, kind: str) -> None:
     if not all(map(find_spec, ("torch", "tqdm"))):
         raise InputError(
             f"{kind} needs PyTorch and tqdm, which are not installed",
-            remedy="pip install '.[networks]'",
+            remedy=f"pip install '.[{KINDS[kind].extra}]'",
         )

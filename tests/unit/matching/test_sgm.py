@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.matching.sgm import MODES, GreyMapping, SemiGlobalMatcher, grey_mapping, to_8_bits
+from stereotruth.matching.sgm import (
+    MODES,
+    GreyMapping,
+    SemiGlobalMatcher,
+    grey_mapping,
+    peak_ratio,
+    to_8_bits,
+)
 
 H, W = 60, 160
 
@@ -173,3 +180,42 @@ def test_the_left_right_check_can_be_switched_off():
         for px in (1, None)
     )
     assert np.isnan(not_checked).sum() < np.isnan(checked).sum()
+
+
+def spoilt():
+    """A pair of shift 5 of which a patch of the right image shows something else."""
+    left, right = pair(5)
+    right[20:40, 60:100] = pair(5, seed=8)[1][20:40, 60:100]
+    return left, right
+
+
+@pytest.mark.parametrize("kind", ["left_right", "peak_ratio"])
+def test_uncertainties_are_larger_where_the_images_differ(kind):
+    loose = {"left_right_px": None, "speckle_px": 0, "uniqueness_percent": 0}
+    matcher = SemiGlobalMatcher(uncertainty=kind, **loose)
+    found, sigma = matcher.with_uncertainty(*spoilt(), (-16, 16))
+    assert np.array_equal(found, SemiGlobalMatcher(**loose)(*spoilt(), (-16, 16)), equal_nan=True)
+    assert sigma.dtype == np.float32 and np.nanmin(sigma) >= 0
+    assert np.isnan(sigma[np.isnan(found)]).all()
+    assert np.isfinite(sigma[np.isfinite(found)]).mean() > 0.9
+    good, bad = sigma[5:15, 20:-20], sigma[24:36, 75:95]
+    assert np.nanmedian(bad) > 3 * np.nanmedian(good)
+    if kind == "left_right":
+        assert np.nanmedian(good) < 0.1
+
+
+def test_without_being_asked_for_there_is_no_uncertainty():
+    assert SemiGlobalMatcher().with_uncertainty(*pair(5), (-16, 16))[1] is None
+    with pytest.raises(InputError, match="SGM has no uncertainty 'entropy'"):
+        SemiGlobalMatcher(uncertainty="entropy")
+
+
+@pytest.mark.parametrize("limits", [(-16, 16), (-40, -8), (4, 36)])
+def test_the_peak_ratio_of_a_shift_is_small_in_any_range(limits):
+    shift = sum(limits) // 2 + 2
+    left, right = pair(shift, np.uint8)
+    found = np.full((H, W), shift, np.float32)
+    ratio = peak_ratio(found, left, right, limits)[5:-5]
+    seen = inside(shift) & inside(shift + 8) & inside(shift - 8)
+    assert np.median(ratio[:, seen]) < 0.2
+    assert np.median(peak_ratio(found + 4, left, right, limits)[5:-5][:, seen]) == 1

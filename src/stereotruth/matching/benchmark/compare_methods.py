@@ -10,10 +10,13 @@ import numpy as np
 
 from ...dataset.stereo_dataset import StereoDataset
 from ...products.rasters import read_image
+from .confidence_table import confidence_table, draw_curves
 from .differences import differences
 from .page import write_benchmark
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction
+from .protocols import one_id
+from .published_rows import beside_published
 from .score_method import choose
 from .scores import Scorer
 from .tables import make_tables, read_scores, write_tables
@@ -34,16 +37,22 @@ def compare(
     seed: int,
     index: str | Path | None = None,
 ) -> None:
-    """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
+    """Write tables, ``figure10.png``, ``confidence.png`` and ``index.html`` to ``out``.
 
     ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
     intervals of differences come from; ``index``: the page of all pages, for a link.
+
+    Raises InputError if a method has no scores, or two have theirs by different protocols.
     """
     out = Path(out)
     methods = read_scores(scores)
     trained = [pair.city for pair in dataset.pairs() if pair.split == "train"]
     tables = make_tables(methods, trained, beside_paper=dataset.layout != "us3d")
     tables.append(differences(methods, scores, seed=seed))
+    tables.append(confidence_table(methods))
+    tables.append(beside_published(methods))
+    protocol = one_id(methods)
+    tables = [table.by(protocol) for table in tables]
     write_tables(tables, out)
     scorer = Scorer(dataset.disparity_range)
     columns = []
@@ -62,8 +71,11 @@ def compare(
             )
         )
     draw_columns(out / "figure10.png", columns)
+    curves = out / "confidence.png"
+    shown = curves if draw_curves(curves, methods, scores) else None
+    figure = out / "figure10.png"
     write_benchmark(
-        out / "index.html", dataset.name, methods, tables, scores, out / "figure10.png", index=index
+        out / "index.html", dataset.name, methods, tables, scores, figure, shown, index=index
     )
     for line in tables[0].markdown().splitlines():
         if line.startswith("|"):

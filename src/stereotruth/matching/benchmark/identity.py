@@ -18,6 +18,7 @@ from ...products.provenance import file_sha256
 from ..kinds import names_of, place_of
 
 GIB = 1 << 30
+INSTALLED = {"sgm": "cv2", "pandora": "pandora"}  # packages that kinds are made of
 
 
 def identity(
@@ -26,8 +27,8 @@ def identity(
     """Licence, version and checksums of a method, from its configuration entry.
 
     ``licence`` and ``version``: as the entry states them, else those of the installed distribution
-    that holds SGM or the user's function, else None. ``files``: SHA-256 of the method's files by
-    name (weights, the user's code). ``code``: digest of this package's code that runs it.
+    that holds SGM, Pandora or the user's function, else None. ``files``: SHA-256 of the method's
+    files by name (weights, the user's code). ``code``: digest of this package's code that runs it.
     """
     found = _distribution(settings)
     licence = settings.get("licence") or (found and _licence(found))
@@ -63,9 +64,9 @@ def _processor() -> str:
 
 
 def _distribution(settings: Mapping[str, Any]) -> Distribution | None:
-    """The installed one that SGM or the user's function comes from."""
-    if settings["kind"] == "sgm":
-        top = "cv2"
+    """The installed one that SGM, Pandora or the user's function comes from."""
+    if settings["kind"] in INSTALLED:
+        top = INSTALLED[settings["kind"]]
     elif settings["kind"] == "function":
         try:
             place, _ = place_of(settings["function"])

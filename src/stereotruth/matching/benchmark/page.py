@@ -30,13 +30,14 @@ def write_benchmark(
     tables: Sequence[Table],
     scores: Sequence[str | Path],
     figure: str | Path | None,
+    curves: str | Path | None = None,
     *,
     index: str | Path | None = None,
 ) -> None:
     """Write the page of a dataset.
 
     ``methods``: their summaries; ``scores``: their folders, with pictures of tiles; ``figure``:
-    figure 10; ``index``: the page of all pages.
+    figure 10; ``curves``: the sparsification curves; ``index``: the page of all pages.
     """
     panels = {
         of["label"]: sorted((Path(folder) / "panels").glob("*.png"))
@@ -57,6 +58,7 @@ def write_benchmark(
         "charts": [chart for chart in charts if chart],
         "sections": sections(tables, methods, methods[0]["thresholds_px"]),
         "figure": None if figure is None else encode_file(Path(figure), FIGURE_BYTES, FIGURE_PX),
+        "curves": None if curves is None else encode_file(Path(curves), FIGURE_BYTES, FIGURE_PX),
         "panels": {
             label: [(file.stem, encode_file(file, allowed, PANEL_PX)) for file in files]
             for label, files in panels.items()

@@ -93,6 +93,7 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row], limits: Sequence[floa
             Figure(f"D1, {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f")
             for limit in limits
         ),
+        Figure("valid only: median, px", "median_px"),
         Figure("valid only: EPE, px", "epe_px"),
         Figure(f"valid only: D1, {first:g} px, %", f"d1_{first:g}_px_share", 100, ".2f"),
         Figure("valid, %", "valid_share", 100, ".2f", more=True),

@@ -43,6 +43,7 @@ from ..methods import MOVED, TOLD, make_method
 from ..result_files import SUFFIXES, read_result
 from .identity import identity, machine
 from .prediction_files import RECORD, UNCERTAINTY
+from .submission import SUBMITTED, Submission
 
 MB = 1 << 20
 
@@ -123,6 +124,7 @@ def predict(
         "device": maker.device,
         "threads": workers,
         **_summary(found),
+        **({SUBMITTED: maker.submission.scores} if maker.submission else {}),
         "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
@@ -141,6 +143,8 @@ def predict(
 
 class _Runs:
     """Makes the disparity of pairs by a method; the method is made when the first is asked for."""
+
+    submission = None
 
     def __init__(
         self, name: str, settings: Mapping[str, Any], range_px: tuple[int, int], workers: int
@@ -202,6 +206,7 @@ class _Results:
             raise InputError(
                 f"method {name!r}: no such folder", file=folder, remedy="name a folder of results"
             )
+        self.submission = Submission.of(folder)
 
     def _file(self, name: str) -> Path | None:
         candidates = (self._folder / f"{name}{end}" for end in SUFFIXES)
@@ -217,7 +222,10 @@ class _Results:
                 remedy=f"put {pair.name}.tif there",
             )
         uncertainty = self._file(f"{pair.name}_{UNCERTAINTY}")
-        return [file] if uncertainty is None else [file, uncertainty]
+        files = [file] if uncertainty is None else [file, uncertainty]
+        if self.submission:
+            self.submission.check(files)
+        return files
 
     def __call__(self, pairs: Sequence[Pair]) -> Iterator[Matched]:
         """Disparities of pairs."""

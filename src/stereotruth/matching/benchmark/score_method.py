@@ -1,7 +1,8 @@
 """A method's predictions of a dataset against its labels: a folder of scores and pictures.
 
 scores.csv   a row per tile
-cities.csv   a row per city, and one of all, with 95 % confidence intervals
+cities.csv   a row per city, and one of all, with 95 % confidence intervals, and the median absolute
+             error of the valid pixels (``median_px``; what is beyond 16 px counts as 16)
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
 scores.json  all of it but the tiles, with settings, time and memory, and of methods that state
              uncertainties what :mod:`.confidence` says of them by stratum
@@ -21,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
+from ...error_statistics import ErrorSum
+from ...errors import InputError
 from ...job import progress
 from ...products.files import whole_folder, write_table
 from ...products.rasters import read_image
@@ -28,8 +31,10 @@ from .confidence import SHARES, Confidence
 from .cumulative import Cumulative
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction, read_record, read_uncertainty
+from .protocols import pair_sha256, protocol_of
 from .scores import ALL, Collector, Scorer, Scores
 from .strata import Products, exact_truth, height_m_per_px, label_strata
+from .submission import SUBMITTED, hold_against
 
 log = logging.getLogger("stereotruth")
 
@@ -47,15 +52,20 @@ def score(
     panels: int,
     fine_tuned_of: str | None = None,
     products: Products | None = None,
+    protocol: str | None = None,
 ) -> dict[str, Any]:
     """Score the predictions of rule match; returns what scores.json holds.
 
     ``label``: how the method is called in pictures and tables; ``fine_tuned_of``: the method whose
     training it carried on; ``panels``: most tiles that are drawn; ``products``: where the strata of
-    the workflow's own dataset come from.
+    the workflow's own dataset come from; ``protocol``: see :mod:`.protocols`, it precedes the other
+    settings.
 
-    Raises InputError if there are no labelled pairs, or files are missing.
+    Raises InputError if there are no labelled pairs, files are missing, the protocol is not one for
+    the dataset, or a submission's scores are others.
     """
+    of_protocol = protocol_of(protocol, dataset, split, thresholds_px)
+    thresholds_px = of_protocol.thresholds_px
     pairs = dataset.pairs(split, labelled=True)
     products = products or Products()
     record = read_record(predictions)
@@ -63,17 +73,26 @@ def score(
     collector = Collector(thresholds_px)
     confidences: dict[str, Confidence] = {}
     cumulative = Cumulative(thresholds_px)
+    errors: dict[str, ErrorSum] = {}
+    scored: list[tuple[str, str]] = []
     drawn = {pair.name for pair in choose(pairs, panels)}
     with whole_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
             found, truth = read_prediction(predictions, pair), dataset.labels(pair)
             strata_of_labels = label_strata(pair, truth, products)
             exact_of_pair = exact_truth(pair, products)
+            if of_protocol.truth == "exact":
+                truth = _visible(pair, exact_of_pair)
+            truths = [truth, *exact_of_pair.values()] if of_protocol.truth == "exact" else [truth]
+            scored.append((pair.name, pair_sha256(pair, truths)))
             here = scorer.counted(truth)
             cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
             sums = scorer.sums(found, truth, strata_of_labels)
             for stratum, exact in exact_of_pair.items():
                 sums[stratum] = scorer.sums(found, exact)[ALL]
+            error = (found - truth)[here]
+            for place in (pair.city, ALL):
+                errors.setdefault(place, ErrorSum()).add(error[np.isfinite(error)])
             sigma = read_uncertainty(predictions, pair)
             if sigma is not None:
                 by_stratum = {
@@ -93,10 +112,13 @@ def score(
                 draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
         scores = collector.scores()
         sampling = {"times": bootstrap, "seed": seed}
+        medians = {place: of.figures()["median_absolute"] for place, of in errors.items()}
         cities = [
-            _row(scores, {"city": city}, sampling, scores.in_city(city)) for city in _cities(scores)
+            _row(scores, {"city": city}, sampling, scores.in_city(city))
+            | {"median_px": medians[city]}
+            for city in _cities(scores)
         ]
-        total = _row(scores, {"city": ALL}, sampling)
+        total = _row(scores, {"city": ALL}, sampling) | {"median_px": medians[ALL]}
         strata = [
             _row(scores, {"stratum": name}, sampling, stratum=name)
             for name in scores.strata
@@ -105,7 +127,8 @@ def score(
         summary = {
             "label": label,
             "fine_tuned_of": fine_tuned_of,
-            **{key: record[key] for key in record if key != "pairs"},
+            **{key: record[key] for key in record if key not in ("pairs", SUBMITTED)},
+            "protocol": of_protocol.identified(scored),
             "tiles": len(pairs),
             "thresholds_px": list(scores.thresholds_px),
             "bootstrap": bootstrap,
@@ -115,6 +138,8 @@ def score(
             "strata": strata,
             "confidence": [{"stratum": s, **of.figures()} for s, of in confidences.items()],
         }
+        if SUBMITTED in record:
+            hold_against(record[SUBMITTED], summary)
         tiles = [
             {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
             for n, pair in enumerate(pairs)
@@ -162,6 +187,16 @@ def choose(pairs: Sequence[Pair], most: int) -> list[Pair]:
         index = np.linspace(0, len(of) - 1, count[city] + 2)[1:-1] if count[city] < len(of) else ()
         chosen += [of[round(k)] for k in index] if len(index) else (of if count[city] else [])
     return chosen
+
+
+def _visible(pair: Pair, exact: Mapping[str, np.ndarray]) -> np.ndarray:
+    if not exact:
+        raise InputError(
+            f"pair {pair.name} has no exact truth, by which its protocol scores",
+            file=pair.left,
+            remedy="take the workflow's own dataset of synthetic cities, or another protocol",
+        )
+    return exact["exact_visible"]
 
 
 def _cities(scores: Scores) -> list[str]:

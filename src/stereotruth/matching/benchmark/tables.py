@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,11 @@ class Table:
     def columns(self) -> list[str]:
         """Of the CSV file, in order of appearance."""
         return list(dict.fromkeys(key for row in self.rows for key in row)) or ["method"]
+
+    def by(self, protocol: str) -> Table:
+        """The table with the id of the protocol that its scores are made by."""
+        rows = [{"protocol": protocol, **row} for row in self.rows]
+        return replace(self, title=f"{self.title} ({protocol})", rows=rows)
 
     def markdown(self) -> str:
         """What is to be read."""
@@ -114,6 +119,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
                     _percent(of["all"], f"filled_d1_{limit:g}_px_share", interval=False)
                     for limit in of["thresholds_px"][1:]
                 ),
+                _number(of["all"].get("median_px"), 1, ".3f"),
                 _px(of["all"], "epe_px", interval=False),
                 _percent(of["all"], d1, interval=False),
                 _percent(of["all"], "valid_share", interval=False),
@@ -127,7 +133,8 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
         "EPE (px)",
         f"D1, {limits[0]:g} px (%)",
         *(f"D1, {limit:g} px (%)" for limit in limits[1:]),
-        "valid only: EPE",
+        "valid only: median (px)",
+        "EPE (px)",
         "D1 (%)",
         "valid (%)",
         "Time (ms)",
@@ -333,4 +340,9 @@ def _what(methods: Sequence[Row]) -> str:
     of = methods[0]
     low, high = of["disparity_range"]
     split = f"split {of['split']}" if of["split"] else "all splits"
-    return f"Dataset {of['dataset']}, {split}, {of['tiles']} pairs, disparities [{low}, {high}) px."
+    exact = of.get("protocol", {}).get("truth") == "exact"
+    more = " Labelled: by the exact truth, all that both views see." if exact else ""
+    where = (
+        f"Dataset {of['dataset']}, {split}, {of['tiles']} pairs, disparities [{low}, {high}) px."
+    )
+    return where + more

@@ -10,13 +10,13 @@ from .layers import (
     Conv2d,
     Conv3d,
     ConvTranspose3d,
+    SoftArgmin,
     concatenation_volume,
     initialise,
     normalised,
     planes,
     residuals,
     resize,
-    soft_argmin,
 )
 
 CHANNELS = 16
@@ -107,6 +107,7 @@ class HMSMNet(nn.Module):
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
         self.set_range(disparity_range)
+        self.expected = SoftArgmin()
         self.features = Features(channels)
         self.hourglasses = nn.ModuleList(Hourglass(2 * CHANNELS) for _ in SCALES)
         self.estimators = nn.ModuleList(Conv3d(CHANNELS, 1, bias=True) for _ in SCALES)
@@ -140,7 +141,7 @@ class HMSMNet(nn.Module):
             if k < 2:
                 x = self.fused[1 - k](self.fusions[1 - k](x, volumes[k]))
             if k == 0 or self.training:
-                found.append(soft_argmin(self.estimators[k](x).squeeze(1), self.planes[k][0]))
+                found.append(self.expected(self.estimators[k](x).squeeze(1), self.planes[k][0]))
         disparity = 4 * resize(found[-1].unsqueeze(1), left.shape[2:])
         hints = torch.cat([disparity, left, *gradients(left)], 1)
         final = (disparity + self.refinement(hints)).squeeze(1)

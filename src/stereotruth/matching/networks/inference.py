@@ -1,5 +1,14 @@
 """The stereo networks as methods of the benchmark: scaling of images, weight files, inference.
 
+``uncertainty`` of an entry states a standard uncertainty:
+
+=======  ==========================================================================================
+entropy  the standard deviation of a uniform distribution as wide as the planes that the last
+         softmax is spread over, by the exponential of its entropy (:func:`.layers.perplexity`)
+flips    the spread (:mod:`..spread`) between the disparities of the pair and of the pair upside
+         down, which takes twice the time
+=======  ==========================================================================================
+
 A weight file (``.pt``) holds a network's weights and what is needed to use them: kind, disparity
 range, channels, scaling of the images, and where they come from.
 """
@@ -7,6 +16,7 @@ range, channels, scaling of the images, and where they come from.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -18,8 +28,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...errors import InputError
+from ..spread import spread
 from .image_scaling import Scaling, image_statistics, scaled
-from .layers import channels_last
+from .layers import channels_last, perplexity, resize
 from .load_network import load_network
 from .weights import SavedNetwork, covering
 
@@ -45,6 +56,7 @@ def choose_device(wanted: str | None) -> torch.device:
         ) from error
 
 
+UNCERTAINTIES = (None, "entropy", "flips")
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
@@ -63,11 +75,20 @@ class NetworkMethod:
     """A network with its weights as a method; see :class:`stereotruth.matching.methods.Matcher`."""
 
     def __init__(
-        self, model: SavedNetwork, network: nn.Module, device: torch.device, precision: str
+        self,
+        model: SavedNetwork,
+        network: nn.Module,
+        device: torch.device,
+        precision: str,
+        uncertainty: str | None = None,
     ) -> None:
+        self._uncertainty = uncertainty
+        self._planes: Tensor | None = None  # that the last softmax was spread over
         self.model, self.device, self.precision = model, device, precision
         self.network = channels_last(network.eval().to(device))
         self.margin_px = network.margin_px
+        if uncertainty == "entropy":
+            network.expected.register_forward_hook(self._seen)
         self._range = model.disparity_range
 
     def _look_for(self, wanted: tuple[int, int]) -> None:
@@ -100,6 +121,33 @@ class NetworkMethod:
         A ``disparity_range`` other than that of the training is taken, widened to the
         network's planes.
         """
+        return self._found(left, right, disparity_range, scaling)[0]
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: tuple[int, int],
+        scaling: Scaling | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """The disparity, and its standard uncertainty [H, W] px if one is asked for."""
+        found, sigma = self._found(left, right, disparity_range, scaling)
+        if self._uncertainty == "flips":
+            turned = (np.ascontiguousarray(image[::-1]) for image in (left, right))
+            again, _ = self._found(*turned, disparity_range, scaling)
+            sigma = spread(found, again[::-1])
+        return found, sigma
+
+    def _seen(self, part: nn.Module, given: tuple[Any, ...], found: Tensor) -> None:
+        self._planes = perplexity(given[0])
+
+    def _found(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: tuple[int, int],
+        scaling: Scaling | None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         self._look_for(disparity_range)
         height, width = left.shape[:2]
         rows, cols = padding(height, width, self.network.divisor)
@@ -111,12 +159,18 @@ class NetworkMethod:
             found: Tensor = self.network(*both)[-1]
         disparity = found[0, :height, :width].float().cpu().numpy()
         seen = (left if left.ndim == 2 else left.any(axis=2)) != 0
-        return np.where(seen, disparity, np.float32(np.nan))
+        sigma = None
+        if self._planes is not None:
+            # a plane is as wide as a pixel of the volume
+            wide = self._planes * (both[0].shape[2] / self._planes.shape[1])
+            full = resize(wide[:, None], both[0].shape[2:])[0, 0, :height, :width].cpu().numpy()
+            sigma = np.where(seen, full / np.float32(math.sqrt(12)), np.float32(np.nan))
+        return np.where(seen, disparity, np.float32(np.nan)), sigma
 
 
 def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> NetworkMethod:
     """The method of a configuration entry: ``weights`` (a .pt, or Keras' .h5), ``device``,
-    ``precision``, and for .h5 ``scaling``; ``workers`` threads on a CPU (0: all cores).
+    ``precision``, ``uncertainty``, for .h5 ``scaling``; ``workers`` threads on a CPU (0: all).
 
     Raises InputError if the weights are missing or those of another network.
     """
@@ -130,7 +184,13 @@ def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> Net
         raise InputError(
             f"weights of {model.kind}, not of {kind}", file=path, remedy="correct the kind"
         )
+    if (uncertainty := settings.get("uncertainty")) not in UNCERTAINTIES:
+        raise InputError(
+            f"method {name!r}: no uncertainty {uncertainty!r} of a network",
+            remedy=f"take one of {', '.join(filter(None, UNCERTAINTIES))}, or null",
+        )
     device = choose_device(settings.get("device"))
     if device.type == "cpu" and workers:
         torch.set_num_threads(workers)
-    return NetworkMethod(model, network, device, precision_of(settings.get("precision"), device))
+    precision = precision_of(settings.get("precision"), device)
+    return NetworkMethod(model, network, device, precision, uncertainty)

@@ -66,7 +66,7 @@ def _parts(network: nn.Module) -> Iterator[nn.Module]:
     for child in network.children():
         if isinstance(child, nn.ModuleList):
             yield from child
-        else:
+        elif any(True for _ in child.parameters()):
             yield child
 
 

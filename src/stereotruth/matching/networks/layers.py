@@ -254,6 +254,23 @@ def soft_argmin(cost: Tensor, first: float, step: float = 1.0) -> Tensor:
     return torch.einsum("ndhw,d->nhw", probability, candidates.float())
 
 
+class SoftArgmin(nn.Module):
+    """:func:`soft_argmin` as a part of a network, so that who looks on sees the costs."""
+
+    def forward(self, cost: Tensor, first: float, step: float = 1.0) -> Tensor:
+        """See the function."""
+        return soft_argmin(cost, first, step)
+
+
+def perplexity(cost: Tensor) -> Tensor:
+    """Number of planes that the softmax of [N, D, H, W] costs is spread over, [N, H, W], 1 to D.
+
+    The exponential of its entropy: D for D equal costs, 1 for one that is far below the others.
+    """
+    log = torch.log_softmax(-cost.float(), 1)
+    return torch.exp(-(log.exp() * log).sum(1))
+
+
 def resize(x: Tensor, size: Sequence[int]) -> Tensor:
     """[N, C, H, W] -> [N, C, *size]: bilinear between pixel centres, without a low-pass filter."""
     return F.interpolate(x, size=tuple(size), mode="bilinear", align_corners=False)

@@ -15,13 +15,13 @@ from .layers import (
     Conv3d,
     ConvTranspose3d,
     Residual,
+    SoftArgmin,
     concatenation_volume,
     initialise,
     normalised,
     planes,
     residuals,
     resize,
-    soft_argmin,
 )
 
 CHANNELS = 32
@@ -91,6 +91,7 @@ class PSMNet(nn.Module):
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
         self.set_range(disparity_range)
+        self.expected = SoftArgmin()
         n = CHANNELS
         self.features = Features(channels)
         self.before = nn.Sequential(_conv3d(2 * n, n // 2), _conv3d(n // 2, n // 2))
@@ -131,5 +132,5 @@ class PSMNet(nn.Module):
         A plane stands for the four disparities to which its cost would be spread, and thus for
         their mean; a pixel likewise for 4 x 4.
         """
-        disparity = soft_argmin(cost, 4 * self.planes[0] + 1.5, 4.0)
+        disparity = self.expected(cost, 4 * self.planes[0] + 1.5, 4.0)
         return F.interpolate(disparity.unsqueeze(1), scale_factor=4.0, mode="nearest").squeeze(1)

@@ -8,13 +8,13 @@ from torch import Tensor, nn
 from .layers import (
     Conv2d,
     Conv3d,
+    SoftArgmin,
     difference_volume,
     initialise,
     normalised,
     planes,
     residuals,
     resize,
-    soft_argmin,
 )
 
 CHANNELS = 32
@@ -83,6 +83,7 @@ class StereoNet(nn.Module):
     def __init__(self, disparity_range: tuple[int, int], channels: int = 1) -> None:
         super().__init__()
         self.set_range(disparity_range)
+        self.expected = SoftArgmin()
         self.features = Features(channels)
         self.aggregation = Aggregation()
         self.refinements = nn.ModuleList(Refinement(channels) for _ in range(3))
@@ -97,7 +98,7 @@ class StereoNet(nn.Module):
         size = left.shape[2:]
         volume = difference_volume(self.features(left), self.features(right), *self.planes)
         cost = self.aggregation(volume).squeeze(1)
-        disparity = soft_argmin(cost, self.planes[0]).unsqueeze(1)
+        disparity = self.expected(cost, self.planes[0]).unsqueeze(1)
         found = [disparity]
         for refine, scale in zip(self.refinements, (4, 2, 1)):
             image = left if scale == 1 else resize(left, [side // scale for side in size])

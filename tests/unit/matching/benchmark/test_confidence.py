@@ -66,6 +66,8 @@ def test_normal_errors_of_stated_spread_lie_in_their_intervals(rng):
         name = f"interval_{100 * level:g}_percent"
         assert found[f"{name}_coverage_share"] == pytest.approx(level, abs=4e-3)
         assert too_sure[f"{name}_coverage_share"] < level - 0.1
+    assert found["calibration_factor"] == pytest.approx(1, abs=0.01)
+    assert too_sure["calibration_factor"] == pytest.approx(2, abs=0.02)
     # 68.27 %: one standard deviation to either side
     assert found["interval_68.27_percent_mean_width_px"] == pytest.approx(2 * 1.6, rel=5e-3)
     assert 0 < found["ause_px"] < found["ause_random_px"]

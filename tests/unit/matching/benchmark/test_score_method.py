@@ -29,6 +29,7 @@ def test_a_folder_of_scores_holds_tiles_cities_strata_and_pictures(compared):
     kunming, wuhan, total = rows(folder / "cities.csv")
     assert (kunming["city"], wuhan["city"], total["city"]) == ("Kunming", "Wuhan", "all")
     assert int(total["labelled"]) == 6 * 24 * 28 and total["tiles"] == "6"
+    assert [float(of["median_px"]) for of in (kunming, wuhan, total)] == [0.5] * 3
     assert kunming["epe_px_low"] == ""  # three tiles are too few
     low, mean, high = (float(total[f"filled_epe_px{end}"]) for end in ("_low", "", "_high"))
     assert low < mean < high

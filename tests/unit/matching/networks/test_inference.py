@@ -57,6 +57,40 @@ def test_parts_of_an_image_share_its_scaling() -> None:
     assert np.array_equal(part, image_scaling.scaled(image, method().model, None)[:, :10])
 
 
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_the_entropy_of_the_softmax_is_an_uncertainty(kind: str) -> None:
+    """Of equal costs, that of a uniform distribution over all planes, in px of the image."""
+    model = SavedNetwork(kind, (-64, 64))
+    network = model.build()
+    image = np.random.default_rng(0).integers(1, 900, (2, 60, 70)).astype(np.uint16)
+    image[0, :3] = 0
+    sure = NetworkMethod(model, network, CPU, "float32", "entropy")
+    found, sigma = sure.with_uncertainty(*image, (-64, 64))
+    assert np.array_equal(found, sure(*image, (-64, 64)), equal_nan=True)
+    assert sigma.shape == (60, 70) and np.isnan(sigma[:3]).all()
+    planes = {"stereonet": 8, "psmnet": 4, "hmsmnet": 4}[kind]
+    least, most = planes / np.sqrt(12), 128 / np.sqrt(12)
+    assert np.nanmin(sigma) > 0.999 * least and np.nanmax(sigma) < 1.001 * most
+    with torch.no_grad():
+        network.expected.register_forward_pre_hook(lambda part, given: (0 * given[0], *given[1:]))
+    _, sigma = sure.with_uncertainty(*image, (-64, 64))
+    assert np.nanmin(sigma) == pytest.approx(most, rel=1e-4) == np.nanmax(sigma)
+
+
+def test_flips_that_agree_leave_no_uncertainty() -> None:
+    """What is the same upside down has none; other pairs have some."""
+    image = np.random.default_rng(0).integers(1, 900, (2, 64, 64)).astype(np.uint16)
+    network = method().network
+    network.forward = lambda left, right: [left[:, 0] - right[:, 0]]
+    of = NetworkMethod(method().model, network, CPU, "float32", "flips")
+    assert np.nanmax(of.with_uncertainty(*image, (-64, 64))[1]) == 0
+    rows = torch.arange(64.0)[:, None]
+    network.forward = lambda left, right: [(rows + 0 * left[:, 0])]
+    sigma = of.with_uncertainty(*image, (-64, 64))[1]
+    assert sigma[0, 0] == pytest.approx(61.03 / np.sqrt(2), rel=0.01)  # rms of 63, 61 and 59
+    assert method().with_uncertainty(*image, (-64, 64))[1] is None
+
+
 def test_any_range_can_be_looked_for() -> None:
     """No weight depends on the range: planes outside the training's are looked at like others."""
     image = np.random.default_rng(0).integers(1, 900, (2, 32, 64)).astype(np.uint16)

@@ -1,0 +1,113 @@
+"""The methods that state uncertainties side by side: a table by stratum, and their curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from ...products.files import read_table
+from ...products.pictures import save_figure
+from .scores import ALL
+from .tables import Table
+
+Row = Mapping[str, Any]
+Curve = tuple[list[float], list[float], list[float]]
+SHOWN = (50, 68.27, 90, 95)  # percent, of the intervals
+NONE = "No method states the uncertainty of its disparities."
+EXACT = ("exact_visible", "exact_hidden")
+
+
+def confidence_table(methods: Sequence[Row]) -> Table:
+    """What the uncertainties of each method are worth, by stratum.
+
+    ``methods``: summaries of one dataset. See :mod:`.confidence`.
+    """
+    title = "Confidence: stated uncertainties held against the errors"
+    stated = [of for of in methods if of["confidence"]]
+    rows = [
+        {"method": of["label"], **row}
+        for name in dict.fromkeys(row["stratum"] for of in stated for row in of["confidence"])
+        for of in stated
+        for row in of["confidence"]
+        if row["stratum"] == name and row["pixels"]
+    ]
+    if not rows:
+        return Table("confidence", title, [], [(NONE, ["Method"], [])])
+    lines = [
+        [
+            f"{row['method']}, {row['stratum'].replace('_', ' ')}",
+            f"{row['epe_px']:.3f}",
+            f"{row['ause_px']:.3f}",
+            _form(row["ause_share_of_random"], ".2f"),
+            *(f"{100 * row[f'interval_{k:g}_percent_coverage_share']:.1f}" for k in SHOWN),
+            f"{row['interval_90_percent_mean_width_px']:.2f}",
+            f"{row['calibration_factor']:.2f}",
+        ]
+        for row in rows
+    ]
+    heading = [
+        "Method, pixels",
+        "EPE (px)",
+        "AUSE (px)",
+        "of ignorance",
+        *(f"in {k:g} % interval (%)" for k in SHOWN),
+        "width of 90 % (px)",
+        "σ times",
+    ]
+    caption = (
+        "Valid pixels with an uncertainty. AUSE: area between the sparsification curve and an "
+        "oracle's, 0 at best; of ignorance: as a share of that of uncertainties that know nothing. "
+        "σ times: what the uncertainties would have to be multiplied by for one σ to hold 68.27 %."
+    )
+    return Table("confidence", title, rows, [(caption, heading, lines)])
+
+
+def read_curves(folder: str | Path) -> dict[str, Curve]:
+    """Curves by stratum of a method's ``sparsification.csv``.
+
+    Each has the share of pixels taken away (%), the mean error of the rest, and the oracle's (px).
+    """
+    found: dict[str, Curve] = {}
+    for row in read_table(Path(folder) / "sparsification.csv"):
+        values = (100 * float(row["removed_share"]), row["epe_px"], row["oracle_epe_px"])
+        for column, value in zip(found.setdefault(row["stratum"], ([], [], [])), values):
+            column.append(float(value))
+    return found
+
+
+def draw_curves(path: str | Path, methods: Sequence[Row], folders: Sequence[str | Path]) -> bool:
+    """PNG of the sparsification curves; returns whether any method has one.
+
+    ``folders``: of the methods' scores. Of synthetic cities, a plot of the visible pixels and one
+    of the hidden ones, by the exact truth; else one of all. The oracle's curves are thin.
+    """
+    curves = {
+        of["label"]: read_curves(folder) for of, folder in zip(methods, folders) if of["confidence"]
+    }
+    names = [name for name in EXACT if any(name in of for of in curves.values())] or [ALL]
+    figure = Figure(figsize=(5.0 * len(names) + 1.0, 4.2), layout="constrained")
+    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names):
+        for place, (label, of) in enumerate(curves.items()):
+            if name in of:
+                colour = colormaps["viridis"](place / max(len(curves), 2))
+                share, stated, oracle = of[name]
+                axis.plot(share, stated, color=colour, lw=1.8, label=label)
+                axis.plot(share, oracle, color=colour, lw=0.7)
+        axis.set(xlabel="most uncertain pixels taken away, %", ylabel="mean error of the rest, px")
+        axis.set_title(f"pixels: {name.replace('_', ' ')}", fontsize=10)
+        axis.set_xlim(0, 100)
+        axis.set_ylim(bottom=0)
+    if curves:
+        figure.axes[0].legend(title="thin: oracle", fontsize=8, title_fontsize=8, frameon=False)
+    else:
+        figure.axes[0].text(50, 0.5, NONE, ha="center")
+    save_figure(path, figure, dpi=120)
+    return bool(curves)
+
+
+def _form(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)

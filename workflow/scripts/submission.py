@@ -1,0 +1,13 @@
+"""The results of a stereo method, packed to be scored elsewhere."""
+
+from stereotruth.job import job
+from stereotruth.matching.benchmark.submission import pack
+from stereotruth.products.publication import publication
+
+if __name__ == "__main__":
+    of = snakemake.wildcards
+    with (
+        job(snakemake.log[0], f"submission {of.dataset} {of.method}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
+        pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])
