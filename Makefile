@@ -71,6 +71,6 @@ lock:
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark audit report.html bench/out docs/_build .snakemake
+	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark audit score_dsm report.html bench/out docs/_build .snakemake
 
 FORCE:

@@ -43,6 +43,7 @@ REACH = {
     "benchmark_tables": {"matching", "dataset", "products"},
     "predict_scene": {"matching", "products"},
     "dsm": {"matching", "epipolar", "products"},
+    "score_dsm": {"evaluation", "lidar", "products"},
 }
 # Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
 # there are, and a scene more is no other scene.

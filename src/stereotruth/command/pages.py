@@ -7,7 +7,12 @@ from pathlib import Path
 
 from ..errors import InputError
 
-PAGES = ("results/report/*/index.html", "benchmark/*/index.html", "audit/*/index.html")
+PAGES = (
+    "results/report/*/index.html",
+    "benchmark/*/index.html",
+    "audit/*/index.html",
+    "score_dsm/*/*/*/index.html",
+)
 
 
 def pages(words: Iterable[str] = ()) -> list[Path]:
