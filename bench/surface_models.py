@@ -34,7 +34,7 @@ from stereotruth.simulate.top_surface import top_surface
 
 Heights = NDArray[np.float64]
 CELL_M = 0.65
-SIDE_M = 900.0
+SIDE_M = 700.0
 NODATA = -9999.0
 SHIFT_M = (2.37, -1.41, 0.83)  # east, north, up
 TILT = 0.002  # m per m, along east

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from .edges import near_steps
 from .height_raster import Floats
@@ -16,12 +16,13 @@ from .reference import BUILDING, GROUND, OTHER, TREE, WATER, Lattice
 LIMITS_M = (1.0, 3.0)
 BIN_M = 0.005
 BINS = 40_001  # to ±100 m; what is beyond counts into the outer bins
-STEP_REACH_M = 3.0  # around a step: heights there say where the edge is
+STEP_REACH_M = 3.0  # around a step, or the shadow of one: heights there say where the edge is
+CROWN_REACH_M = 1.5  # around a crown, below which slanting pulses reach the ground
 SLOPES_DEG = (0.0, 5.0, 15.0, 30.0, 90.0)
 SMOOTH_M = 2.0  # over which slopes are taken
 SOLID = "all but trees and water"
-OPEN = "off steps"  # of them: the vertical error proper
-STEPS = f"within {STEP_REACH_M:g} m of steps"
+OPEN = "off steps"  # and off crowns: the vertical error proper
+STEPS = "beside steps and trees"
 
 
 @dataclass
@@ -103,9 +104,10 @@ def strata(lattice: Lattice, classified: bool) -> dict[str, NDArray[np.bool_]]:
     """The squares of each stratum, by its name; only of the lattice's own window."""
     kind, own = lattice.kind, lattice.own & np.isfinite(lattice.z)
     solid = own & (kind != TREE) & (kind != WATER)
-    step = near_steps(lattice, STEP_REACH_M)
-    open_places = solid & ~step
-    found = {OPEN: open_places, STEPS: solid & step, SOLID: solid}
+    reach = 2 * int(np.ceil(CROWN_REACH_M / lattice.step_m)) + 1
+    crown = maximum_filter(kind == TREE, reach, mode="nearest")
+    open_places = solid & ~near_steps(lattice, STEP_REACH_M) & ~crown & lattice.even
+    found = {OPEN: open_places, STEPS: solid & ~open_places, SOLID: solid}
     if classified:
         found["ground, off steps"] = open_places & (kind == GROUND)
         found["buildings, off steps"] = open_places & (kind == BUILDING)

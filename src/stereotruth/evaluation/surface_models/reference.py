@@ -29,7 +29,8 @@ KIND_OF_CLASS[[3, 4, 5]] = TREE
 KIND_OF_CLASS[9] = WATER
 KIND_OF_CLASS[[7, 18]] = NONE
 WALL_M = 1.5  # that a point on a wall lies below its roof at least
-SHADOW_M = 2.5  # from empty squares, where points on edges have no say in the registration
+BARE = 0.55  # share of empty squares around that makes a patch, which chance does not
+SHADOW_M = 2.5  # around such patches
 FINEST_M = 0.5  # side of the lattice's squares at least
 SLACK = 1.2  # squares are so much wider than the points' spacing: few are empty
 
@@ -40,8 +41,8 @@ class Lattice:
 
     Where a square has no point, ``z`` is NaN and ``kind`` NONE. ``step_m``: side of a square;
     rows run north to south, as the raster's do. ``own``: squares that lie in the window asked for,
-    without its margin. ``even``: squares with points all around; beside a wall's shadow one side of
-    an edge has none, and would pull the model over it.
+    without its margin. ``even``: squares with points all around; beside a wall's shadow an edge may
+    stand that no point tells.
     """
 
     x: Floats
@@ -182,7 +183,7 @@ def lattice_step(reference: Reference, model: HeightRaster) -> float:
 
 def _evenly(sampled: NDArray[np.bool_], step_m: float) -> NDArray[np.bool_]:
     """Squares without a patch of empty ones within SHADOW_M."""
-    bare = uniform_filter((~sampled).astype(np.float64), 3, mode="nearest") > 0.5
+    bare = uniform_filter((~sampled).astype(np.float64), 5, mode="nearest") > BARE
     return ~maximum_filter(bare, 2 * int(np.ceil(SHADOW_M / step_m)) + 1, mode="nearest")
 
 

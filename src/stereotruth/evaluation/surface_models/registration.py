@@ -87,13 +87,12 @@ def _cost(
     z: Floats,
     scale: float,
     farthest: float,
-) -> float:
+) -> tuple[float, int]:
     """Sum over places of a function that is quadratic near 0, then linear, and level at last.
 
-    ``col``, ``row``: in the window's cells. Places without a height count as far off, so that a
-    shift gains nothing by holes.
+    ``col``, ``row``: in the window's cells. Also the number of places that have a height.
     """
-    total = 0.0
+    total, known = 0.0, 0
     h, w = heights.shape
     for k in range(z.size):
         j, i = math.floor(col[k]), math.floor(row[k])
@@ -103,9 +102,11 @@ def _cost(
             d = (1 - v) * ((1 - u) * heights[i, j] + u * heights[i, j + 1])
             d += v * ((1 - u) * heights[i + 1, j] + u * heights[i + 1, j + 1])
             d -= z[k]
-        size = math.sqrt(d * d + scale * scale) - scale
-        total += size if size < farthest else farthest
-    return total
+        if math.isfinite(d):
+            size = math.sqrt(d * d + scale * scale) - scale
+            total += size if size < farthest else farthest
+            known += 1
+    return total, known
 
 
 def _thinned(parts: Sequence[Part], most: int, seed: int) -> list[Part]:
@@ -120,18 +121,21 @@ def _differences(parts: Sequence[Part], east: float, north: float) -> Floats:
     return np.concatenate([part.difference(east, north) for part in parts])
 
 
-def _mean_cost(parts: Sequence[Part], shift: Floats, scale: float, farthest: float) -> float:
-    total = sum(
-        _cost(
-            part.window.heights,
-            *part.window.cells(part.x + shift[0], part.y + shift[1]),
-            part.z + shift[2],
-            scale,
-            farthest,
-        )
-        for part in parts
-    )
-    return total / max(sum(part.x.size for part in parts), 1)
+def _mean_cost(
+    parts: Sequence[Part], shift: Floats, scale: float, *, holes_cost: bool = False
+) -> float:
+    """Mean over all places that have a height.
+
+    ``holes_cost``: the others count as far off, so that a search gains nothing by leaving it.
+    """
+    total, known, places = 0.0, 0, 0
+    for part in parts:
+        cells = part.window.cells(part.x + shift[0], part.y + shift[1])
+        cost, n = _cost(part.window.heights, *cells, part.z + shift[2], scale, FARTHEST_M)
+        total, known, places = total + cost, known + n, places + part.z.size
+    if holes_cost:
+        return (total + (places - known) * FARTHEST_M) / max(places, 1)
+    return total / known if known else FARTHEST_M
 
 
 def _search(parts: Sequence[Part]) -> tuple[float, float, float]:
@@ -146,7 +150,9 @@ def _search(parts: Sequence[Part]) -> tuple[float, float, float]:
                 if not np.isfinite(d).any():
                     continue
                 up = float(np.nanmedian(d))
-                cost = _mean_cost(parts, np.array([east, north, up]), LEAST_SCALE_M, FARTHEST_M)
+                cost = _mean_cost(
+                    parts, np.array([east, north, up]), LEAST_SCALE_M, holes_cost=True
+                )
                 best = min(best, (cost, float(east), float(north), up))
         centre, reach = best[1:3], step
     return best[1:]
@@ -156,7 +162,7 @@ def _fit(parts: Sequence[Part], start: Sequence[float], scale: float, size: floa
     """The shift (east, north, up) of least cost, from nearby."""
     start = np.asarray(start, dtype=np.float64)
     found = minimize(
-        lambda shift: _mean_cost(parts, shift, scale, FARTHEST_M),
+        lambda shift: _mean_cost(parts, shift, scale),
         start,
         method="Nelder-Mead",
         options={
