@@ -3,7 +3,7 @@
 A synthetic city is flown by LiDAR, its surface is written as a GeoTIFF, exact at the centres of the
 cells, and each fault is planted in a copy. See README.md beside this file.
 
-python bench/surface_models.py --city Qichun --json faults.json
+python bench/surface_models.py --json faults.json
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter
 
+from stereotruth.command.example_city import DEMO
 from stereotruth.evaluation.surface_models.height_errors import OPEN, SOLID
 from stereotruth.evaluation.surface_models.reference import LidarReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
@@ -33,8 +34,9 @@ from stereotruth.simulate.surfaces import IN_LIDAR
 from stereotruth.simulate.top_surface import top_surface
 
 Heights = NDArray[np.float64]
+EVERY = {"Demo": DEMO, **CITIES}
 CELL_M = 0.65
-SIDE_M = 700.0
+SIDE_M = 380.0
 NODATA = -9999.0
 SHIFT_M = (2.37, -1.41, 0.83)  # east, north, up
 TILT = 0.002  # m per m, along east
@@ -154,11 +156,11 @@ def show(name: str, row: dict[str, Any]) -> None:
 def main() -> None:
     """Print the table; ``--json`` keeps the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--city", choices=list(CITIES), default="Qichun")
+    parser.add_argument("--city", choices=list(EVERY), default="Demo")
     parser.add_argument("--fault", action="append", choices=["shift", *FAULTS], help="default: all")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    city = CITIES[given.city]
+    city = EVERY[given.city]
     scene = city.scenes[0]
     table: dict[str, dict[str, Any]] = {}
     print(

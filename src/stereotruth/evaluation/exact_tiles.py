@@ -51,6 +51,8 @@ def make_city(number: int, folder: str | Path, *, size: int, seed: int, workers:
                 f"an epipolar grid of {model.shape[0]} x {model.shape[1]} px",
                 remedy=f"make tiles smaller than {size} px",
             )
+        for kind in FOLDERS:
+            (out / kind).mkdir()
         for tile in range(TILES_A_CITY):
             first = row + tile // 2 * size, col + tile % 2 * size
             _write_tile(out, city, model, images, first, size, tile + 1)
