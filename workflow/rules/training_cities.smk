@@ -32,18 +32,18 @@ rule training_city:
 
 rule training_cities:
     input:
-        training=lambda w: expand(rules.training_city.output[0], number=cities_for(int(w.count))[0]),
+        training=lambda w: expand(rules.training_city.output[0], number=cities_for(int(w.tiles))[0]),
         validation=lambda w: expand(
-            rules.training_city.output[0], number=cities_for(int(w.count))[1]
+            rules.training_city.output[0], number=cities_for(int(w.tiles))[1]
         ),
     output:
-        directory("results/training_cities/{count}"),
+        directory("results/training_cities/{tiles}"),
     log:
-        "logs/training_cities/{count}.log",
+        "logs/training_cities/{tiles}.log",
     benchmark:
-        "logs/training_cities/{count}.tsv"
+        "logs/training_cities/{tiles}.tsv"
     wildcard_constraints:
-        count="[1-9][0-9]*",
+        tiles="[1-9][0-9]*",
     conda:
         CONDA
     threads: 1

@@ -5,7 +5,7 @@ from stereotruth.job import job
 from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
-    count = snakemake.wildcards.count
+    count = snakemake.wildcards.tiles
     with (
         job(snakemake.log[0], f"training_cities {count}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
