@@ -19,7 +19,8 @@ def test_labels_of_a_training_city_bring_the_right_image_to_the_left(tmp_path):
     dataset = StereoDataset("three", tmp_path / "three", "whu", (-64, 128))
     assert len(dataset.pairs("val")) == 4
     pairs = dataset.pairs("train", labelled=True)
-    assert [pair.name for pair in pairs] == ["Training5_1", "Training5_2", "Training5_3"]
+    names = [pair.left.name for pair in pairs]
+    assert names == [f"Training5_left_{k}.tiff" for k in (1, 2, 3)]
     for pair in pairs:
         left, right = (read_image(file).astype(float) for file in (pair.left, pair.right))
         labels = dataset.labels(pair)
