@@ -38,6 +38,7 @@ LOW, HIGH = 0.1, 0.9  # levels of the step
 ALONG_M = (-2.0, -1.0, 0.0, 1.0, 2.0)  # profiles of an edge, from its middle
 STEP_M = 0.25  # along a profile
 LEAST_RISE = 0.5  # share of the step from the ends' outer halves: the model has the edge
+GAPS = 0.6  # share of a profile that may lack, as behind walls; between its ends it is bridged
 KNOWN = 0.8  # share of a profile that has heights at least
 TOGETHER = 2000  # edges
 S = np.arange(-REACH_M + STEP_M / 2, REACH_M, STEP_M)  # m
@@ -174,14 +175,34 @@ class Profiles:
     share: Floats
 
 
-def measure(edges: Edges, height_at: Callable[[Floats, Floats], Floats]) -> Profiles:
-    """The edges in a model; ``height_at`` (x, y in m) gives its heights, registered."""
+def _bridged(z: Floats) -> Floats:
+    """Heights [..., s] with gaps filled linearly, where at most GAPS of a profile lacks."""
+    known = np.isfinite(z)
+    index = np.where(known, np.arange(S.size), -1)
+    before = np.maximum.accumulate(index, axis=-1)
+    index = np.where(known, np.arange(S.size), S.size)
+    after = np.minimum.accumulate(index[..., ::-1], axis=-1)[..., ::-1]
+    inside = (before >= 0) & (after < S.size) & (known.mean(axis=-1, keepdims=True) >= 1 - GAPS)
+    first, last = np.where(inside, before, 0), np.where(inside, after, 0)
+    low, high = (np.take_along_axis(z, k, -1) for k in (first, last))
+    part = (np.arange(S.size) - first) / np.maximum(last - first, 1)
+    return np.where(inside, low + part * (high - low), z)
+
+
+def measure(
+    edges: Edges, height_at: Callable[[Floats, Floats], Floats], *, bridge: bool = True
+) -> Profiles:
+    """The edges in a model; ``height_at`` (x, y in m) gives its heights, registered.
+
+    ``bridge``: gaps are bridged; they lie on one side of walls, and would pull a registration.
+    """
     n = [v[:, None, None] for v in (edges.nx, edges.ny)]
     along, s = np.array(ALONG_M)[:, None], S[None]
     x = edges.x[:, None, None] + n[0] * s - n[1] * along
     y = edges.y[:, None, None] + n[1] * s + n[0] * along
     step = (edges.top - edges.foot)[:, None, None]
-    share = (height_at(x, y) - edges.foot[:, None, None]) / step
+    z = height_at(x, y)
+    share = ((_bridged(z) if bridge else z) - edges.foot[:, None, None]) / step
     q = np.clip((share - LOW) / (HIGH - LOW), 0.0, 1.0)
     known = np.isfinite(q)
     whole = known.mean(axis=2) >= KNOWN  # [n, along]

@@ -217,7 +217,7 @@ class _Displaced:
             def height_at(x: Floats, y: Floats, window: Window = part.window) -> Floats:
                 return window.at(x + shift[0], y + shift[1]) - shift[2]
 
-            seen = measure(part.edges, height_at)
+            seen = measure(part.edges, height_at, bridge=False)
             normals.append(np.column_stack([part.edges.nx, part.edges.ny])[seen.found])
             outward.append(seen.outward[seen.found])
             group.append(np.full(int(seen.found.sum()), number))
