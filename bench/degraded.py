@@ -14,28 +14,26 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from whole_scene import parsed
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.matching.benchmark.scores import Collector, Scorer
+from stereotruth.matching.image_faults import (
+    FAULTS,
+    Fault,
+    Image,
+    as_images,
+    blur,
+    haze,
+    shadows,
+)
 from stereotruth.matching.methods import Matcher, make_method
 from stereotruth.products.rasters import read_image
 
-Image = NDArray[np.float32]
 Change = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
 THRESHOLD_PX = 3.0
-
-
-def smooth(shape: tuple[int, ...], wavelength: float, rng: np.random.Generator) -> Image:
-    """A random field of about 0 to 1 whose features are ``wavelength`` px wide."""
-    coarse = tuple(int(np.ceil(n / wavelength)) + 3 for n in shape)
-    values = rng.uniform(size=coarse).astype(np.float32)
-    size = tuple(int(n * wavelength) for n in reversed(coarse))
-    whole = cv2.resize(values, size, interpolation=cv2.INTER_CUBIC)
-    return whole[: shape[0], : shape[1]]
 
 
 def noise(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -44,21 +42,9 @@ def noise(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, I
     return tuple(image + rng.normal(0, sigma, image.shape) for image in (left, right))
 
 
-def haze(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """Half the contrast and more light, by places, in the right image."""
-    share = smooth(right.shape, 256, rng).clip(0, 1)
-    return left, right * (1 - 0.5 * share) + share * right.std()
-
-
-def shadows(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """An eighth of the right image at 0.4 of its brightness, in patches of some 40 px."""
-    field = smooth(right.shape, 40, rng)
-    return left, np.where(field > np.quantile(field, 0.875), 0.4 * right, right)
-
-
-def blur(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """The right image out of focus by 1.5 px."""
-    return left, cv2.GaussianBlur(right, (0, 0), 1.5)
+def on_the_right(fault: Fault) -> Change:
+    """A fault of the right image alone."""
+    return lambda left, right, rng: (left, fault(right, rng, 1.0))
 
 
 def upper_bits(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -69,10 +55,10 @@ def upper_bits(left: Image, right: Image, rng: np.random.Generator) -> tuple[Ima
 CHANGES: dict[str, tuple[Change, ...]] = {
     "as they are": (),
     "noise": (noise,),
-    "haze": (haze,),
-    "moved shadows": (shadows,),
-    "blur": (blur,),
-    "noise, haze, shadows, blur": (blur, shadows, haze, noise),
+    "haze": (on_the_right(haze),),
+    "moved shadows": (on_the_right(shadows),),
+    "blur": (on_the_right(blur),),
+    "noise, haze, shadows, blur": (*map(on_the_right, FAULTS.values()), noise),
     "upper 8 bits": (upper_bits,),
 }
 
@@ -85,10 +71,7 @@ def changed(
     images = [image.astype(np.float32) for image in (left, right)]
     for change in changes:
         images = list(change(*images, rng))
-    return [
-        np.where(image == 0, 0, np.clip(np.rint(new), 1, 65535)).astype(np.uint16)
-        for image, new in zip((left, right), images)
-    ]
+    return as_images(images, (left, right))
 
 
 def score(matcher: Matcher, dataset: StereoDataset, changes: tuple[Change, ...]) -> dict:

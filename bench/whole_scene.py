@@ -37,9 +37,8 @@ from stereotruth.products.grids import Layer, blocks, building, create_grid, req
 from stereotruth.products.pictures import colours, stretch
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
 from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.kernels import kernel
-from stereotruth.simulate.render import prepare, simulate_image
-from stereotruth.simulate.surfaces import IN_IMAGES, cast
+from stereotruth.simulate.render import simulate_image
+from stereotruth.simulate.top_surface import top_surface
 
 ROOT = Path(__file__).parents[1]
 SIZE = 4096
@@ -215,30 +214,14 @@ def untiled(folder: Path, method: str, settings: dict[str, Any], part: tuple[int
 # --------------------------------------------------------------------------------- surface model
 
 
-@kernel
-def _tops(s, xy, z, kind):
-    for n in range(xy.shape[0]):
-        z[n], kind[n], _, _, _, _, _ = cast(
-            s, s.lidar_top, xy[n, 0], xy[n, 1], 0.0, 0.0, IN_IMAGES, True, 0.0
-        )
-
-
 def true_surface(raster: Raster) -> tuple[np.ndarray, np.ndarray]:
     """Top surface of the synthetic world at the cells' centres, m, and its kind (0: none)."""
-    ready = prepare(CITY, SCENE)
     heights = np.full(raster.shape, np.nan, np.float32)
     kinds = np.zeros(raster.shape, np.uint8)
     for first in range(0, raster.shape[0], 256):
         rows = slice(first, min(first + 256, raster.shape[0]))
         row, col = np.mgrid[rows, 0 : raster.shape[1]].astype(float)
-        lon, lat = (v.ravel() for v in raster.ground(col, row))
-        places = np.column_stack([lon, lat, np.full(lon.size, CITY.base_height_m + 100.0)])
-        xyz = ready.frame.from_geodetic(places)
-        z, kind = np.empty(lon.size), np.empty(lon.size, np.uint8)
-        _tops(ready.surfaces, np.ascontiguousarray(xyz[:, :2]), z, kind)
-        xyz[:, 2] = z
-        heights[rows] = ready.frame.to_geodetic(xyz)[:, 2].reshape(row.shape)
-        kinds[rows] = kind.reshape(row.shape)
+        heights[rows], kinds[rows] = top_surface(CITY, *raster.ground(col, row))
     return heights, kinds
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from .evaluation.surface_models.page import describe as describe_surface_model
 from .matching.benchmark.score_method import describe
 
 
@@ -72,6 +73,11 @@ def _audit(product: str, dataset: str) -> Iterator[str]:
     yield f"Look at {product}/index.html"
 
 
+def _surface_model(product: str, scene: str, method: str) -> Iterator[str]:
+    line = describe_surface_model(_read(product, "scores.json"))
+    yield f"Surface model of {scene} by {method}: {line}; look at {product}/index.html"
+
+
 SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"tiles/([^/]+)": _tiles,
     r"results/evaluate/(?:[^/]+/)?([^/]+)/truth\.json": _against_truth,
@@ -84,4 +90,5 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"submission/[^/]+/[^/]+": _look,
     r"audit/([^/]+)": _audit,
     r"results/predict/.*_dsm\.tif": _look,
+    r"score_dsm/[^/]+/([^/]+)/([^/]+)": _surface_model,
 }

@@ -211,26 +211,31 @@ def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> No
             )
 
 
-def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
-    """The LAS/LAZ files of a scene's ``lidar`` cell (a folder or a glob), sorted.
-
-    Raises InputError if there is none.
-    """
-    pattern = Path(scene.lidar)
-    if pattern.is_dir():
-        found = [f for f in pattern.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES]
-    elif pattern.is_file():
-        found = [pattern]
+def lidar_files(pattern: str) -> list[Path]:
+    """The LAS/LAZ files of a folder or a glob, sorted. Raises InputError if there is none."""
+    path = Path(pattern)
+    if path.is_dir():
+        found = [f for f in path.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES]
+    elif path.is_file():
+        found = [path]
     else:
-        anchor = Path(pattern.anchor)
-        found = [f for f in anchor.glob(str(pattern.relative_to(anchor))) if f.is_file()]
+        anchor = Path(path.anchor)
+        found = [f for f in anchor.glob(str(path.relative_to(anchor))) if f.is_file()]
     if not found:
         raise InputError(
-            f"scene {scene.scene!r}: no LiDAR file at {scene.lidar!r}",
-            file=sheet,
+            f"no LiDAR file at {pattern!r}",
             remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
         )
     return sorted(found)
+
+
+def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
+    """The LAS/LAZ files of a scene's ``lidar`` cell, sorted. Raises InputError if there is none."""
+    try:
+        return lidar_files(scene.lidar)
+    except InputError as error:
+        problem = f"scene {scene.scene!r}: {error.problem}"
+        raise InputError(problem, file=sheet, remedy=error.remedy) from None
 
 
 def store_names(files: Iterable[Path]) -> dict[str, Path]:

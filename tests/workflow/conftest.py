@@ -81,7 +81,7 @@ def later(tiled, tmp_path_factory) -> Project:
     project = tiled.copy(tmp_path_factory.mktemp("later") / "project")
     run = project.snakemake(
         *("dataset", "report", "audit/synthetic", "benchmark/synthetic/sgm"),
-        "results/predict/Tiny/Tiny-1/sgm_dsm.tif",
+        *("results/predict/Tiny/Tiny-1/sgm_dsm.tif", "score_dsm/Tiny/Tiny-1/sgm"),
         *("--configfile", "tiny.yaml", "later.yaml"),
     )
     assert run.status == 0, run.text[-4000:]
@@ -93,6 +93,7 @@ def later(tiled, tmp_path_factory) -> Project:
         "look at benchmark/synthetic/sgm/cities.csv",
         "Audit of synthetic: ",
         "Look at results/predict/Tiny/Tiny-1/sgm_dsm.tif",
+        "Surface model of Tiny-1 by sgm: ",
     ):
         assert words in last
     assert "manifest.csv" not in last  # an earlier run has made the tiles

@@ -37,6 +37,24 @@ REACH = {
     "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
     "report_city": {"report", "dataset", "epipolar", "products"},
     "audit": {"evaluation", "alignment", "dataset", "epipolar", "products"},
+    "training_city": {
+        "evaluation",
+        "alignment",
+        "dataset",
+        "epipolar",
+        "lidar",
+        "simulate",
+        "products",
+    },
+    "training_cities": {
+        "evaluation",
+        "alignment",
+        "dataset",
+        "epipolar",
+        "lidar",
+        "simulate",
+        "products",
+    },
     "train": {"matching", "dataset", "products"},
     "match": {"matching", "dataset", "products"},
     "score": {"matching", "dataset", "products"},
@@ -44,6 +62,7 @@ REACH = {
     "benchmark_tables": {"matching", "dataset", "products"},
     "predict_scene": {"matching", "products"},
     "dsm": {"matching", "epipolar", "products"},
+    "score_dsm": {"evaluation", "lidar", "products"},
 }
 # Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
 # there are, and a scene more is no other scene.

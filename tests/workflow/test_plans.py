@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+import yaml
 
 from ..synthetic.project import ROOT
 
@@ -30,6 +31,20 @@ def test_exact_truth_is_planned_by_scene_and_by_city(project):
     jobs = project.plan("evaluate")
     assert jobs["grid_truth"] == jobs["evaluate_truth"] == 7
     assert jobs["evaluate_truth_city"] == 6
+
+
+def test_a_surface_model_is_judged_against_the_scenes_lidar(project):
+    jobs = project.plan("score_dsm/Wuhan/Wuhan-1/sgm")
+    assert jobs["score_dsm"] == jobs["dsm"] == jobs["predict_scene"] == 1
+    assert jobs["ingest"] == 4
+
+
+def test_training_cities_are_planned_for_who_trains_on_them(project):
+    more = {"root": "results/training_cities/19", "layout": "whu", "disparity_range": [-64, 128]}
+    config = {"benchmark": {"datasets": {"more": more}}}
+    (project.folder / "more.yaml").write_text(yaml.safe_dump(config))
+    jobs = project.plan("results/train/more/stereonet/best.pt", "--configfile", "more.yaml")
+    assert jobs == {"training_city": 6, "training_cities": 1, "train": 1}  # 5 to train on
 
 
 def test_real_scenes_are_evaluated_by_their_images(project):

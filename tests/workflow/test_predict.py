@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import rasterio
 
@@ -46,3 +48,11 @@ def test_a_second_call_runs_nothing_and_a_resolution_only_the_model(later):
     (project.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
     jobs = project.plan(TARGET, *ARGUMENTS, "coarse.yaml")
     assert jobs == {"dsm": 1}
+
+
+def test_the_surface_model_is_judged(later):
+    folder = later.folder / "score_dsm/Tiny/Tiny-1/sgm"
+    found = json.loads((folder / "scores.json").read_text())
+    assert abs(found["registration"]["up_m"]) < 1.0
+    assert found["errors"]["ground, off steps"]["known_share"] > 0.5
+    assert (folder / "index.html").is_file()

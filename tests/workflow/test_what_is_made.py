@@ -21,7 +21,8 @@ def folders() -> set[str]:
 
 def test_the_folders_are_those_of_the_design():
     of_design = {"results", "logs", "tiles", "dataset", "benchmark", "audit", "data", "submission"}
-    assert folders() == of_design | {"originals"}  # these if the configuration asks for them
+    # the latter if the configuration or the user asks for them
+    assert folders() == of_design | {"originals", "score_dsm"}
 
 
 @pytest.mark.parametrize("name", sorted(folders()))

@@ -1,5 +1,6 @@
 """Datasets and stereo methods of the configuration."""
 
+import re
 from functools import cache
 
 from snakemake.logging import logger
@@ -26,9 +27,10 @@ def dataset_entry(name):
 
 
 def dataset_folder(name):
-    """The root of a dataset; the workflow makes its own."""
+    """The root of a dataset; the workflow makes its own, and those of training cities."""
     root = str(Path(dataset_settings(name)["root"]))
-    if root != "dataset" and not Path(root).is_dir():
+    made_here = root == "dataset" or re.fullmatch("results/training_cities/[1-9][0-9]*", root)
+    if not made_here and not Path(root).is_dir():
         raise WorkflowError(
             f"benchmark.datasets.{name}.root: {root}: no such folder. "
             "Remedy: name the dataset's folder"

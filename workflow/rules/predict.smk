@@ -57,6 +57,35 @@ rule dsm:
         "../scripts/dsm.py"
 
 
+rule score_dsm:
+    input:
+        dsm=rules.dsm.output.dsm,
+        points=point_stores,
+    output:
+        directory("score_dsm/{city}/{scene}/{method}"),
+    log:
+        "logs/score_dsm/{city}/{scene}/{method}.log",
+    benchmark:
+        "logs/score_dsm/{city}/{scene}/{method}.tsv"
+    wildcard_constraints:
+        method="[^/]+",
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=3000,
+        runtime=240,
+    params:
+        made=lambda w: making_of(rules.score_dsm, w),
+        script=content_of("../scripts/score_dsm.py"),
+        code=source_digest("evaluation.surface_models.page"),
+        templates=templates_of("evaluation", "surface_models", "page.html.jinja"),
+    message:
+        "Judging the surface model of scene {wildcards.scene} by {wildcards.method}"
+    script:
+        "../scripts/score_dsm.py"
+
+
 rule predict:
     input:
         [

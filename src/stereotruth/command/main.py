@@ -202,6 +202,47 @@ def status(
     show_status(cities or [], configfile)
 
 
+@app.command(
+    "score-dsm",
+    epilog=examples(
+        "stereotruth score-dsm dsm.tif --lidar /data/lidar --to verdict",
+        "stereotruth score-dsm dsm.tif --reference truth.tif --to verdict",
+        "stereotruth score-dsm dsm.tif --geoid egm08_25.gtx --lidar 'tiles/*.laz' --to verdict",
+    ),
+)
+def score_surface_model(
+    model: Annotated[Path, typer.Argument(help="GeoTIFF of heights, north-up, in metres.")],
+    to: Annotated[Path, typer.Option(help="Folder to be written: scores.json, index.html.")],
+    lidar: Annotated[str, typer.Option(help="Folder or glob of LAS, LAZ, COPC files.")] = "",
+    reference: Annotated[Path | None, typer.Option(help="Or a raster of true heights.")] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(help="Geoid grid, if the model's heights are orthometric.")
+    ] = None,
+    lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
+    reference_geoid: Annotated[
+        Path | None, typer.Option(help="Geoid grid, if the reference's heights are orthometric.")
+    ] = None,
+    reference_classes: Annotated[
+        Path | None, typer.Option(help="LAS classes on the grid of the reference raster.")
+    ] = None,
+) -> None:
+    """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
+    from .score_dsm import score_dsm
+
+    typer.echo(
+        score_dsm(
+            model,
+            to,
+            lidar=lidar,
+            reference=reference,
+            geoid=geoid,
+            lidar_crs=lidar_crs,
+            reference_geoid=reference_geoid,
+            reference_classes=reference_classes,
+        )
+    )
+
+
 @app.command("open", epilog=examples("stereotruth open", "stereotruth open Marseille"))
 def open_pages(
     words: Annotated[

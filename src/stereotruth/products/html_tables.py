@@ -58,8 +58,10 @@ def words(name: str) -> str:
     unit = ""
     if "share" in text:  # shown in percent
         text = text.removeprefix("share_").removeprefix("of_")
-    elif text.endswith("_px"):
-        text, unit = text.removesuffix("_px"), ", px"
+    else:
+        for end in ("px", "m"):
+            if text.endswith(f"_{end}"):
+                text, unit = text.removesuffix(f"_{end}"), f", {end}"
     return " ".join(ABBREVIATIONS.get(word, word) for word in text.split("_")) + unit
 
 

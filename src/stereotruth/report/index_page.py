@@ -1,4 +1,4 @@
-"""The index of a folder's pages: cities, benchmarks and audits that there are, with their figures.
+"""The index of a folder's pages: cities, benchmarks, audits, surface models, with their figures.
 
 It lists what is there, and no plan of a run knows that beforehand: each run writes it when it ends,
 as does whoever opens it.
@@ -15,7 +15,12 @@ from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.pictures import encode_file
 
-PAGES = ("results/report/*/index.html", "benchmark/*/index.html", "audit/*/index.html")
+PAGES = (
+    "results/report/*/index.html",
+    "benchmark/*/index.html",
+    "audit/*/index.html",
+    "score_dsm/*/*/*/index.html",
+)
 TEMPLATE = Path(__file__).with_name("index.html.jinja")
 LOOK_PX, LOOK_BYTES = 420, 30_000
 NOTHING = Cell("", "")
@@ -36,6 +41,7 @@ def write_index(root: Path = Path()) -> Path | None:
         "cities": [_city(root, out, page) for page in sorted(root.glob(PAGES[0]))],
         "benchmarks": _benchmarks(root, out),
         "audits": _audits(root, out),
+        "surface_models": _surface_models(root, out),
         "links": [
             (name, str(way(out, root / name)), text)
             for name, text in (
@@ -150,4 +156,24 @@ def _audits(root: Path, out: Path) -> Table | None:
         )
     titles = ("dataset", "pairs", "good", "faulty", "undecided", "every figure")
     columns = tuple(Column(title, 0 < k < 5) for k, title in enumerate(titles))
+    return Table(columns, (("", tuple(lines)),)) if lines else None
+
+
+def _surface_models(root: Path, out: Path) -> Table | None:
+    """A row per scene and method whose surface model is judged."""
+    lines = []
+    for page in sorted(root.glob(PAGES[3])):
+        of = _read(page.with_name("scores.json"))
+        errors, edges = of["errors"]["off steps"], of["edges"]
+        lines.append(
+            (
+                _link(out, page, page.parts[-3]),
+                Cell(page.parts[-2], page.parts[-2]),
+                _value(errors["mean_absolute_m"], ".2f", unit=" m"),
+                _value(errors["known_share"], ".1f", 100, " %"),
+                _value(edges["position_error_m"], ".2f", unit=" m"),
+            )
+        )
+    titles = ("scene", "method", "mean absolute error off steps", "known", "edges of roofs off by")
+    columns = tuple(Column(title, k > 1) for k, title in enumerate(titles))
     return Table(columns, (("", tuple(lines)),)) if lines else None

@@ -26,6 +26,7 @@ from torch.utils.data import Dataset
 from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...errors import InputError
 from ...products.rasters import read_image
+from ..image_faults import faulty_pair
 from .image_scaling import scaled
 from .training_settings import Augmentation
 from .weights import SavedNetwork
@@ -98,8 +99,11 @@ class LabelledPairs(Dataset):
             )
         low, high = self.dataset.disparity_range
         disparity[~((disparity >= low) & (disparity < high))] = np.nan
-        images = np.stack([scaled(image, self.model, None) for image in (left, right)])
         rng = np.random.default_rng([self.seed, self.epoch, index])
+        chances = self.augmentation.faults
+        if any(chances.values()):
+            left, right = faulty_pair(left, right, chances, rng)
+        images = np.stack([scaled(image, self.model, None) for image in (left, right)])
         if self.crop_px is not None:
             window = self._window(disparity, rng)
             seen = match_inside(disparity)[window]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from ...errors import InputError
-from ...settings import Flag, Number, Text, Unit, Whole, settings
+from ...settings import Flag, Number, Share, Text, Unit, Whole, settings
 
 if TYPE_CHECKING:
     from torch import nn
@@ -33,6 +33,20 @@ class Augmentation:
 
     noise: Annotated[NotNegative, Unit("standard deviations of the image")] = 0
     """of each pixel"""
+
+    blur: Annotated[Share, Unit("share of the pairs")] = 0
+    """one image, left or right, out of focus, by up to 2.3 px"""
+
+    shadows: Annotated[Share, Unit("share of the pairs")] = 0
+    """patches of shadow in one image, as where the sun has moved"""
+
+    haze: Annotated[Share, Unit("share of the pairs")] = 0
+    """less contrast and more light in one image, by places"""
+
+    @property
+    def faults(self) -> dict[str, float]:
+        """Chances of the faults that images themselves have, by name of image_faults.FAULTS."""
+        return {"blur": self.blur, "shadows": self.shadows, "haze": self.haze}
 
 
 @settings

@@ -140,3 +140,18 @@ def test_a_flip_keeps_matches_in_place(dataset: StereoDataset) -> None:
 def test_crops_larger_than_the_tiles_are_refused(dataset: StereoDataset) -> None:
     with pytest.raises(InputError, match="crops of 128 x 64 px of tiles of 64 x 64 px"):
         LabelledPairs.of(dataset, "train", crop_px=(128, 64))[0]
+
+
+def test_faults_of_images_are_planted_before_they_are_scaled(dataset: StereoDataset) -> None:
+    plain = LabelledPairs.of(dataset, "train", seed=4)
+    faulty = LabelledPairs.of(dataset, "train", augmentation=Augmentation(haze=1.0), seed=4)
+    for k in range(3):
+        first, second, third = plain[k], faulty[k], faulty[k]
+        assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(second, third))
+        changed = [not torch.equal(a, b) for a, b in zip(first[:2], second[:2])]
+        assert sum(changed) == 1
+        image = second[changed.index(True)]
+        assert abs(float(image.mean())) < 1e-4  # by the statistics of the changed image
+        torch.testing.assert_close(first[2], second[2], equal_nan=True)
+    faulty.epoch = 1
+    assert not torch.equal(faulty[0][0], second[0]) or not torch.equal(faulty[0][1], second[1])

@@ -1,0 +1,18 @@
+"""Tiles of training cities put together as a dataset."""
+
+from stereotruth.evaluation.exact_tiles import gather
+from stereotruth.job import job
+from stereotruth.products.publication import publication
+
+if __name__ == "__main__":
+    count = snakemake.wildcards.tiles
+    with (
+        job(snakemake.log[0], f"training_cities {count}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
+        gather(
+            snakemake.input.training,
+            snakemake.input.validation,
+            snakemake.output[0],
+            int(count),
+        )

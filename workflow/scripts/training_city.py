@@ -1,0 +1,19 @@
+"""Tiles of one training city, with exact labels."""
+
+from stereotruth.evaluation.exact_tiles import make_city
+from stereotruth.job import job
+from stereotruth.products.publication import publication
+
+if __name__ == "__main__":
+    number = snakemake.wildcards.number
+    with (
+        job(snakemake.log[0], f"training_city {number}"),
+        publication(snakemake.input, snakemake.output, snakemake.params.made),
+    ):
+        make_city(
+            int(number),
+            snakemake.output[0],
+            size=snakemake.params.size,
+            seed=snakemake.params.seed,
+            workers=snakemake.threads,
+        )
