@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import logging
 import multiprocessing
 import os
@@ -15,12 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
-from dask.callbacks import Callback
-
 from .errors import InputError
 
 log = logging.getLogger("stereotruth")
+# New objects before garbage is collected: compiling kernels makes many that stay, and walking
+# through them again and again took an eighth of its time.
+GARBAGE = 200_000
 
 
 @contextmanager
@@ -30,7 +31,9 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1,
     and so does a full disk; anything else is a defect and keeps its traceback.
     """
-    cv2.setNumThreads(1)  # parallelism belongs to Dask and Snakemake
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)  # parallelism belongs to Dask and Snakemake
+    gc.set_threshold(GARBAGE)
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
@@ -142,17 +145,19 @@ def progress(items: Iterable, total: int, what: str) -> Iterator:
             log.info("%s: %d of %d", what, done, total)
 
 
-class BlockProgress(Callback):
-    """Logs about every tenth of the blocks done while Dask computes (local schedulers only)."""
+def block_progress(total: int, what: str) -> Any:
+    """A Dask callback that logs about every tenth of the blocks done (local schedulers only)."""
+    from dask.callbacks import Callback  # most jobs do without Dask
 
-    def __init__(self, total: int, what: str) -> None:
-        super().__init__()
-        self.done, self.total, self.what = 0, total, what
+    done = 0
 
-    def _posttask(self, *_: object) -> None:
-        self.done += 1
-        if self.done * 10 // self.total > (self.done - 1) * 10 // self.total:
-            log.info("%s: %d of %d blocks", self.what, self.done, self.total)
+    def count(*_: object) -> None:
+        nonlocal done
+        done += 1
+        if done * 10 // total > (done - 1) * 10 // total:
+            log.info("%s: %d of %d blocks", what, done, total)
+
+    return Callback(posttask=count)
 
 
 def scheduler_address(config: Mapping[str, Any]) -> str | None:

@@ -35,6 +35,7 @@ ROUGH = 0.08  # with more points below the low and above the high surface, these
 SLACK_CELLS = 0.12  # horizontal noise of points, in cells
 MARGIN_CELLS = 0.2  # added to either side of the feasible span
 SMALLEST = 0.1  # area of a triangle that is worth a cut, in squares of the mean distance
+WIDEST = 1.5  # half the width of a strip that still tells something, in mean distances
 _MOST = 4096  # points that have a say at most
 
 
@@ -316,6 +317,8 @@ def _cuts(
                 off = spans[0, j] - mean_a + (spans[1, j] - mean_b) * at
                 width = max(width, abs(off) / norm)
         width += MARGIN_CELLS * PART
+        if width > WIDEST * distance:
+            continue
         # (u - a - b v) / norm, in x and y from the first vertex
         p, q = (nx + mean_b * ny) / norm, (ny - mean_b * nx) / norm
         r = mean_a / norm + p * ox + q * oy

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..job import BlockProgress
+from ..job import block_progress
 from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import describe, digest
@@ -226,7 +226,7 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
-        with BlockProgress(len(tasks), "disparity"):
+        with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:
             return None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..job import BlockProgress
+from ..job import block_progress
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, making
@@ -161,7 +161,7 @@ def rectify_image(
         dask.delayed(run)(rows, cols, dask_key_name=f"block-{i:07d}")
         for i, (_, rows, cols) in enumerate(todo)
     ]
-    with BlockProgress(len(tasks), what):
+    with block_progress(len(tasks), what):
         dask.compute(*tasks, scheduler="threads", num_workers=workers)
     if strip is not None:
         return {}

@@ -23,7 +23,7 @@ import numpy as np
 import zarr
 
 from ...errors import InputError
-from ...job import BlockProgress
+from ...job import block_progress
 from ...products.grids import Layer, require_complete
 from ...products.provenance import describe, digest, file_sha256
 from ...products.resumable_grids import BlockStore, making
@@ -161,7 +161,7 @@ def _run(
         dask.delayed(work, pure=False)(*given, dask_key_name=f"{what}-{number:07d}")
         for number, given in enumerate(arguments)
     ]
-    with BlockProgress(len(tasks), what):
+    with block_progress(len(tasks), what):
         dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
 
 

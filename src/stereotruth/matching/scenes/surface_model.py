@@ -38,7 +38,7 @@ from ...epipolar.intersection import intersect
 from ...epipolar.model import EpipolarModel
 from ...epipolar.rpc import SensorModel
 from ...errors import InputError
-from ...job import BlockProgress
+from ...job import block_progress
 from ...products.files import replacing
 from ...products.grids import Layer, blocks, require_complete
 from ...products.provenance import digest
@@ -356,7 +356,7 @@ def write_dsm(
             )
             for k in missing
         ]
-        with BlockProgress(len(tasks), "surface model"):
+        with block_progress(len(tasks), "surface model"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         known = sum(unfinished.results(every))
         tags = {
