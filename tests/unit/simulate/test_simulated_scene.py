@@ -49,6 +49,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.provenance",
         "products.publication",
         "products.records",
+        "products.remote_files",
         "products.runs",
         "settings",
     }

@@ -46,7 +46,7 @@ def test_scoring_again_gives_the_same_bytes(compared, tmp_path):
     again = settings(fine_tuned_of="two")
     score(dataset, "test", "Half", compared / "match/half", tmp_path / "again", **again)
     files = [p for p in (compared / "benchmark/half").rglob("*") if p.is_file()]
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         other = tmp_path / "again" / file.relative_to(compared / "benchmark/half")
         assert file.read_bytes() == other.read_bytes(), file.name
