@@ -40,8 +40,9 @@ def _tiles(product: str, city: str) -> Iterator[str]:
 
 
 def _against_truth(product: str, of: str) -> Iterator[str]:
-    errors = _read(product)["errors"]
-    if errors["count"]:
+    figures = _read(product)
+    scopes = [figures[scope]["errors"] for scope in ("exported_tiles", "whole_scene")]
+    if errors := next((of for of in scopes if of["count"]), None):
         yield (
             f"{of} against its exact truth: {errors['mean_absolute']:.3f} px mean absolute error, "
             f"{100 * errors['share_over_1_px']:.2f} % off by more than 1 px; look at "

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from stereotruth.evaluation.labels_against_truth import Comparison, SceneComparison
 from stereotruth.last_lines import last_lines
 
 SCORES = {
@@ -15,11 +17,20 @@ SCORES = {
     "tiles": 4,
     "all": {"labelled": 9, "valid_share": 1, "epe_px": 0.5, "d1_3_px_share": 0.02},
 }
-TRUTH = {"errors": {"count": 5, "mean_absolute": 0.021, "share_over_1_px": 0.0004}}
+
+
+def truth(errors: list[float]) -> dict:
+    """What ``truth.json`` holds of tiles with these errors."""
+    result = SceneComparison("A")
+    result.all_tiles.parts["ground"] = part = Comparison(("no_points", "labelled"))
+    part.errors.add(np.array(errors))
+    return result.figures()
+
+
 FILES = {
     "results/export/A/summary.json": {"lines": ["A: 16 pairs", "Look at tiles/A"]},
-    "results/evaluate/A/truth.json": TRUTH,
-    "results/evaluate/A/A-1/truth.json": {"errors": {"count": 0}},
+    "results/evaluate/A/truth.json": truth([0.01] * 98 + [-0.02, -1.1]),
+    "results/evaluate/A/A-1/truth.json": truth([]),
     "results/train/own/net/training.json": {"best": {"val_epe_px": 1.25, "val_d1": 0.5}},
     "benchmark/own/sgm/scores.json": SCORES,
     "audit/own/summary.json": {"statements": ["4 pairs: 3 good.", "Labels fit."]},
@@ -53,7 +64,7 @@ def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
     assert last_lines(products) == [
         "A: 16 pairs",
         "Look at tiles/A",
-        "A against its exact truth: 0.021 px mean absolute error, 0.04 % off by more than 1 px; "
+        "A against its exact truth: 0.021 px mean absolute error, 1.00 % off by more than 1 px; "
         "look at results/evaluate/A/truth.csv",
         "Look at results/report/A/index.html",
         "net trained on own: EPE 1.250 px, D1 50.00 % on the validation tiles; "

@@ -88,7 +88,8 @@ def _city(root: Path, out: Path, page: Path) -> dict[str, Any]:
     sift = [of["sift_mean_absolute_error_px"] for of in scenes]
     if any(value is not None for value in sift):
         facts.append(f"SIFT matches less labels: {spread(sift, '.2f')} px mean absolute")
-    truth = _read(root / "results" / "evaluate" / name / "truth.json").get("errors", {})
+    truth = _read(root / "results" / "evaluate" / name / "truth.json")
+    truth = truth["exported_tiles"]["errors"] if truth else {}
     if truth.get("count"):
         facts.append(f"error against the exact truth: {truth['mean_absolute']:.3f} px")
     flagged = len(export.get("quality", {}).get("flagged_tiles", {}))

@@ -6,8 +6,10 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from stereotruth.evaluation.labels_against_truth import Comparison, SceneComparison
 from stereotruth.products.html_page import INDEX
 from stereotruth.report.index_page import pages_of, write_index
 
@@ -41,8 +43,10 @@ def folder(tmp_path):
         put(tmp_path / page / "index.html", "<title>page</title>")
     put(tmp_path / "tiles/A b/export.json", json.dumps(EXPORT))
     put(tmp_path / "tiles/A b/manifest.csv", "tile\n")
-    truth = {"errors": {"count": 9, "mean_absolute": 0.0214}}
-    put(tmp_path / "results/evaluate/A b/truth.json", json.dumps(truth))
+    truth = SceneComparison("A b")
+    truth.all_tiles.parts["ground"] = Comparison(("no_points", "labelled"))
+    truth.all_tiles.parts["ground"].errors.add(np.array([0.0114, -0.0314]))
+    put(tmp_path / "results/evaluate/A b/truth.json", json.dumps(truth.figures()))
     for name, epe in (("sgm", 1.25), ("net", 0.5)):
         put(tmp_path / f"benchmark/own/{name}/scores.json", json.dumps(scores(name.upper(), epe)))
         put(tmp_path / f"benchmark/own/{name}/cities.csv", "city\n")
