@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from .image_agreement import outvoted, outvoted_nearby, warp_to_left
+from .image_agreement import apart_from_steps, outvoted, outvoted_nearby, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .open_pixels import surfaces_by_images
@@ -298,12 +298,13 @@ def _test_agreement(
     top, side = wide[0].start - left.row, wide[1].start - left.col
     shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
     surface = labels.disparity, labels.slope
-    found = surface_correlation(shown, warped, *surface, settings.window)
+    clear = apart_from_steps(labels.disparity)
+    found = surface_correlation(shown, warped, *surface, settings.window, clear)
     changed = outvoted(found, *surface, settings.correlation_threshold)
     if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
         share = 1.0 - (1.0 - USUAL_SHARE) * scene.scale.trust
-        limits = settings.correlation_threshold, share, settings.window // 2
+        limits = settings.correlation_threshold, share
         changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED

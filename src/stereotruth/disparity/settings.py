@@ -113,7 +113,7 @@ class Settings(Representative, Occlusion):
     def margin(self) -> int:
         """Pixels around a window whose points have a say in it."""
         # here, since these load compiled code and a workflow plans with the settings
-        from .image_agreement import VOTE_PX
+        from .image_agreement import NEARBY_PX, VOTE_PX
         from .open_pixels import MARGIN
         from .seen_surface import EDGE
 
@@ -121,6 +121,6 @@ class Settings(Representative, Occlusion):
         reach = EDGE + 3
         if self.method != "both":
             return reach
-        # windows, votes about them, and what is asked of the votes nearby
-        reach += VOTE_PX + self.window // 2 * 2
+        # steps beside pixels, windows, votes about them, and what is asked of the votes nearby
+        reach += VOTE_PX + NEARBY_PX + self.window // 2 + 1
         return reach + (MARGIN if self.asks_images else 0)

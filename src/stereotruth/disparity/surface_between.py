@@ -391,7 +391,8 @@ def between_labels(
 
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
     keep the label that these give if it is the surer one (one point is less than three around it),
-    or if ``keep_own``. ``left``, ``right``: patches that tell the frames.
+    or if ``keep_own``. Points before the surface tell of something else in the pixel; points behind
+    it are hidden by it, as the ground under a roof is that a tower leans over. ``left``, ``right``: patches that tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN
@@ -402,11 +403,11 @@ def between_labels(
     inside, masked = in_left & in_right == USABLE, (in_left | in_right) & MASKED != 0
     status[row[~inside], col[~inside]] = Status.OUT_OF_FRAME
     status[row[masked], col[masked]] = Status.MASKED
-    with np.errstate(invalid="ignore"):
-        measured = np.abs(own.disparity - between.disparity) <= STEP_PX
     between_points = status == Status.LABELLED_BETWEEN
-    status[between_points & np.isfinite(own.disparity)] = Status.EDGE_IN_PIXEL
-    measured &= between_points
+    with np.errstate(invalid="ignore"):
+        lift = own.disparity - between.disparity
+        measured = between_points & (np.abs(lift) <= STEP_PX)
+        status[between_points & (lift > STEP_PX)] = Status.EDGE_IN_PIXEL
     status[measured] = Status.LABELLED
     surer = measured & (keep_own | (own.variance <= between.variance))
     return Labels(

@@ -44,8 +44,10 @@ def tolerance_px(down: int, across: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _correlation(
-    left: Singles, warped: Singles, disparity: Singles, slope: Singles, half: int, out: Singles
-) -> None:
+    left: Singles, warped: Singles, disparity: Singles, counted: Singles, slope: Singles, half: int,
+    out: Singles,
+) -> None:  # fmt: skip
+    """``counted``: disparity of the pixels that count, else NaN."""
     rows, cols = left.shape
     surface = np.empty(3 * BLOCK, np.float32)
     centre = np.empty(2 * BLOCK, np.float32)
@@ -64,7 +66,7 @@ def _correlation(
                     across, tolerance = np.float32(step), tolerance_px(b - y, step)
                     first, end = columns_inside(x0, size, cols, step)
                     d, uu, vv = (
-                        disparity[b, x0 + step + first : x0 + step + end],
+                        counted[b, x0 + step + first : x0 + step + end],
                         left[b, x0 + step + first : x0 + step + end],
                         warped[b, x0 + step + first : x0 + step + end],
                     )
@@ -98,8 +100,11 @@ def surface_correlation(
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     window: int,
+    clear: NDArray[np.bool_] | None = None,
 ) -> Singles:
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
+
+    Of these, the ``clear`` [h, w] ones alone where that is given.
 
     ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
     where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
@@ -113,6 +118,7 @@ def surface_correlation(
         np.ascontiguousarray(left, dtype=np.float32),
         np.where(known, warped, 0).astype(np.float32, copy=False),
         disparity,
+        disparity if clear is None else np.where(clear, disparity, np.float32(np.nan)),
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
         out,
