@@ -52,10 +52,17 @@ def _feasible(
     m = 4
     polygon[0, :4] = (-extent, extent, extent, -extent)
     polygon[1, :4] = (-STEEPEST, -STEEPEST, STEEPEST, STEEPEST)
+    least_a, most_a, least_b, most_b = -extent, extent, -STEEPEST, STEEPEST
     for k in range(n):
         i = order[k]
         side = 1 if v[i] >= 0.0 else 0
         if abs(v[i]) > limit[side]:
+            continue
+        # most points are far from all lines that are left
+        if high[i]:
+            if most_a + max(least_b * v[i], most_b * v[i]) <= u[i] + slack:
+                continue
+        elif least_a + min(least_b * v[i], most_b * v[i]) >= u[i] - slack:
             continue
         low, top = np.inf, -np.inf
         for j in range(m):
@@ -75,8 +82,11 @@ def _feasible(
             limit[side] = abs(v[i])
             continue
         m = min(found, CORNERS - 4)
+        least_a, most_a, least_b, most_b = np.inf, -np.inf, np.inf, -np.inf
         for j in range(m):  # a slice would be copied twice
             polygon[0, j], polygon[1, j] = spare[0, j], spare[1, j]
+            least_a, most_a = min(least_a, spare[0, j]), max(most_a, spare[0, j])
+            least_b, most_b = min(least_b, spare[1, j]), max(most_b, spare[1, j])
     return m
 
 

@@ -39,6 +39,7 @@ VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
 NEARBY_PX = 8  # for what is small, pixels up to here vote,
 NEARBY_SHARE = 0.35  # of which so many fail
+USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
 
 def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
@@ -149,14 +150,17 @@ def outvoted_nearby(
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     threshold: float,
-    usual: float,
+    trust: float,
 ) -> Bools:
     """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
 
-    That is less than ``threshold``, or than the share ``usual`` of the mean over their surface up
-    to VOTE_PX off: noise lowers both. Small things are found that :func:`outvoted` lets their
-    surroundings outvote.
+    That is less than ``threshold``, or than the share USUAL of the mean over their surface up to
+    VOTE_PX off: noise lowers both. Small things are found that :func:`outvoted` lets their
+    surroundings outvote. ``trust`` (0 to 1): how far the points miss nothing; with less, more of
+    the usual correlation is asked for, and fewer failures are enough.
     """
+    usual = 1.0 - (1.0 - USUAL) * trust
     least = np.fmax(usual * surface_mean(correlation, disparity, slope), threshold)
     against = np.where(np.isfinite(correlation), correlation < least, np.nan)
-    return surface_mean(against, disparity, slope, NEARBY_PX, 1) > NEARBY_SHARE
+    share = NEARBY_SHARE * float(np.sqrt(trust))
+    return surface_mean(against, disparity, slope, NEARBY_PX, 1) > share

@@ -51,7 +51,6 @@ Window = tuple[slice, slice]
 
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
 DENSE = 2.0  # points in a pixel, that miss nothing of a pixel's size
-USUAL_SHARE = 0.8  # of the correlation around: with less, a pixel between points disagrees
 
 
 def label_window(
@@ -303,8 +302,7 @@ def _test_agreement(
     changed = outvoted(found, *surface, settings.correlation_threshold)
     if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
-        share = 1.0 - (1.0 - USUAL_SHARE) * scene.scale.trust
-        limits = settings.correlation_threshold, share
+        limits = settings.correlation_threshold, scene.scale.trust
         changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED

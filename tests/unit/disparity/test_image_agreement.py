@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.image_agreement import (
+    apart_from_steps,
     outvoted,
     outvoted_nearby,
     surface_mean,
@@ -111,13 +112,47 @@ def test_surface_mean_is_that_of_the_surface() -> None:
     assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level)).all()
 
 
-@pytest.mark.parametrize("usual", [0.95, 0.65])
-def test_what_is_small_is_told_by_what_is_usual_around_it(usual) -> None:
-    """A tree of 6 px amid agreeing ground: its surroundings outvote it, its own pixels do not."""
-    correlation = np.full((80, 80), usual)
-    correlation[37:43, 37:43] = 0.45
+@pytest.mark.parametrize("noise", [20.0, 200.0])
+@pytest.mark.parametrize("size, trust", [(10, 1.0), (8, 0.5)])
+def test_what_is_small_is_told_by_what_is_usual_around_it(noise, size, trust) -> None:
+    """A hut amid agreeing ground: its surroundings outvote it, its own pixels do not.
+
+    Where points are sparse, they miss larger things, and fewer failures are enough.
+    """
+    left = texture((80, 80))
+    warped = left + np.random.default_rng(1).normal(0.0, noise, left.shape)
+    warped[36 : 36 + size, 36 : 36 + size] = texture((size, size), seed=2)
     level = np.zeros((80, 80))
+    correlation = surface_correlation(left, warped, level, LEVEL, 9)
     assert not outvoted(correlation, level, LEVEL, 0.5).any()
-    found = outvoted_nearby(correlation, level, LEVEL, 0.0, 0.8, 2)
-    assert found[39:41, 39:41].all()
-    assert not found[:30].any() and not found[:, 50:].any()
+    found = outvoted_nearby(correlation, level, LEVEL, 0.5, trust)
+    assert found[38:42, 38:42].all()
+    assert not found[:24].any() and not found[:, 58:].any()
+
+
+def test_a_roof_that_is_blurred_into_the_ground_is_no_change() -> None:
+    """A bright roof beside dull ground, which the other view shows beside more ground."""
+    ground, roof = 60 + 0.05 * texture((80, 80)), 2000 + texture((80, 80), seed=1)
+    left = np.where(np.arange(80) < 40, roof, ground)
+    warped = np.where(np.arange(80) < 40, roof, ground)
+    left[:, 40:42] += np.array([600.0, 60.0])  # what the optics bring over
+    disparity = np.where(np.arange(80) < 40, 15.0, 0.0) * np.ones((80, 1))
+    disparity[:, 39:41] = np.nan  # the edge itself has no label
+    clear = apart_from_steps(disparity)
+    assert not clear[:, 38:42].any() and clear[1:-1, 1:38].all() and clear[1:-1, 42:-1].all()
+    warped[:, 39:41] = np.nan
+    mixed = surface_correlation(left, warped, disparity, LEVEL, 9)
+    assert outvoted_nearby(mixed, disparity, LEVEL, 0.5, 1.0)[20:60, 41:44].all()
+    found = surface_correlation(left, warped, disparity, LEVEL, 9, clear)
+    assert found[20:60, 41:46] == pytest.approx(1.0, abs=1e-4)
+    assert not outvoted_nearby(found, disparity, LEVEL, 0.5, 1.0).any()
+
+
+def test_steps_are_told_from_slopes() -> None:
+    x = np.arange(30.0)
+    slope = np.broadcast_to(0.6 * x, (20, 30)).copy()
+    inner = np.s_[1:-1, 1:-1]
+    assert apart_from_steps(slope)[inner].all()
+    slope[:, 15:] += 2.0
+    found = apart_from_steps(slope)
+    assert not found[:, 14:16].any() and found[inner][:, :13].all()

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.label_window import label_window
+from stereotruth.disparity.pixel_labels import Labels
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.disparity.surface_between import SHOWN, Between, between_labels
 
 from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
@@ -147,3 +150,33 @@ def test_without_fill_labels_are_those_of_pixels_with_points(box) -> None:
     for name in ("disparity", "uncertainty", "height", "point_count"):
         assert np.array_equal(bare[name].values[measured], filled[name].values[measured])
     assert np.isnan(bare["disparity"].values[~measured]).all()
+
+
+def test_points_behind_the_seen_surface_are_no_edge() -> None:
+    """A roof over sparse ground points: these are hidden by it, those before it are not."""
+    shape = (8, 8)
+    level, zeros = np.full(shape, 10.0), np.zeros(shape)
+    between = Between(
+        outcome=np.full(shape, SHOWN, np.uint8),
+        disparity=level,
+        slope=np.zeros((2, *shape)),
+        variance=zeros,
+        height=zeros,
+        surface_class=zeros.astype(np.uint8),
+        highest=level,
+        rough=zeros.astype(bool),
+        places=None,
+    )
+    points = np.full(shape, np.nan)
+    points[2, 2:5] = 10.2, 4.0, 16.0  # on the surface, behind, before it
+    own = Labels(points, np.zeros((2, *shape)), zeros)
+    left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
+    right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
+    labels, status = between_labels(between, own, left, right, (4, 12))
+    assert list(status[2, 2:5]) == [
+        Status.LABELLED,
+        Status.LABELLED_BETWEEN,
+        Status.EDGE_IN_PIXEL,
+    ]
+    assert labels.disparity[2, 2:4] == pytest.approx([10.2, 10.0])
+    assert np.isnan(labels.disparity[2, 4])
