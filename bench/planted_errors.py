@@ -141,13 +141,6 @@ def write_store(xyz: Floats, crs: Any, store: Path) -> list[str]:
         return ingest(Path(scratch) / "points.las", store)["notes"]
 
 
-def in_memory(path: Path) -> PointStore:
-    """A store whose points are read once for all trials."""
-    store = PointStore(path)
-    store._position, store._attributes = store._position[:], store._attributes[:]
-    return store
-
-
 # ------------------------------------------------------------------------------- alignment errors
 
 
@@ -528,7 +521,7 @@ def alignment_part(scene: Scene, folder: Path, trials: int, framed: bool) -> Non
     store = folder / f"{name}.zarr"
     if not store.exists():
         write_store(scene.xyz - (offset if framed else 0.0), scene.crs, store)
-    loaded = in_memory(store)
+    loaded = PointStore(store)
     records = Records(folder / f"alignment_{name}.jsonl")
     done = []
     for seed in range(trials):
