@@ -137,7 +137,7 @@ class SortedRuns:
             yield points
 
     def write(self, folder: Path) -> int:
-        """Write points and cell table in final order; returns the checksum of the latter."""
+        """Write points and cell table in final order; return the CRC-32 of the latter's file."""
         segments, limits = np.concatenate(self.segments), np.concatenate(self.limits)
         order = np.argsort(segments[:, 0], kind="stable")
         segments, limits = segments[order], limits[order]
@@ -157,4 +157,4 @@ class SortedRuns:
                     file.write(points)
                 table["crc32"][cell] = found
         np.save(folder / CELLS, table)
-        return zlib.crc32(table)
+        return zlib.crc32((folder / CELLS).read_bytes())

@@ -15,7 +15,7 @@ A folder with plain arrays, which NumPy opens (little-endian; n points, m cells 
 ``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
                               of the cell's first point; ``lowest``, ``highest``: heights of its
                               points, steps; ``crc32`` of its points as they lie in the file
-``store.json``                attributes; ``cells_crc32`` of ``cells.npy``'s array
+``store.json``                attributes; ``cells_crc32`` of the file ``cells.npy``
 ==============  ============  =====================================================================
 
 Points are written once and read once or twice, so that they are neither compressed nor cut into
@@ -31,6 +31,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -194,12 +195,12 @@ class PointStore:
 
     def _cell_table(self) -> NDArray[np.void]:
         try:
-            cells = np.load(self.path / CELLS)
-        except (OSError, ValueError, EOFError) as error:
+            data = (self.path / CELLS).read_bytes()
+        except OSError as error:
             raise self._damaged(CELLS) from error
-        if cells.dtype != CELL or zlib.crc32(cells) != self.attrs["cells_crc32"]:
+        if zlib.crc32(data) != self.attrs["cells_crc32"]:
             raise self._damaged(CELLS)
-        return cells
+        return np.load(BytesIO(data))
 
     def _first_byte(self) -> int:
         """Where the points begin in their file, which has the size that it should have."""
