@@ -60,16 +60,17 @@ def _sort(
     i = 0
     while i < cell.size:
         c, first = cell[i], i
-        at = end[c] - first
-        low, high = np.int64(limits[c, 0]), np.int64(limits[c, 1])
         while i < cell.size and cell[i] == c:
-            told, height = np.int64(attributes[i]), lattice[2, i]
-            run[at + i, 0] = lattice[0, i] & inside | (told & 4095) << CELL_BITS
-            run[at + i, 1] = lattice[1, i] & inside | told >> 16 << CELL_BITS
-            run[at + i, 2] = height
-            low, high = min(low, height), max(high, height)
             i += 1
-        end[c] = at + i
+        at = end[c] - first
+        end[c] += i - first
+        low, high = np.int64(limits[c, 0]), np.int64(limits[c, 1])
+        for k in range(first, i):
+            told, height = np.int64(attributes[k]), lattice[2, k]
+            run[at + k, 0] = lattice[0, k] & inside | (told & 4095) << CELL_BITS
+            run[at + k, 1] = lattice[1, k] & inside | told >> 16 << CELL_BITS
+            run[at + k, 2] = height
+            low, high = min(low, height), max(high, height)
         limits[c, 0], limits[c, 1] = low, high
 
 
