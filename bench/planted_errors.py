@@ -518,7 +518,7 @@ def alignment_part(scene: Scene, folder: Path, trials: int, framed: bool) -> Non
     if framed:
         offset, error = lidar_offset(scene)
         print("LiDAR less check points, m:", offset.round(3), "standard error", error.round(3))
-    store = folder / f"{name}.zarr"
+    store = folder / f"{name}.points"
     if not store.exists():
         write_store(scene.xyz - (offset if framed else 0.0), scene.crs, store)
     loaded = PointStore(store)
