@@ -534,7 +534,7 @@ def alignment_part(scene: Scene, folder: Path, trials: int, framed: bool) -> Non
 
 def datum_part(scene: Scene, folder: Path) -> None:
     records = Records(folder / "datum.jsonl")
-    store = folder / "fault.zarr"
+    store = folder / "fault.points"
     done = {}
     for fault, (change, _) in FAULTS.items():
         keys = {f"{fault}, {control}": control for control in CONTROLS}
