@@ -242,7 +242,7 @@ class Made:
         self.left = Path(f"results/rectify/{place}/left.zarr")
         self.right = Path(f"results/rectify/{place}/right.zarr")
         self.tiles = Path(f"tiles/{scene.city}")
-        self.points = sorted(Path(f"results/ingest/{place}").glob("*.zarr"))
+        self.points = sorted(Path(f"results/ingest/{place}").glob("*.points"))
         self.aligned = Path(f"results/align/{place}/alignment.json")
         self.refined = Path(f"results/refine/{place}/alignment.json")
         self.exact = Path(f"results/accuracy/{place}")

@@ -304,7 +304,7 @@ def main() -> None:
     make_scene(city, city.scenes[0], folder / "in", spacing_m=0.4, seed=SEED)
     rows = {"this project": make_ours(folder, city, given.cores)}
     made = folder / "results"
-    store = PointStore(next((made / "ingest" / city.name / scene).glob("*.zarr")))
+    store = PointStore(next((made / "ingest" / city.name / scene).glob("*.points")))
     alignment = Alignment.load(made / f"refine/{city.name}/{scene}/alignment.json")
     cars = given.cars.absolute()
     rows["CARS"] = make_cars(folder / "cars", cars, folder / "in", store, alignment, given.cores)

@@ -57,8 +57,8 @@ class Thinned(PointStore):
     def cell_counts(self) -> NDArray[np.int64]:
         return np.maximum((super().cell_counts * self.share).astype(np.int64), 1)
 
-    def _read(self, first: int, end: int, box: tuple[int, int, int, int]) -> Points:
-        points = super()._read(first, end, box)
+    def query(self, *box: float) -> Points:
+        points = super().query(*box)
         if self.share >= 1.0:
             return points
         mixed = points.lon_q.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -95,7 +95,7 @@ class Block:
         city = self.scene.rsplit("-", 1)[0]
         at = self.results
         self.images = [at / "rectify" / city / self.scene / f"{v}.zarr" for v in ("left", "right")]
-        self.paths = sorted((at / "ingest" / city / self.scene).glob("*.zarr"))
+        self.paths = sorted((at / "ingest" / city / self.scene).glob("*.points"))
         self.truth = self.true(at / "rectify" / city / self.scene / "epipolar.json", city)
         self.density = density([PointStore(path) for path in self.paths])
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.grids import require_complete
 
 # Li et al. 2023: 11 pairs of such images, so many points. Which pairs are of which city is assumed.
@@ -61,8 +62,8 @@ def rates(work: Path) -> dict[str, float]:
     """
     logs, results = work / "logs", work / "results"
     points = sum(
-        require_complete(store).attrs["points"]["read"]
-        for store in (results / "ingest").rglob("*.zarr")
+        PointStore(store).attrs["points"]["read"]
+        for store in (results / "ingest").rglob("*.points")
     )
     (store,) = (results / "project").glob("*/*.zarr")
     rows, cols = require_complete(store)["disparity"].shape

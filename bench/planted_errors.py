@@ -141,13 +141,6 @@ def write_store(xyz: Floats, crs: Any, store: Path) -> list[str]:
         return ingest(Path(scratch) / "points.las", store)["notes"]
 
 
-def in_memory(path: Path) -> PointStore:
-    """A store whose points are read once for all trials."""
-    store = PointStore(path)
-    store._position, store._attributes = store._position[:], store._attributes[:]
-    return store
-
-
 # ------------------------------------------------------------------------------- alignment errors
 
 
@@ -525,10 +518,10 @@ def alignment_part(scene: Scene, folder: Path, trials: int, framed: bool) -> Non
     if framed:
         offset, error = lidar_offset(scene)
         print("LiDAR less check points, m:", offset.round(3), "standard error", error.round(3))
-    store = folder / f"{name}.zarr"
+    store = folder / f"{name}.points"
     if not store.exists():
         write_store(scene.xyz - (offset if framed else 0.0), scene.crs, store)
-    loaded = in_memory(store)
+    loaded = PointStore(store)
     records = Records(folder / f"alignment_{name}.jsonl")
     done = []
     for seed in range(trials):
@@ -541,7 +534,7 @@ def alignment_part(scene: Scene, folder: Path, trials: int, framed: bool) -> Non
 
 def datum_part(scene: Scene, folder: Path) -> None:
     records = Records(folder / "datum.jsonl")
-    store = folder / "fault.zarr"
+    store = folder / "fault.points"
     done = {}
     for fault, (change, _) in FAULTS.items():
         keys = {f"{fault}, {control}": control for control in CONTROLS}

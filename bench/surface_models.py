@@ -172,7 +172,7 @@ def main() -> None:
         stores = []
         for name in lidar_files(city, scene):
             simulate_lidar_tile(city, scene, name, folder / name, seed=1)
-            stores.append(folder / f"{name}.zarr")
+            stores.append(folder / f"{name}.points")
             ingest(folder / name, stores[-1])
         reference = LidarReference(stores)
         exact, west, north = surface(city)

@@ -88,8 +88,7 @@ BOUNDS = {  # part of a profile: what its time goes into
     "projection_polynomials": "27 multiplications and additions a point in vectors: memory",
     "cell_sort": "scattered writes of the sort: cache misses",
     "point_store": "one pass over memory",
-    "zarr, store": "LZ4 and three copies in Zarr",
-    "zarr, query": "LZ4 and two copies in Zarr",
+    "zarr": "LZ4 and three copies in Zarr",
     "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
     "seen_surface": "scattered updates of the surface",
@@ -205,7 +204,12 @@ def ingest_all(files: Sequence[Path], folder: Path, workers: int, env: Mapping[s
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
             pool.submit(
-                job, INGEST_JOB, file, folder / f"{file.stem}.zarr", folder / "ingest.log", env=env
+                job,
+                INGEST_JOB,
+                file,
+                folder / f"{file.stem}.points",
+                folder / "ingest.log",
+                env=env,
             )
             for file in files
         ]
@@ -216,7 +220,7 @@ def ingest_all(files: Sequence[Path], folder: Path, workers: int, env: Mapping[s
 def own_times(profile: cProfile.Profile) -> dict[tuple[str, str], float]:
     """Seconds by (part, function): each function of the package with all that it calls elsewhere.
 
-    Zarr's share is told apart, as store or query; Dask, which calls back, does not count.
+    Zarr's share is told apart; Dask, which calls back, does not count.
     """
     stats = pstats.Stats(profile)
     times: dict[tuple[str, str], float] = {}
@@ -238,9 +242,7 @@ def own_times(profile: cProfile.Profile) -> dict[tuple[str, str], float]:
             if module(callee) is not None or "dask" in Path(callee[0]).parts:
                 continue
             if "zarr" in Path(callee[0]).parts:
-                add(
-                    "zarr, query" if function[2] == "_read" else "zarr, store", function[2], seconds
-                )
+                add("zarr", function[2], seconds)
             elif "laspy" in Path(callee[0]).parts:
                 add("laspy", "read_points", seconds)
             else:
@@ -271,7 +273,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     folder, workers = arguments.folder, arguments.workers
     files = make_scene(folder, arguments.points, arguments.seed)
     env = environment(folder)
-    stores = [folder / "points" / f"{file.stem}.zarr" for file in files]
+    stores = [folder / "points" / f"{file.stem}.points" for file in files]
     left, right, out = (
         folder / "left.zarr",
         folder / "right.zarr",
@@ -283,7 +285,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
 
     print("compiling", flush=True)
     ingest_all([smallest], folder / "points", 1, env)
-    smallest_store = folder / "points" / f"{smallest.stem}.zarr"
+    smallest_store = folder / "points" / f"{smallest.stem}.points"
     code = source_digest("disparity.project")
     project_scene(left, right, [smallest_store], out, Settings(**settings), code=code)
 
@@ -325,7 +327,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         large = max(files, key=lambda file: file.stat().st_size)
         with laspy.open(large) as reader:
             of = reader.header.point_count
-        made = folder / "profile.zarr"
+        made = folder / "profile.points"
         ingest(smallest, made)  # loads what is compiled
         profiles["ingest"] = parts(profiled(lambda: ingest(large, made)), of)
         shutil.rmtree(made)
@@ -448,7 +450,7 @@ def plain_splines(image: Mapping[str, Any], col: np.ndarray, row: np.ndarray) ->
 
 
 def ground_points(folder: Path, wanted: int) -> Points:
-    store = PointStore(max((folder / "points").glob("*.zarr"), key=lambda s: PointStore(s).count))
+    store = PointStore(max((folder / "points").glob("*.points"), key=lambda s: PointStore(s).count))
     points = store.query(*store.bounds[:4])
     return Points(*(getattr(points, name)[:wanted] for name in Points.__dataclass_fields__))
 

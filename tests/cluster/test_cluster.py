@@ -205,7 +205,7 @@ def test_dask_workers_come_and_go_while_project_runs(
     monkeypatch.setattr(project, "CHUNK", SMALL)
     made = runs.local.folder / "results"
     images = [made / f"rectify/East/East-1/{view}.zarr" for view in ("left", "right")]
-    points = sorted((made / "ingest/East/East-1").glob("*.zarr"))
+    points = sorted((made / "ingest/East/East-1").glob("*.points"))
 
     def label(out: Path, **how: object) -> None:
         project.project_scene(*images, points, out, Settings(), code="the same", **how)

@@ -97,8 +97,8 @@ def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path
     xyz = np.column_stack(to_utm.transform(*points.T))
     first = np.ones(len(xyz), np.uint8)  # returns: no order of points tells another surface
     write_las(folder / f"{name}.las", xyz=xyz, return_number=first)
-    ingest(folder / f"{name}.las", folder / f"{name}.zarr")
-    return folder / f"{name}.zarr"
+    ingest(folder / f"{name}.las", folder / f"{name}.points")
+    return folder / f"{name}.points"
 
 
 RUN = ("code", "view", "workers", "scheduler", "scene", "max_points", "strip")

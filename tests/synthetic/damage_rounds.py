@@ -73,7 +73,7 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def _read_lidar(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
-    store = folder / "store.zarr"
+    store = folder / "store.points"
     shutil.rmtree(store, ignore_errors=True)
     summary = apart(lambda: ingest(file, store, **case.options), file)
     points = PointStore(store)

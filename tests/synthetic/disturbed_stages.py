@@ -79,7 +79,7 @@ STAGES = {
         "ingest",
         "logs/ingest/{c}/{c}-1/Tiny-1_0_0.log",
         "{c}/lidar/Tiny-1_0_0.laz",
-        ("results/ingest/{c}/{c}-1/Tiny-1_0_0.zarr",),
+        ("results/ingest/{c}/{c}-1/Tiny-1_0_0.points",),
         _edit_laz,
     ),
     "align": Stage(
@@ -115,7 +115,7 @@ STAGES = {
     "project": Stage(
         "project",
         "logs/project/{c}/{c}-1.log",
-        "results/ingest/{c}/{c}-1/Tiny-1_0_0.zarr",
+        "results/ingest/{c}/{c}-1/Tiny-1_0_0.points",
         ("results/project/{c}/{c}-1.zarr",),
         of="ingest",
     ),

@@ -66,12 +66,12 @@ def everything(store: PointStore) -> Points:
 
 def refused(file: Path, match: str, **arguments) -> str:
     """Ingest must fail with a message that names the file, and leave nothing behind."""
-    store = file.with_name("refused.zarr")
+    store = file.with_name("refused.points")
     with pytest.raises(InputError, match=match) as error:
         ingest(file, store, **arguments)
     assert file.name in str(error.value)
     assert "Remedy: " in str(error.value)
-    assert not list(file.parent.glob("refused.zarr*"))
+    assert not list(file.parent.glob("refused.points*"))
     return str(error.value)
 
 

@@ -80,5 +80,5 @@ def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
 
 def test_what_has_no_figures_is_named():
     assert last_lines([]) == []
-    stores = [f"results/ingest/A/A-1/{n}.zarr" for n in range(5)]
+    stores = [f"results/ingest/A/A-1/{n}.points" for n in range(5)]
     assert last_lines(stores) == [f"Made {stores[2]}, {stores[3]}, {stores[4]} and 2 more"]

@@ -17,6 +17,7 @@ import zarr
 
 from stereotruth.command.check import check_project
 from stereotruth.command.findings import Level
+from stereotruth.lidar.point_store import PointStore
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
@@ -388,7 +389,10 @@ def test_provenance_is_in_every_product(made):
         json.loads(next((made.folder / "tiles/Tiny/orientation").iterdir()).read_text()),
     ]
     stores = [*(made.folder / "results").rglob("*.zarr")]
-    assert len(stores) >= 4
+    assert len(stores) >= 3
     records += [dict(zarr.open_group(store, mode="r").attrs) for store in stores]
+    points = [*(made.folder / "results/ingest").rglob("*.points")]
+    assert points
+    records += [PointStore(store).attrs for store in points]
     for record in records:
         assert {"code", "inputs", "parameters"} <= set(record["provenance"])

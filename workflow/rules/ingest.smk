@@ -3,7 +3,7 @@ rule ingest:
         lidar=lidar_file,
         geoid=given_in("geoid"),
     output:
-        store=directory("results/ingest/{city}/{scene}/{lidar}.zarr"),
+        store=directory("results/ingest/{city}/{scene}/{lidar}.points"),
     log:
         "logs/ingest/{city}/{scene}/{lidar}.log",
     benchmark:

@@ -69,7 +69,7 @@ def lidar_file(wildcards):
 
 def point_stores(wildcards):
     return expand(
-        "results/ingest/{city}/{scene}/{lidar}.zarr",
+        "results/ingest/{city}/{scene}/{lidar}.points",
         city=wildcards.city,
         scene=wildcards.scene,
         lidar=LIDAR[wildcards.scene],

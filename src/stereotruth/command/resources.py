@@ -25,7 +25,7 @@ TILE = 4.0  # a labelled tile of 1024 px: SIFT matches, warping
 SCENE = 60.0  # refinement
 JOB = 8.0  # start of a job, and what Snakemake does around it
 # Bytes on the disk.
-POINT_BYTES = 7.0
+POINT_BYTES = 12.0
 PX_BYTES = 4.0 + 12.0 + 8.0  # rectified pair, disparity grid, tiles
 SPARE = 1.2
 MEMORY = 4.0e9  # of the largest job

@@ -55,6 +55,6 @@ def _ingested(
 ) -> Sequence[Path]:
     stores = []
     for name, file in files.items():
-        stores.append(folder / f"{name}.zarr")
+        stores.append(folder / f"{name}.points")
         ingest(file, stores[-1], lidar_crs=lidar_crs, geoid=geoid)
     return stores

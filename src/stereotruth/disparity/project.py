@@ -174,16 +174,11 @@ def project_scene(
         )
     if apart(tuple(bounds), images):
         refuse_apart(tuple(bounds), images, heights, where)
-    made_of = {
-        name: digest(dict(require_complete(path).attrs.get("provenance", {})))
-        for name, path in (
-            ("left", left_store),
-            ("right", right_store),
-            *((f"points/{store.path.name}", store.path) for store in stores),
-        )
-    }
+    left_attrs, right_attrs = (require_complete(p).attrs for p in (left_store, right_store))
+    told = {"left": left_attrs, "right": right_attrs}
+    told |= {f"points/{store.path.name}": store.attrs for store in stores}
+    made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in told.items()}
     parameters = {"view": view} | asdict(settings)
-    left_attrs = require_complete(left_store).attrs
     attrs = {
         "kind": "disparity",
         "scene": scene,
@@ -199,7 +194,7 @@ def project_scene(
     _tell_density(inputs)
     content = digest(
         {
-            "images": [_identity(require_complete(p).attrs) for p in (left_store, right_store)],
+            "images": [_identity(left_attrs), _identity(right_attrs)],
             "epipolar": left_attrs["epipolar"],
             "uncertainty": inputs.pair.uncertainty.to_attrs(),
             "parameters": parameters

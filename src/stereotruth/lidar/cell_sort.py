@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import zarr
 from numba import njit
 from numpy.typing import NDArray
 
 from .lattice import CELL_BITS, cell_key
-from .point_store import CHUNK_POINTS, CODEC, SHARD_POINTS, STORE_ATTRS
+from .point_store import CELL, CELLS, POINT_BYTES, POINTS, WORDS
 
 Integers = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint32]
 
 
-_RECORD_BYTES = 16  # of a point before it has its final place: position and attributes
-SCRATCH_POINTS = 1 << 24  # of these kept in memory, 256 MiB
+SCRATCH_POINTS = (1 << 28) // POINT_BYTES  # kept in memory, 256 MiB
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -31,19 +32,24 @@ def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Intege
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort(
     lattice: Integers,
-    attributes: NDArray[np.uint32],
+    attributes: Words,
     cell: Integers,
     end: Integers,
     limits: NDArray[np.int32],
-    run: NDArray[np.int32],
+    run: Words,
 ) -> None:
-    """Fill ``run`` [n, 4] with the points as scratch records, by cell, in their order in a cell.
+    """Fill ``run`` [n, 3] with the points as they are stored, by cell, in their order in a cell.
 
     ``cell`` [n] is the number of each point's cell; ``end`` [m], zeros, gets the end of each cell
-    in the run, ``limits`` [m, 2] its lowest and highest height.
+    in the run, ``limits`` [m, 2] its lowest and highest height. Neighbours in the file are so in a
+    cell mostly, and are moved together.
     """
-    for i in range(cell.size):
-        end[cell[i]] += 1
+    i = 0
+    while i < cell.size:
+        first = i
+        while i < cell.size and cell[i] == cell[first]:
+            i += 1
+        end[cell[first]] += i - first
     total = 0
     for c in range(end.size):
         number = end[c]
@@ -51,38 +57,21 @@ def _sort(
         total += number
         limits[c, 0], limits[c, 1] = np.iinfo(np.int32).max, np.iinfo(np.int32).min
     inside = (1 << CELL_BITS) - 1
-    for i in range(cell.size):
-        c = cell[i]
-        at = end[c]
-        end[c] += 1
-        height = np.int32(lattice[2, i])
-        run[at, 0] = lattice[0, i] & inside
-        run[at, 1] = lattice[1, i] & inside
-        run[at, 2] = height
-        run[at, 3] = attributes[i]
-        limits[c, 0], limits[c, 1] = min(limits[c, 0], height), max(limits[c, 1], height)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _gather(
-    records: NDArray[np.int32],
-    pieces: Integers,
-    position: NDArray[np.int32],
-    attributes: Bytes,
-) -> None:
-    """Fill position [3, n] and attributes [3, n] from pieces of scratch records [k, 4].
-
-    ``pieces`` [m, 2]: first record and number of records of each.
-    """
-    done = 0
-    for piece in range(pieces.shape[0]):
-        first, number = pieces[piece]
-        for k in range(3):
-            target, low = position[k, done : done + number], attributes[k, done : done + number]
-            for i in range(number):
-                target[i] = records[first + i, k]
-                low[i] = records[first + i, 3] >> 8 * k & 255
-        done += number
+    i = 0
+    while i < cell.size:
+        c, first = cell[i], i
+        while i < cell.size and cell[i] == c:
+            i += 1
+        at = end[c] - first
+        end[c] += i - first
+        low, high = np.int64(limits[c, 0]), np.int64(limits[c, 1])
+        for k in range(first, i):
+            told, height = np.int64(attributes[k]), lattice[2, k]
+            run[at + k, 0] = lattice[0, k] & inside | (told & 4095) << CELL_BITS
+            run[at + k, 1] = lattice[1, k] & inside | told >> 16 << CELL_BITS
+            run[at + k, 2] = height
+            low, high = min(low, height), max(high, height)
+        limits[c, 0], limits[c, 1] = low, high
 
 
 def _cells(lattice: Integers) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -104,111 +93,69 @@ class SortedRuns:
     """External sort by cell: each chunk becomes one sorted run, a part of the scratch.
 
     A segment is what one run holds of one cell; segments of a cell, in the order of the runs, are
-    its points in the order of the file. Runs are in ``memory`` [k, 4]; where that is full, it is
-    moved to ``disk``.
+    its points in the order of the file. Runs are in ``memory`` [k, 3]; those that find no room
+    there any more are on ``disk``.
     """
 
-    memory: NDArray[np.int32]
+    memory: Words
     disk: BinaryIO
     written: int = 0
-    held: int = 0  # in memory
+    held: int = 0  # in memory, the first ones
     segments: list[np.ndarray] = field(default_factory=list)  # int64 [k, 3]: key, start, count
     limits: list[np.ndarray] = field(default_factory=list)  # int32 [k, 2]: lowest, highest
 
-    def add(self, lattice: NDArray[np.int64], attributes: NDArray[np.uint32]) -> None:
+    def add(self, lattice: NDArray[np.int64], attributes: Words) -> None:
         """Take in a chunk's points: lattice coordinates [3, n], attributes [n] as of _unpack."""
         size = attributes.size
         if not size:
             return
-        if self.held + size > len(self.memory):
-            self.spill()
         key, cell = _cells(lattice)
         end, limits = np.zeros(key.size, np.int64), np.empty((key.size, 2), np.int32)
-        run = self.memory[self.held : self.held + size]
+        room = self.held == self.written and self.held + size <= len(self.memory)
+        run = self.memory[self.held : self.held + size] if room else np.empty((size, WORDS), "<u4")
         _sort(lattice, attributes, cell, end, limits, run)
+        if room:
+            self.held += size
+        else:
+            self.disk.write(run)  # unlike ndarray.tofile it says why it fails
         count = np.diff(end, prepend=0)
         here = count > 0
         segments = np.stack([key, end - count + self.written, count], axis=1)
         self.segments.append(segments[here])
         self.limits.append(limits[here])
-        self.held += size
         self.written += size
 
-    def spill(self) -> None:
-        """Write what is held in memory to the scratch file."""
-        self.disk.write(self.memory[: self.held])  # unlike ndarray.tofile it says why it fails
-        self.held = 0
+    def _take(self, segments: Integers) -> Iterator[Words]:
+        """The points of segments, each at once."""
+        for _, start, count in segments.tolist():
+            if start < self.held:
+                yield self.memory[start : start + count]
+                continue
+            points = np.empty((count, WORDS), "<u4")
+            self.disk.seek((start - self.held) * POINT_BYTES)
+            if self.disk.readinto(points.data.cast("B")) != points.nbytes:
+                raise OSError("the scratch file of the points is cut short")
+            yield points
 
-    def take(self, pieces: list[tuple[int, int]]) -> tuple[NDArray[np.int32], Bytes]:
-        """Position [3, n] and attributes [3, n] of pieces of runs: first record, number."""
-        where = np.array(pieces, np.int64).reshape(-1, 2)
-        total = int(where[:, 1].sum())
-        position, attributes = np.empty((3, total), np.int32), np.empty((3, total), np.uint8)
-        records = self.memory
-        if self.written > self.held:
-            # Read by hand: pages of a memory map would count as this process's memory.
-            records, done = np.empty((total, 4), np.int32), 0
-            for first, number in pieces:
-                self.disk.seek(first * _RECORD_BYTES)
-                target = memoryview(records[done : done + number]).cast("B")
-                if self.disk.readinto(target) != number * _RECORD_BYTES:
-                    raise OSError("the scratch file of the points is cut short")
-                done += number
-            where = np.array([[0, total]])
-        _gather(records, where, position, attributes)
-        return position, attributes
-
-    def write(self, group: zarr.Group) -> None:
-        """Write points and cell table in final order."""
+    def write(self, folder: Path) -> int:
+        """Write points and cell table in final order; return the CRC-32 of the latter's file."""
         segments, limits = np.concatenate(self.segments), np.concatenate(self.limits)
         order = np.argsort(segments[:, 0], kind="stable")
         segments, limits = segments[order], limits[order]
         key, first = np.unique(segments[:, 0], return_index=True)
-        start_of = np.concatenate([[0], np.cumsum(segments[:, 2])])  # of segments, sorted
-        table = {
-            "cell_row": (key >> 32).astype("i4"),
-            "cell_col": ((key & 0xFFFFFFFF) - (1 << 30)).astype("i4"),
-            "cell_start": start_of[first].astype("i8"),
-            "cell_min": np.minimum.reduceat(limits[:, 0], first),
-            "cell_max": np.maximum.reduceat(limits[:, 1], first),
-        }
-        for name, values in table.items():
-            array = group.create_array(
-                name,
-                shape=values.shape,
-                dtype=values.dtype,
-                chunks=values.shape,
-                compressors=CODEC,
-                dimension_names=("cell",),
-                attributes=STORE_ATTRS[name],
-            )
-            array[:] = values
-        arrays = {
-            name: group.create_array(
-                name,
-                shape=(3, self.written),
-                dtype=dtype,
-                chunks=(3, CHUNK_POINTS),
-                shards=(3, SHARD_POINTS),
-                compressors=CODEC,
-                dimension_names=("component", "point"),
-                attributes=STORE_ATTRS[name],
-                config={"write_empty_chunks": True},  # does not look whether they are
-            )
-            for name, dtype in (("position", "i4"), ("attributes", "u1"))
-        }
-        if self.written > self.held:
-            self.spill()
-        for begin in range(0, self.written, SHARD_POINTS):
-            end = min(begin + SHARD_POINTS, self.written)
-            at = int(np.searchsorted(start_of, begin, side="right")) - 1
-            pieces, done = [], begin
-            while done < end:
-                _, start, count = segments[at].tolist()
-                skip = done - int(start_of[at])
-                pieces.append((start + skip, min(count - skip, end - done)))
-                done += pieces[-1][1]
-                at += 1
-            position, attributes = self.take(pieces)
-            arrays["position"][:, begin:end] = position
-            arrays["attributes"][:, begin:end] = attributes
+        table = np.empty(key.size, CELL)
+        table["row"], table["col"] = key >> 32, (key & 0xFFFFFFFF) - (1 << 30)
+        table["first"] = np.cumsum(segments[:, 2])[first] - segments[first, 2]
+        table["lowest"] = np.minimum.reduceat(limits[:, 0], first)
+        table["highest"] = np.maximum.reduceat(limits[:, 1], first)
+        described = {"descr": "<u4", "fortran_order": False, "shape": (self.written, WORDS)}
+        with (folder / POINTS).open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, described)
+            for cell, of in enumerate(np.split(segments, first[1:])):
+                found = 0
+                for points in self._take(of):
+                    found = zlib.crc32(points, found)
+                    file.write(points)
+                table["crc32"][cell] = found
+        np.save(folder / CELLS, table)
+        return zlib.crc32((folder / CELLS).read_bytes())

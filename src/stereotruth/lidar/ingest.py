@@ -4,20 +4,8 @@ Every point lies on one global lattice: longitude and latitude in steps of 1e-9Â
 steps of 1e-4 m. Sums over lattice integers are exact, so that nothing later depends on the order
 of files or points. Points are stored by square cells of 2**20 steps (0.00105Â°, 117 m along a
 meridian), cells in row-major order (south to north, west to east), inside a cell in the order of
-the file. The store of a file is the same to the byte whatever the size of the reading chunks.
-
-Layout of a store (Zarr v3, sharded; n points, m cells):
-
-===========================  =============  ==================================================
-``position``                 int32 [3, n]   lon, lat: steps from the cell's south-west corner;
-                                            height: steps above the WGS 84 ellipsoid
-``attributes``               uint8 [3, n]   classification, return_number, number_of_returns
-``cell_row``, ``cell_col``   int32 [m]      lattice latitude, longitude >> 20
-``cell_start``               int64 [m]      first point of the cell
-``cell_min``, ``cell_max``   int32 [m]      lowest and highest height in the cell
-===========================  =============  ==================================================
-
-One array for all that is read together: queries are nearly twice as fast as with one each.
+the file. The store of a file is the same to the byte whatever the size of the reading chunks. Its
+files: see :mod:`.point_store`.
 
 What ingest does to a point costs less than half of decoding it: kernels take the records apart,
 bring them to the lattice and sort them by cell without an intermediate copy of the points.
@@ -25,6 +13,7 @@ bring them to the lattice and sort them by cell without an intermediate copy of 
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,16 +22,16 @@ from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
-import zarr
 from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import progress
-from ..products.grids import building
+from ..products.files import whole_folder
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
+from .point_store import ARRAYS, ATTRIBUTES, FORMAT, WORDS
 from .settings import Settings
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
@@ -130,9 +119,9 @@ def ingest(
 ) -> dict[str, Any]:
     """Bring one LAS, LAZ or COPC file (1.0 to 1.4, any point format) into a point store.
 
-    Memory is that of one reading chunk, one shard and :data:`SCRATCH_POINTS`, whatever the size of
-    the file; where it has more points, they pass through a scratch file without a name, 16 bytes
-    each, on the disk of the store.
+    Memory is that of a reading chunk and :data:`SCRATCH_POINTS`, whatever the size of the file;
+    where it has more points, the others pass through a scratch file without a name, 12 bytes each,
+    on the disk of the store.
 
     Withheld points are dropped, and those of ``drop_classes``: by default noise, 7 (low) and 18
     (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
@@ -157,10 +146,9 @@ def ingest(
     transform = transform_of(None)
     _refuse_coarse(header, transform, file)
     with (
-        building(store) as unfinished,
+        whole_folder(store) as unfinished,
         TemporaryFile(dir=unfinished.parent) as disk,
     ):
-        group = zarr.open_group(unfinished, mode="w", zarr_format=3)
         reading = (drop_classes, chunk_points, workers, disk)
         tally, runs = _read(file, header, transform, *reading)
         own = tally.extent(header)
@@ -191,7 +179,7 @@ def ingest(
             notes.append(remark)
         if bounds[4] < -600 or bounds[5] > 9500:
             notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
-        runs.write(group)
+        cells_crc32 = runs.write(unfinished)
         summary = {
             "points": {
                 "header": header.point_count,
@@ -204,19 +192,22 @@ def ingest(
             "crs": transform.describe(),
             "notes": notes,
         }
-        group.attrs.update(
-            {
-                "kind": "points",
-                "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
-                f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
-                "row-major; the order of the file inside a cell",
-                "scene": scene,
-                "source": file.name,
-                "cell_bits": CELL_BITS,
-                **summary,
-                "provenance": dict(provenance or {}),
-            }
-        )
+        attrs = {
+            "kind": "points",
+            "format": FORMAT,
+            "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
+            f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
+            "row-major; the order of the file inside a cell",
+            "arrays": ARRAYS,
+            "scene": scene,
+            "source": file.name,
+            "cell_bits": CELL_BITS,
+            "cells_crc32": cells_crc32,
+            **summary,
+            "provenance": dict(provenance or {}),
+        }
+        text = json.dumps(attrs, indent=1, allow_nan=False)
+        (unfinished / ATTRIBUTES).write_text(text + "\n", encoding="utf-8")
     for note in notes:
         log.warning("%s: %s", file.name, note)
     log.info(
@@ -244,8 +235,8 @@ def _read(
     disk.seek(0)
     disk.truncate()
     tally = PointTally()
-    room = max(min(SCRATCH_POINTS, header.point_count), chunk_points)
-    runs = SortedRuns(np.empty((room, 4), np.int32), disk)
+    room = min(SCRATCH_POINTS, header.point_count)
+    runs = SortedRuns(np.empty((room, WORDS), "<u4"), disk)
     units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
     chunks = read_chunks(file, header, chunk_points)
     if workers > 1:

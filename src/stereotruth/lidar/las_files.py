@@ -227,8 +227,8 @@ class PointTally:
 
     def refuse_quantised(self, file: Path) -> None:
         """InputError if the file's first points share few positions."""
-        sample = np.concatenate(self.sample)
-        positions = len(np.unique(sample))
+        sample = np.sort(np.concatenate(self.sample))  # np.unique takes ten times as long
+        positions = 1 + np.count_nonzero(np.diff(sample))
         if len(sample) >= 1000 and positions < 0.1 * len(sample):
             raise InputError(
                 f"coordinates are quantised: {len(sample)} points lie on {positions} positions",

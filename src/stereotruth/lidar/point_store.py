@@ -1,51 +1,84 @@
-"""A point store: its layout on disk, and reading of its points by box."""
+"""A point store: its files, and reading of its points by box.
+
+A folder with plain arrays, which NumPy opens (little-endian; n points, m cells of the lattice):
+
+==============  ============  =====================================================================
+``points.npy``  uint32[n, 3]  a point in 96 bits, cell after cell:
+
+                              longitude from the cell's west edge, steps (bits 0 to 19), class
+                              (20 to 27), return number (28 to 31);
+
+                              latitude from the cell's south edge, steps (0 to 19), number of
+                              returns (20 to 23);
+
+                              height above the WGS 84 ellipsoid, steps (32 bits, signed)
+``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
+                              of the cell's first point; ``lowest``, ``highest``: heights of its
+                              points, steps; ``crc32`` of its points as they lie in the file
+``store.json``                attributes; ``cells_crc32`` of the file ``cells.npy``
+==============  ============  =====================================================================
+
+Points are written once and read once or twice, so that they are neither compressed nor cut into
+chunks. They are read by hand: pages of a memory map count as memory of the process, and a process
+dies of a mapped file that is cut short. What is read of a cell is held against its checksum.
+"""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterable, Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..errors import InputError
-from ..products.grids import require_complete
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
 Integers = NDArray[np.int64]
+Words = NDArray[np.uint32]
 
 
-CHUNK_POINTS = 1 << 17  # points per Zarr chunk
-SHARD_POINTS = 1 << 21  # points per shard file
-ATTRIBUTES = ("classification", "return_number", "number_of_returns")
-# A fifth of the time of zstd, level 3, to write and a third to read, for a tenth more bytes (7.1
-# instead of 6.4 a point): a store is written once and read once or twice.
-CODEC = BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.shuffle)
-STORE_ATTRS = {
-    "position": {
+FORMAT = 1  # of the files
+POINTS, CELLS, ATTRIBUTES = "points.npy", "cells.npy", "store.json"
+WORDS = 3  # of 32 bits, of a point
+POINT_BYTES = 4 * WORDS
+CELL = np.dtype(
+    [
+        ("row", "<i4"),
+        ("col", "<i4"),
+        ("first", "<i8"),
+        ("lowest", "<i4"),
+        ("highest", "<i4"),
+        ("crc32", "<u4"),
+    ]
+)
+ARRAYS = {  # what the files' attributes would say if they had any
+    POINTS: {
         "units": "1e-9 degree, 1e-9 degree, 1e-4 m",
-        "long_name": "longitude and latitude from the south-west corner of the cell, "
-        "height above the WGS 84 ellipsoid",
-        "components": ["lon", "lat", "height"],
+        "long_name": "longitude and latitude from the south-west corner of the cell, height above "
+        "the WGS 84 ellipsoid (signed); LAS attributes above bit 19",
+        "components": [
+            "lon + (class << 20) + (return number << 28)",
+            "lat + (number of returns << 20)",
+            "height",
+        ],
     },
-    "attributes": {
-        "units": "1",
-        "long_name": "LAS attributes of the points",
-        "components": list(ATTRIBUTES),
+    CELLS: {
+        "units": "row, col: cell size; lowest, highest: 1e-4 m",
+        "long_name": "south-west corner, first point, lowest and highest height of each cell, "
+        "CRC-32 of its points",
     },
-    "cell_row": {"units": "1", "long_name": "latitude of the cell's south edge / cell size"},
-    "cell_col": {"units": "1", "long_name": "longitude of the cell's west edge / cell size"},
-    "cell_start": {"units": "1", "long_name": "index of the cell's first point"},
-    "cell_min": {"units": "1e-4 m", "long_name": "lowest height of the cell's points"},
-    "cell_max": {"units": "1e-4 m", "long_name": "highest height of the cell's points"},
 }
+_PIECE = 1 << 16  # points that are read at once, so that they stay in the cache
 
 
 @dataclass(frozen=True)
@@ -88,8 +121,7 @@ class Points:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _select(
-    position: NDArray[np.int32],
-    attributes: Bytes,
+    stored: Words,
     start: Integers,
     corner: Integers,
     box: Integers,
@@ -100,17 +132,21 @@ def _select(
 ) -> int:
     """Fill lon, lat, height [n] and out [3, n] with the stored points in a box; how many there are.
 
-    ``start`` [m + 1] of the cells' points, ``corner`` [2, m] their south-west corners (lon, lat).
+    ``start`` [m + 1] of the cells' points among the ``stored``, ``corner`` [2, m] their south-west
+    corners (lon, lat).
     """
     kept = 0
+    west, south, east, north = box[0], box[1], box[2], box[3]
+    inside = (1 << CELL_BITS) - 1
     for cell in range(start.size - 1):
-        west, south, east, north = box[0], box[1], box[2], box[3]
         col, row = corner[0, cell], corner[1, cell]
         for i in range(start[cell], start[cell + 1]):
-            x, y = position[0, i] + col, position[1, i] + row
-            lon[kept], lat[kept], height[kept] = x, y, position[2, i]
-            for k in range(3):
-                out[k, kept] = attributes[k, i]
+            first, second = np.int64(stored[i, 0]), np.int64(stored[i, 1])
+            x, y = (first & inside) + col, (second & inside) + row
+            lon[kept], lat[kept], height[kept] = x, y, np.int32(stored[i, 2])
+            out[0, kept] = first >> CELL_BITS & 255
+            out[1, kept] = first >> 28
+            out[2, kept] = second >> CELL_BITS & 15
             kept += (x >= west) & (y >= south) & (x <= east) & (y <= north)
     return kept
 
@@ -119,24 +155,73 @@ class PointStore:
     """A finished point store, open for queries.
 
     ``bounds`` = (lon_min, lat_min, lon_max, lat_max, h_min, h_max), ``count`` points, ``attrs`` of
-    the store. Raises InputError if the store is missing, unfinished or of another kind.
+    the store. Raises InputError if the store is missing, of another kind or damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        group = require_complete(path)
-        if group.attrs.get("kind") != "points":
-            raise InputError("no point store", file=path, remedy="give a store made by ingest")
-        self.attrs: dict[str, Any] = dict(group.attrs)
+        self.attrs = self._attributes()
         self.bounds: tuple[float, ...] = tuple(self.attrs["bounds"])
-        self._position, self._attributes = group["position"], group["attributes"]
-        self.count = int(self._position.shape[1])
-        self.cell_row = group["cell_row"][:].astype(np.int64)
-        self.cell_col = group["cell_col"][:].astype(np.int64)
-        self.cell_heights = np.stack([group["cell_min"][:], group["cell_max"][:]], axis=1)
-        self._start = np.append(group["cell_start"][:], self.count)
+        self.count = int(self.attrs["points"]["kept"])
+        cells = self._cell_table()
+        self.cell_row = cells["row"].astype(np.int64)
+        self.cell_col = cells["col"].astype(np.int64)
+        self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
+        self._crc32 = cells["crc32"].tolist()
+        self._start = np.append(cells["first"], self.count)
         self._key = cell_key(self.cell_row, self.cell_col)
         self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=self.cell_row[0] - 1))
+        self._offset = self._first_byte()
+
+    def _attributes(self) -> dict[str, Any]:
+        file = self.path / ATTRIBUTES
+        try:
+            attrs = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise InputError(
+                "no such point store", file=self.path, remedy="run the stage that makes it"
+            ) from error
+        except ValueError as error:
+            raise self._damaged(ATTRIBUTES) from error
+        if not isinstance(attrs, dict) or attrs.get("kind") != "points":
+            raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
+        if attrs["format"] != FORMAT:
+            raise InputError(
+                f"a point store of format {attrs['format']}, not {FORMAT}",
+                file=self.path,
+                remedy="delete it and run the workflow again",
+            )
+        return attrs
+
+    def _cell_table(self) -> NDArray[np.void]:
+        try:
+            data = (self.path / CELLS).read_bytes()
+        except OSError as error:
+            raise self._damaged(CELLS) from error
+        if zlib.crc32(data) != self.attrs["cells_crc32"]:
+            raise self._damaged(CELLS)
+        return np.load(BytesIO(data))
+
+    def _first_byte(self) -> int:
+        """Where the points begin in their file, which has the size that it should have."""
+        file = self.path / POINTS
+        try:
+            with file.open("rb") as stream:
+                np.lib.format.read_magic(stream)
+                shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+                right = (shape, dtype) == ((self.count, WORDS), np.dtype("<u4"))
+                if right and file.stat().st_size - stream.tell() == self.count * POINT_BYTES:
+                    return stream.tell()
+        except (OSError, ValueError) as error:
+            raise self._damaged(POINTS) from error
+        raise self._damaged(POINTS)
+
+    def _damaged(self, name: str) -> InputError:
+        return InputError(
+            "damaged: it is not what was written",
+            file=self.path / name,
+            remedy=f"delete {self.path} and run the workflow again",
+        )
 
     @property
     def cell_counts(self) -> Integers:
@@ -170,26 +255,49 @@ class PointStore:
         return float(heights[:, 0].min()) / PER_M, float(heights[:, 1].max()) / PER_M
 
     def query(self, lon_min: float, lat_min: float, lon_max: float, lat_max: float) -> Points:
-        """Points with lon_min <= lon <= lon_max and lat_min <= lat <= lat_max, in stored order."""
-        ranges: list[tuple[int, int]] = []
-        box = lattice_box(lon_min, lat_min, lon_max, lat_max)
-        for first, end in self._cells(box):
-            # Rows less than a chunk apart share it: one read for both.
-            if ranges and self._start[first] - self._start[ranges[-1][1]] < CHUNK_POINTS:
-                ranges[-1] = (ranges[-1][0], end)
-            else:
-                ranges.append((first, end))
-        return Points.concatenate([self._read(first, end, box) for first, end in ranges])
+        """Points with lon_min <= lon <= lon_max and lat_min <= lat <= lat_max, in stored order.
 
-    def _read(self, first: int, end: int, box: tuple[int, int, int, int]) -> Points:
-        where = slice(int(self._start[first]), int(self._start[end]))
-        stored = self._position[:, where], self._attributes[:, where]
-        total = where.stop - where.start
+        Raises InputError if they are not what was written.
+        """
+        box = lattice_box(lon_min, lat_min, lon_max, lat_max)
+        ranges = self._cells(box)
+        total = int(sum(self._start[end] - self._start[first] for first, end in ranges))
         lattice, attributes = np.empty((3, total), np.int64), np.empty((3, total), np.uint8)
-        start = self._start[first : end + 1] - where.start
-        corner = np.stack([self.cell_col[first:end], self.cell_row[first:end]]) << CELL_BITS
-        kept = _select(*stored, start, corner, np.array(box), *lattice, attributes)
+        limits, kept = np.array(box), 0
+        for stored, start, cells in self._stored(ranges):
+            corner = np.stack([self.cell_col[cells], self.cell_row[cells]]) << CELL_BITS
+            out = (*lattice[:, kept:], attributes[:, kept:])
+            kept += _select(stored, start, corner, limits, *out)
         return Points(*lattice[:, :kept], *attributes[:, :kept])
+
+    def _stored(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[Words, Integers, slice]]:
+        """Points of ranges of cells as they are stored, [n, 3], a piece at a time.
+
+        With the cells that a piece is of, and where the points of each begin in it.
+        """
+        buffer = np.empty((_PIECE, WORDS), "<u4")
+        with (self.path / POINTS).open("rb", buffering=0) as file:
+            for first, end in ranges:
+                begin, last = int(self._start[first]), int(self._start[end])
+                file.seek(self._offset + begin * POINT_BYTES)
+                found, cell = 0, first
+                for at in range(begin, last, _PIECE):
+                    stored = buffer[: min(_PIECE, last - at)]
+                    if file.readinto(stored.data.cast("B")) != stored.nbytes:
+                        raise self._damaged(POINTS)
+                    stop = at + len(stored)
+                    of = cell
+                    while cell < end and self._start[cell] < stop:
+                        part = stored[max(self._start[cell] - at, 0) : self._start[cell + 1] - at]
+                        found = zlib.crc32(part, found)
+                        if self._start[cell + 1] > stop:
+                            break
+                        if found != self._crc32[cell]:
+                            raise self._damaged(POINTS)
+                        found, cell = 0, cell + 1
+                    cells = slice(of, min(cell + 1, end))
+                    bounds = self._start[cells.start : cells.stop + 1]
+                    yield stored, np.clip(bounds - at, 0, len(stored)), cells
 
 
 def _datum_and_operation(store: PointStore) -> tuple[str, str]:

@@ -219,10 +219,10 @@ class TestMarseille:
         xyz, crs = cloud
         changed = np.column_stack([xyz[:, :2], change(xyz[:, 2])])
         write_las(folder / "points.las", xyz=changed, system=crs)
-        ingest(folder / "points.las", folder / "points.zarr")
+        ingest(folder / "points.las", folder / "points.points")
         images = MARSEILLE / "left.tif", MARSEILLE / "right.tif"
         aligned = align(*images, MARSEILLE / "gcps.csv", provenance={})
-        return refine(aligned, *images, [folder / "points.zarr"])[0]
+        return refine(aligned, *images, [folder / "points.points"])[0]
 
     def test_as_it_is_nothing_is_doubted(self, cloud, tmp_path):
         found = self.refined(cloud, tmp_path, lambda z: z)

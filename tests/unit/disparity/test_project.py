@@ -253,8 +253,8 @@ def test_water_is_masked_as_changed(plane, tmp_path) -> None:
         xyz=np.column_stack(to_utm.transform(*points.T)),
         classification=water,
     )
-    ingest(tmp_path / "water.las", tmp_path / "water.zarr")
-    project_with(*plane.images, [tmp_path / "water.zarr"], tmp_path / "out.zarr", method="both")
+    ingest(tmp_path / "water.las", tmp_path / "water.points")
+    project_with(*plane.images, [tmp_path / "water.points"], tmp_path / "out.zarr", method="both")
     grid = open_grid(tmp_path / "out.zarr")
     status, east = grid["status"].values, plane.surface[0]
     assert not (status == Status.LABELLED)[east > 1.0].any()
@@ -372,7 +372,7 @@ def test_attributes_and_summary(plane) -> None:
     assert status.attrs["flag_values"] == list(range(9))  # none between points, by this method
     assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status][:9]
     assert grid.attrs["provenance"]["code"] == "abc"
-    assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.zarr"}
+    assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.points"}
     assert EpipolarModel.from_dict(grid.attrs["epipolar"]).shape == plane.model.shape
     pixels = plane.summary["pixels"]
     assert pixels == grid.attrs["summary"]["pixels"]
@@ -429,7 +429,7 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
     with pytest.raises(InputError, match=r"114\.3.*30\.6"):
         project_with(
-            *plane.images, [tmp_path / "far" / "points.zarr"], tmp_path / "x.zarr", method="none"
+            *plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr", method="none"
         )
 
 

@@ -12,6 +12,7 @@ import zarr
 
 from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
+from stereotruth.lidar.point_store import ATTRIBUTES
 from stereotruth.products.grids import Strip
 
 from ...synthetic.box_scene import Scene, project_with, write_image, write_points
@@ -25,7 +26,7 @@ def scene(tmp_path, monkeypatch) -> Scene:
     monkeypatch.setattr("stereotruth.disparity.project.CHUNK", 24)
     (tmp_path / "scene").mkdir()
     scene = Scene(tmp_path / "scene", box=True)
-    name(scene.store, "points")
+    name_points(scene.store, {"made of": "points"})
     for path in scene.images:
         name(path, path.stem)
     return scene
@@ -33,6 +34,12 @@ def scene(tmp_path, monkeypatch) -> Scene:
 
 def name(store: Path, text: str) -> Path:
     zarr.open_group(store, mode="r+").attrs["provenance"] = {"made of": text}
+    return store
+
+
+def name_points(store: Path, made_of: dict[str, str]) -> Path:
+    file = store / ATTRIBUTES
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"provenance": made_of}))
     return store
 
 
@@ -55,7 +62,8 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     assert project(scene, [scene.store], out) == set()
     lon, lat, _ = scene.points.T
     corner = scene.points[(lon < lon.min() + 2e-4) & (lat < lat.min() + 2e-4)] + [0.0, 0.0, 4.0]
-    more = name(write_points(tmp_path / "more", corner, name="more"), "more")
+    more = write_points(tmp_path / "more", corner, name="more")
+    name_points(more, {"made of": "more"})
     touched = project(scene, [scene.store, more], out)
     assert touched and len(touched) < 0.7 * len(everything), (len(touched), len(everything))
     other = tmp_path / "other.zarr"
@@ -90,7 +98,7 @@ def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
 
 
 def test_a_store_that_does_not_say_what_it_is_made_of_is_never_taken_over(scene, tmp_path):
-    zarr.open_group(scene.store, mode="r+").attrs["provenance"] = {}
+    name_points(scene.store, {})
     out = tmp_path / "out.zarr"
     everything = project(scene, [scene.store], out)
     record = json.loads((tmp_path / ".out.zarr.work/done/0-0.json").read_text())

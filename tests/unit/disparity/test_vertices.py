@@ -8,6 +8,7 @@ import pytest
 from stereotruth.disparity.even_squares import REACH, SIDE
 from stereotruth.disparity.rays import Rays
 from stereotruth.disparity.vertices import PART, PART_BITS, VertexBuilder, Vertices
+from stereotruth.epipolar.one_surface import SURFACE_PX
 from stereotruth.lidar.lattice import LATTICE_M
 
 CELL = 3000
@@ -28,6 +29,40 @@ def built(height_at, low=(0, 0), kept=None, noise_m=0.0, kinds=2, order=None) ->
     q = np.rint(h[use] / LATTICE_M).astype(np.int64)
     builder.add(lon, lat, q, classes[use].astype(np.uint8))
     return builder.built()
+
+
+@pytest.mark.parametrize("cell", [(1, 1), (7, 5), (3001, 2999), (6765, 5849)])
+def test_places_are_those_of_whole_numbers(cell) -> None:
+    """West of Greenwich and south of the equator, on the corners of cells and one step off."""
+    rng = np.random.default_rng(1)
+    low = np.array([-70_123_456_789, -33_987_654_321])
+    size = 40 * np.array(cell)
+    places = low[:, None] + rng.integers(0, size, (400, 2)).T
+    corners = (low // cell + rng.integers(1, 40, (400, 2))) * cell
+    lon, lat = np.hstack([places, corners.T, corners.T - 1])
+    rays = Rays(np.zeros((2, 2, 3)), cell, 1.0)
+    builder = VertexBuilder(rays, tuple(low.tolist()), tuple((low + size).tolist()))
+    h = rng.integers(-(10**6), 10**6, lon.size)
+    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8))
+    found = builder.built()
+    tolerance = int(SURFACE_PX / LATTICE_M)
+    expected = {}
+    for i, j in {(i, j) for i, j in zip(lon // cell[0], lat // cell[1])}:
+        here = (lon // cell[0] == i) & (lat // cell[1] == j)
+        here &= h >= h[here].max() - tolerance
+        n, (east, north, up) = here.sum(), (lon - i * cell[0], lat - j * cell[1], h)
+        east, north = int(east[here].sum()) // n, int(north[here].sum()) // n
+        first = low // cell
+        expected[j, i] = (
+            i * cell[0] + east,
+            j * cell[1] + north,
+            int(up[here].sum()) // n,
+            ((i - first[0]) << PART_BITS) + east * PART // cell[0],
+            ((j - first[1]) << PART_BITS) + north * PART // cell[1],
+            n,
+        )
+    got = zip(found.lon_q, found.lat_q, found.h_q, found.x, found.y, found.count)
+    assert list(got) == [expected[key] for key in sorted(expected)]
 
 
 def in_middle(found: Vertices) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import struct
 
@@ -11,7 +12,7 @@ import pyproj
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.lidar import cell_sort, lattice, point_store
+from stereotruth.lidar import lattice
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.to_wgs84 import to_wgs84
@@ -54,10 +55,10 @@ def test_points_keep_their_place_and_attributes(tmp_path, version, pdrf, suffix)
             "scanner_channel": rng.integers(0, 4, 3000),
         }
     xyz = write_las(file, pdrf=pdrf, version=version, classification=classes, **fields)
-    result = ingest(file, tmp_path / "a.zarr", lidar_crs="EPSG:32650", drop_classes=())
+    result = ingest(file, tmp_path / "a.points", lidar_crs="EPSG:32650", drop_classes=())
     assert result["points"]["header"] == result["points"]["read"] == 3000
     assert result["points"]["kept"] == 3000
-    got = everything(PointStore(tmp_path / "a.zarr"))
+    got = everything(PointStore(tmp_path / "a.points"))
     truth = pyproj.Transformer.from_crs("EPSG:32650", "EPSG:4326", always_xy=True)
     lon, lat = truth.transform(xyz[:, 0], xyz[:, 1])
     expected = by_position(lon, lat, xyz[:, 2])
@@ -73,8 +74,8 @@ def test_points_keep_their_place_and_attributes(tmp_path, version, pdrf, suffix)
 
 def test_coordinates_and_lattice_are_consistent(tmp_path) -> None:
     write_las(tmp_path / "a.laz")
-    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
-    store = PointStore(tmp_path / "a.zarr")
+    ingest(tmp_path / "a.laz", tmp_path / "a.points")
+    store = PointStore(tmp_path / "a.points")
     got = everything(store)
     assert np.array_equal(got.lon, got.lon_q / 1e9)
     assert np.array_equal(got.height, got.h_q / 1e4)
@@ -85,20 +86,19 @@ def test_coordinates_and_lattice_are_consistent(tmp_path) -> None:
 
 
 def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(point_store, "SHARD_POINTS", 4096)
-    monkeypatch.setattr(point_store, "CHUNK_POINTS", 1024)
+    module = importlib.import_module(ingest.__module__)
     write_las(tmp_path / "a.laz", 20_000)
     digests = set()
     for k, (chunk, workers, kept_in_memory) in enumerate(
         [(20_000, 1, 1 << 20), (333, 1, 1 << 20), (7000, 2, 9000), (900, 1, 0), (10**6, 1, 1)]
     ):
-        monkeypatch.setattr(cell_sort, "SCRATCH_POINTS", kept_in_memory)
-        store = tmp_path / f"{k}.zarr"
+        monkeypatch.setattr(module, "SCRATCH_POINTS", kept_in_memory)
+        store = tmp_path / f"{k}.points"
         ingest(tmp_path / "a.laz", store, chunk_points=chunk, workers=workers)
         digests.add(tree_digest(store))
         assert not list(store.rglob("*scratch*"))
     assert len(digests) == 1
-    assert PointStore(tmp_path / "0.zarr").count == 20_000
+    assert PointStore(tmp_path / "0.points").count == 20_000
 
 
 def test_the_datum_operation_follows_from_the_points(tmp_path, caplog) -> None:
@@ -107,7 +107,7 @@ def test_the_datum_operation_follows_from_the_points(tmp_path, caplog) -> None:
     xyz = np.array([x, y, 600]) + np.random.default_rng(0).uniform(0, 300, (900, 3))
     write_las(tmp_path / "a.laz", xyz=xyz, system=pyproj.CRS("EPSG:23030"))
     with caplog.at_level(logging.INFO, "stereotruth"):
-        good = ingest(tmp_path / "a.laz", tmp_path / "good.zarr")
+        good = ingest(tmp_path / "a.laz", tmp_path / "good.points")
     assert f"a.laz: brought to WGS 84 by '{good['crs']['operation']}'" in caplog.text
     data = bytearray((tmp_path / "a.laz").read_bytes())
     for k, sign in enumerate((1, -1, 1, -1)):
@@ -116,16 +116,16 @@ def test_the_datum_operation_follows_from_the_points(tmp_path, caplog) -> None:
     (tmp_path / "a.laz").write_bytes(data)
     header = laspy.open(tmp_path / "a.laz").header
     assert to_wgs84(header, "a.laz").operation != good["crs"]["operation"]
-    assert ingest(tmp_path / "a.laz", tmp_path / "bad.zarr") == good
-    assert tree_digest(tmp_path / "bad.zarr") == tree_digest(tmp_path / "good.zarr")
+    assert ingest(tmp_path / "a.laz", tmp_path / "bad.points") == good
+    assert tree_digest(tmp_path / "bad.points") == tree_digest(tmp_path / "good.points")
 
 
 def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
     xyz = np.random.default_rng(0).uniform(0, 700, (5000, 3)) + np.array([WEST, SOUTH, 0])
     xyz[:, 2] = np.arange(5000) * 0.1  # the height tells the place in the file
     write_las(tmp_path / "a.laz", xyz=xyz)
-    ingest(tmp_path / "a.laz", tmp_path / "a.zarr", chunk_points=700)
-    got = everything(PointStore(tmp_path / "a.zarr"))
+    ingest(tmp_path / "a.laz", tmp_path / "a.points", chunk_points=700)
+    got = everything(PointStore(tmp_path / "a.points"))
     cell = np.column_stack([got.lat_q >> lattice.CELL_BITS, got.lon_q >> lattice.CELL_BITS])
     changes = np.flatnonzero((np.diff(cell, axis=0) != 0).any(axis=1)) + 1
     visited = cell[np.r_[0, changes]]
@@ -139,8 +139,8 @@ def test_southern_and_western_hemisphere(tmp_path) -> None:
     xyz = np.random.default_rng(0).uniform(0, 300, (500, 3))
     xyz += [320_000, 6_250_000, 0]
     xyz = write_las(tmp_path / "a.laz", xyz=xyz, system=pyproj.CRS("EPSG:32719").to_3d())
-    ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
-    got = everything(PointStore(tmp_path / "a.zarr"))
+    ingest(tmp_path / "a.laz", tmp_path / "a.points")
+    got = everything(PointStore(tmp_path / "a.points"))
     lon, lat = pyproj.Transformer.from_crs(32719, 4326, always_xy=True).transform(*xyz.T[:2])
     assert lon.max() < -70
     assert lat.max() < -33
@@ -167,7 +167,7 @@ def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> No
         withheld=withheld,
         synthetic=synthetic,
     )
-    result = ingest(tmp_path / "a.laz", tmp_path / "a.zarr")
+    result = ingest(tmp_path / "a.laz", tmp_path / "a.points")
     assert result["points"] == {
         "header": 1000,
         "read": 1000,
@@ -175,15 +175,15 @@ def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> No
         "dropped": {"withheld": 110, "class 7": 25, "class 18": 15},
     }
     assert result["classes"] == {"2": 840, "12": 10}
-    kept = ingest(tmp_path / "a.laz", tmp_path / "b.zarr", drop_classes=())
+    kept = ingest(tmp_path / "a.laz", tmp_path / "b.points", drop_classes=())
     assert kept["points"]["kept"] == 890
 
 
 def test_producers_own_classes_are_kept_unless_listed(tmp_path) -> None:
     classes = np.where(np.arange(1000) < 40, 65, 2).astype(np.uint8)
     write_las(tmp_path / "a.laz", 1000, classification=classes)
-    assert ingest(tmp_path / "a.laz", tmp_path / "a.zarr")["classes"] == {"2": 960, "65": 40}
-    dropped = ingest(tmp_path / "a.laz", tmp_path / "a.zarr", drop_classes=(7, 18, 65))
+    assert ingest(tmp_path / "a.laz", tmp_path / "a.points")["classes"] == {"2": 960, "65": 40}
+    dropped = ingest(tmp_path / "a.laz", tmp_path / "a.points", drop_classes=(7, 18, 65))
     assert dropped["points"]["dropped"]["class 65"] == 40
 
 
@@ -196,8 +196,8 @@ def test_no_crs_names_lidar_crs(tmp_path) -> None:
     xyz = write_las(tmp_path / "a.laz", system=None)
     refused(tmp_path / "a.laz", "lidar_crs")
     refused(tmp_path / "a.laz", "outside of the area", lidar_crs="EPSG:2193")
-    ingest(tmp_path / "a.laz", tmp_path / "a.zarr", lidar_crs="EPSG:32650")
-    assert PointStore(tmp_path / "a.zarr").count == len(xyz)
+    ingest(tmp_path / "a.laz", tmp_path / "a.points", lidar_crs="EPSG:32650")
+    assert PointStore(tmp_path / "a.points").count == len(xyz)
 
 
 def test_places_off_the_earth(tmp_path) -> None:
@@ -233,9 +233,9 @@ def test_heights_with_a_geoid_and_survey_feet(tmp_path) -> None:
     noise = np.where(np.arange(3000) < 1000, 7, 2).astype(np.uint8)  # one whole chunk of it
     xyz = write_las(tmp_path / "a.laz", system=system, classification=noise)
     result = ingest(
-        tmp_path / "a.laz", tmp_path / "a.zarr", geoid=tmp_path / "n.gtx", chunk_points=1000
+        tmp_path / "a.laz", tmp_path / "a.points", geoid=tmp_path / "n.gtx", chunk_points=1000
     )
-    got = everything(PointStore(tmp_path / "a.zarr"))
+    got = everything(PointStore(tmp_path / "a.points"))
     expected = np.sort(xyz[1000:, 2]) * 1200 / 3937 - 12.5
     np.testing.assert_allclose(np.sort(got.height), expected, rtol=0, atol=6e-5)
     assert result["crs"]["geoid"] == "n.gtx"
@@ -290,12 +290,12 @@ def test_real_files_are_read_right_or_refused_by_name(tmp_path, name, arguments,
         arguments["geoid"].write_bytes(head + np.full(181 * 360, FLAT_N, ">f4").tobytes())
     if isinstance(expected, str):
         with pytest.raises(InputError, match=expected) as error:
-            ingest(REAL / name, tmp_path / "a.zarr", **arguments)
+            ingest(REAL / name, tmp_path / "a.points", **arguments)
         assert name in str(error.value)
-        assert not (tmp_path / "a.zarr").exists()
+        assert not (tmp_path / "a.points").exists()
         return
     kept, epsg, unit = expected
-    result = ingest(REAL / name, tmp_path / "a.zarr", **arguments)
+    result = ingest(REAL / name, tmp_path / "a.points", **arguments)
     assert result["points"]["kept"] == kept
     with laspy.open(REAL / name) as reader:
         las = reader.read()
@@ -307,7 +307,7 @@ def test_real_files_are_read_right_or_refused_by_name(tmp_path, name, arguments,
     lon, lat, height = truth.transform(x, y, z * unit)
     if arguments.get("geoid"):
         height += FLAT_N
-    got = everything(PointStore(tmp_path / "a.zarr"))
+    got = everything(PointStore(tmp_path / "a.points"))
     for ours, theirs in ((got.lon, lon), (got.lat, lat)):
         np.testing.assert_allclose(np.sort(ours), np.sort(theirs), rtol=0, atol=1.1e-9)
     np.testing.assert_allclose(np.sort(got.height), np.sort(height), rtol=0, atol=6e-5)
@@ -323,7 +323,7 @@ def test_copc_with_hierarchy_page_is_read_whole(tmp_path) -> None:
     (tmp_path / "n.gtx").write_bytes(head + np.zeros(181 * 360, ">f4").tobytes())
     with laspy.CopcReader.open(str(file)) as reader:
         whole = reader.query()
-    result = ingest(file, tmp_path / "a.zarr", geoid=tmp_path / "n.gtx")
+    result = ingest(file, tmp_path / "a.points", geoid=tmp_path / "n.gtx")
     assert result["points"]["read"] == len(whole) == 1065
     # Its coordinates are in feet, its system in metres: it lands in Canada, and that is said.
     assert any("outside of the area" in note for note in result["notes"])

@@ -78,14 +78,14 @@ def test_stale_header_is_remarked(tmp_path) -> None:
     """Where no counts by return contradict it."""
     file = tmp_path / "a.las"
     write_las(file, 100, pdrf=1, version="1.2")
-    assert not ingest(file, tmp_path / "a.zarr")["notes"]
+    assert not ingest(file, tmp_path / "a.points")["notes"]
     data = bytearray(file.read_bytes())
     struct.pack_into("<I", data, 107, 80)
     file.write_bytes(data)
     refused(file, "announces 80 points, its counts by return add up to 100")
     struct.pack_into("<5I", data, 111, 0, 0, 0, 0, 0)
     file.write_bytes(data)
-    result = ingest(file, tmp_path / "a.zarr")
+    result = ingest(file, tmp_path / "a.points")
     assert result["points"]["kept"] == 80
     assert "announces 80 points, which are read; 100 would fit" in result["notes"][0]
 
@@ -99,7 +99,7 @@ def test_counts_by_return_are_held_against_the_points(tmp_path) -> None:
     refused(file, "counts 49, 51 points by return, 50, 50 were read")
     struct.pack_into("<2I", data, 111, 100, 0)  # software that knows no returns
     file.write_bytes(data)
-    assert "counts 100 points by return" in ingest(file, tmp_path / "a.zarr")["notes"][0]
+    assert "counts 100 points by return" in ingest(file, tmp_path / "a.points")["notes"][0]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_points_outside_of_the_stated_bounds(tmp_path, system, scale, unit) -> N
     east = struct.unpack_from("<d", data, 179)[0]
     struct.pack_into("<d", data, 179, east - 20 * unit)
     file.write_bytes(data)
-    assert "points reach from" in ingest(file, tmp_path / "a.zarr")["notes"][-1]
+    assert "points reach from" in ingest(file, tmp_path / "a.points")["notes"][-1]
     struct.pack_into("<d", data, 179, east - 200 * unit)
     file.write_bytes(data)
     refused(file, "damaged: points reach from")

@@ -15,7 +15,7 @@ from ...synthetic.las import write_las
 def test_a_header_says_what_the_points_are(tmp_path):
     file = tmp_path / "a.laz"
     write_las(file, 5000)
-    found, read = survey(file), ingest(file, tmp_path / "a.zarr")
+    found, read = survey(file), ingest(file, tmp_path / "a.points")
     assert found.points == read["points"]["read"]
     box, points = np.array(found.box), np.array(read["bounds"])
     np.testing.assert_allclose(box, points[:4], atol=1e-6)  # corners of a box turned in degrees
