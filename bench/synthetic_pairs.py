@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
 from stereotruth.alignment.adjustment import epipolar_model
@@ -24,7 +23,8 @@ from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import whole_folder
-from stereotruth.simulate.cities import CITIES, CitySpec, lidar_files
+from stereotruth.products.ungeoreferenced import open_raster
+from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, lidar_files
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -95,17 +95,17 @@ class Condition:
             return images
         rng = np.random.default_rng([SEED, pair.spec.pose_seed])
         for image in images:
-            with rasterio.open(image) as source:
+            with open_raster(image) as source:
                 profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
             (changed,) = as_images([self.change(pixels.astype(np.float32), rng)], [pixels])
-            with rasterio.open(folder / image.name, "w", **profile, rpcs=rpcs) as target:
+            with open_raster(folder / image.name, "w", **profile, rpcs=rpcs) as target:
                 target.write(changed, 1)
         return [folder / image.name for image in images]
 
 
 CONDITIONS = {
     "plain": Condition(),
-    "exact": Condition(exact_gcps=True),
+    "exact": Condition(exact_gcps=True, refined=False),
     "misaligned": Condition(refined=False),
     "noise": Condition(change=noise),
     "gain": Condition(change=gain),
@@ -123,7 +123,7 @@ class Pair:
     results: Path
 
     @property
-    def spec(self):
+    def spec(self) -> SceneSpec:
         """The scene's specification."""
         return self.city.scene(self.name)
 

@@ -135,7 +135,7 @@ def contact_sheet(
     axis = figure.add_axes((0.01, 0.05 / height, 6 * LINE_IN / 13.0, inches / height))
     for k, (caption, left, right, disparity) in enumerate(tiles):
         row = k // 2 * step + GAP_PX
-        trio = (left[..., None], right[..., None], colours(disparity, limits))
+        trio = (np.atleast_3d(left), np.atleast_3d(right), colours(disparity, limits))
         for n, (picture, name) in enumerate(zip(trio, (f"{caption}, left", "right", "disparity"))):
             col = (3 * (k % 2) + n) * step
             high, wide = picture.shape[:2]
