@@ -100,6 +100,10 @@ def print_shares(found: dict[Run, dict[float, Figures]], densities: Sequence[flo
     rows.append(["asked for", "", "", *(shown(TARGETS.get(d, ())) for d in densities)])
     title = "Visible labelled / hidden labelled / off by more than 1 px, %, by points/m²"
     print_table(title, columns, rows)
+    rows = [
+        [*run, *(shown([by[d].hidden_in_both]) for d in densities)] for run, by in found.items()
+    ]
+    print_table("Hidden labelled, % of those that the LiDAR's world hides, too", columns, rows)
 
 
 def print_errors(found: dict[Run, dict[float, Figures]]) -> None:
@@ -183,6 +187,7 @@ def as_json(found: dict[Run, dict[float, Figures]]) -> list[dict]:
     return [
         {"pair": run[0], "condition": run[1], "fill": run[2], "points/m2": target}
         | dict(zip(names, shares(figures.counts)))
+        | {"hidden in the LiDAR's world, too, labelled, %": figures.hidden_in_both}
         | {"errors": figures.errors, "surfaces": figures.surfaces}
         for run, by in found.items()
         for target, figures in by.items()

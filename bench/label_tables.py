@@ -55,13 +55,16 @@ def composition(block: Block) -> tuple[float, float, float]:
 class Figures:
     """Figures of the labels of a block.
 
-    ``counts``: pixels visible, of these labelled, hidden, of these labelled, and off. ``rings``:
+    ``counts``: pixels visible, of these labelled, hidden, of these labelled, and off.
+    ``hidden_in_both``: % of the hidden pixels with a label, without those that only a building
+    hides which the LiDAR never saw. ``rings``:
     these by (surface, distance from the nearest edge). ``errors``: by kind of label, share of the
     visible pixels (%), errors (px), sigma's coverage (%). ``surfaces``: by kind of surface, share
     of the visible pixels and of these by status, %.
     """
 
     counts: NDArray[np.int64]
+    hidden_in_both: float
     rings: dict[tuple[str, str], NDArray[np.int64]]
     errors: dict[str, dict[str, float]]
     surfaces: dict[str, dict[str, float]]
@@ -70,7 +73,7 @@ class Figures:
     def of(cls, block: Block, found: dict[str, NDArray]) -> Figures:
         """Of the layers that were found for a block."""
         of = _Compared(block, found)
-        return cls(of.counts(), of.by_distance(), of.errors(), of.by_surface())
+        return cls(of.counts(), of.hidden_in_both(), of.by_distance(), of.errors(), of.by_surface())
 
 
 class _Compared:
@@ -81,6 +84,7 @@ class _Compared:
         groups, land = truth.groups(), truth.kind != WATER
         self.kind, self.surface = truth.kind, block.surface
         self.visible, self.hidden = groups["visible"] & land, groups["hidden"] & land
+        self.bared = groups["hidden_bared"]
         self.status = found["status"]
         self.known = is_labelled(self.status)
         self.error = np.where(self.known, found["disparity"] - truth.disparity, 0.0)
@@ -93,6 +97,10 @@ class _Compared:
         seen, hidden = self.visible & part, self.hidden & part
         masks = (seen, seen & self.known, hidden, hidden & self.known, self.off & part)
         return np.array([int(mask.sum()) for mask in masks])
+
+    def hidden_in_both(self) -> float:
+        hidden = self.hidden & ~self.bared
+        return percent((hidden & self.known).sum(), hidden.sum())
 
     def by_distance(self) -> dict[tuple[str, str], NDArray[np.int64]]:
         surfaces = {name: np.zeros_like(self.visible) for name in ("all", *SURFACES.values())}
