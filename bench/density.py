@@ -1,40 +1,36 @@
-"""Labels between points by density of the points, against exact truth. See README.md beside this.
+"""Labels by density of the points, against exact truth. See README.md beside this file.
 
-One block of a synthetic scene is projected with its points thinned to several densities, in either
-view; the truth of its grid is that of rule grid_truth. Nothing is written.
+A block of a synthetic pair is labelled with its points thinned to several densities, in either
+view, under one condition or several; fresh cities are drawn and made once. Labels are not written.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import logging
 import time
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
-
-from stereotruth.disparity.label_window import label_window
-from stereotruth.disparity.project import MAX_POINTS, SHARD
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
-from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.evaluation.labels_against_truth import (
-    CLASSES,
-    ROOF_EDGE,
-    TREE_EDGE,
-    WATER,
-    Truth,
+from label_tables import (
+    DISTANCES_PX,
+    NEAR_PX,
+    SURFACES,
+    Figures,
+    composition,
+    percent,
+    print_table,
+    shares,
+    shown,
+    spread,
 )
-from stereotruth.lidar.lattice import DEGREE_M
-from stereotruth.lidar.point_store import Points, PointStore
+from labelled_block import Block
+from synthetic_pairs import CONDITIONS, Pair, fresh_pair, made_pair
+
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.products.pictures import SERIES
-from stereotruth.simulate.cities import CITIES
 
 TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1 px at most, %
     4: (95, 0.2, 0.03),
@@ -43,250 +39,189 @@ TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1
     0.5: (90.5, 0.2, 0.03),
     0.25: (88, 0.3, 0.05),
 }
+TABLES = ("errors", "edges", "surfaces")
+Run = tuple[str, str, str]  # scene, condition, fill
 
 
-class Thinned(PointStore):
-    """A point store of which a share of the pulses is seen, drawn by their place."""
-
-    def __init__(self, path: Path, share: float) -> None:
-        super().__init__(path)
-        self.share = share
-        self.count = int(self.count * share)
-
-    @property
-    def cell_counts(self) -> NDArray[np.int64]:
-        return np.maximum((super().cell_counts * self.share).astype(np.int64), 1)
-
-    def query(self, *box: float) -> Points:
-        points = super().query(*box)
-        if self.share >= 1.0:
-            return points
-        mixed = points.lon_q.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= points.lat_q.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
-        mixed ^= mixed >> np.uint64(29)
-        mixed *= np.uint64(0xBF58476D1CE4E5B9)
-        mixed ^= mixed >> np.uint64(32)
-        kept = mixed < np.uint64(self.share * 2.0**64)
-        return Points(*(getattr(points, name)[kept] for name in points.__dataclass_fields__))
+def block_of(pair: Pair, condition: str, options: argparse.Namespace) -> Block:
+    """The window of a pair that is asked for; without one, that in the middle."""
+    rectified = pair.rectified(condition, options.folder / "rectified")
+    shape = EpipolarModel.load(rectified / "epipolar.json").shape
+    size = [min(options.size or end, end) for end in shape]
+    first = options.first or [(end - side) // 2 for end, side in zip(shape, size)]
+    window = (slice(at, min(at + side, end)) for at, side, end in zip(first, size, shape))
+    return Block(pair, rectified, *window, options.view)
 
 
-def density(stores: list[PointStore]) -> float:
-    """First returns per m² in the median cell."""
-    store = stores[0]
-    box = store.bounds
-    middle = [(box[k] + box[k + 2]) / 2 for k in (0, 1)]
-    half = 50.0 / DEGREE_M
-    wide = half / np.cos(np.radians(middle[1]))
-    found = store.query(middle[0] - wide, middle[1] - half, middle[0] + wide, middle[1] + half)
-    return float((found.return_number <= 1).sum()) / 100.0**2
+def looks(block: Block) -> str:
+    """What a block shows, in words."""
+    visible, crowns, near = composition(block)
+    return (
+        f"{block.density:.2f} first returns per m²; of the visible pixels {crowns:.0f} % are "
+        f"crowns, {near:.0f} % within {NEAR_PX:g} px of an edge; {visible:.2f} Mpx"
+    )
 
 
-@dataclass
-class Block:
-    """A block of a scene, its truth and its points at any density."""
+def labelled(options: argparse.Namespace) -> dict[Run, dict[float, Figures]]:
+    """Labels of every scene under every condition by every fill, by density, and their truth."""
+    found: dict[Run, dict[float, Figures]] = defaultdict(dict)
+    fresh = [fresh_pair(number + 1, options.folder) for number in range(options.fresh)]
+    for pair in [*(made_pair(scene, options.results) for scene in options.scenes), *fresh]:
+        for condition in options.conditions:
+            block = block_of(pair, condition, options)
+            print(f"{pair.name}, {condition}: {looks(block)}", flush=True)
+            for fill in options.fill:
+                for target in options.densities:
+                    job = block.job(target, fill)
+                    block.compile(job)
+                    start = time.process_time()
+                    layers = block.labels(job)
+                    took = (time.process_time() - start) / block.megapixels
+                    figures = Figures.of(block, layers)
+                    found[pair.name, condition, fill][target] = figures
+                    said = f"{shown(shares(figures.counts))}, {took:.1f} s/Mpx"
+                    print(f"  {fill}, {target:g} points/m²: {said}", flush=True)
+    return found
 
-    scene: str
-    results: Path
-    rows: slice
-    cols: slice
-    view: str = "left"
 
-    def __post_init__(self) -> None:
-        city = self.scene.rsplit("-", 1)[0]
-        at = self.results
-        self.images = [at / "rectify" / city / self.scene / f"{v}.zarr" for v in ("left", "right")]
-        self.paths = sorted((at / "ingest" / city / self.scene).glob("*.points"))
-        self.truth = self.true(at / "rectify" / city / self.scene / "epipolar.json", city)
-        self.density = density([PointStore(path) for path in self.paths])
+def print_shares(found: dict[Run, dict[float, Figures]], densities: Sequence[float]) -> None:
+    """Visible / hidden labelled / off, by scene and density, and over the scenes."""
+    columns = ["pair", "condition", "fill", *(f"{d:g}" for d in densities)]
+    rows = []
+    for run, by in found.items():
+        rows.append([*run, *(shown(shares(by[d].counts)) for d in densities)])
+    for condition, fill in dict.fromkeys(run[1:] for run in found):
+        of = [by for run, by in found.items() if run[1:] == (condition, fill)]
+        if len(of) < 2:
+            continue
+        both = [spread([shares(by[d].counts) for by in of]) for d in densities]
+        for name, cells in zip(("median", "range"), zip(*both)):
+            rows.append([f"{name} of {len(of)}", condition, fill, *cells])
+    rows.append(["asked for", "", "", *(shown(TARGETS.get(d, ())) for d in densities)])
+    title = "Visible labelled / hidden labelled / off by more than 1 px, %, by points/m²"
+    print_table(title, columns, rows)
+    rows = [
+        [*run, *(shown([by[d].hidden_in_both]) for d in densities)] for run, by in found.items()
+    ]
+    print_table("Hidden labelled, % of those that the LiDAR's world hides, too", columns, rows)
 
-    def true(self, epipolar_json: Path, city: str) -> Truth:
-        """The exact truth of the block, by rays through its pixels."""
-        made, model = CITIES[city], EpipolarModel.load(epipolar_json)
-        window = truth_window(
-            model, made, made.scene(self.scene), self.rows, self.cols, self.view
-        )  # fmt: skip
-        layers = xr.Dataset({name: (("y", "x"), array) for name, array in window.items()})
-        height, width = window["disparity"].shape
-        return Truth.read(layers, slice(0, height), slice(0, width))
 
-    def job(self, points_per_m2: float | None, fill: str, method: str = "both") -> SceneInputs:
-        """What labels the block; ``points_per_m2`` None: all points."""
-        settings = Settings(method=method, fill=fill)
-        job = SceneInputs(*self.images, tuple(self.paths), settings, self.view)
-        share = 1.0 if points_per_m2 is None else points_per_m2 / self.density
-        job.__dict__["stores"] = tuple(Thinned(path, share) for path in self.paths)
-        return job
+def print_errors(found: dict[Run, dict[float, Figures]]) -> None:
+    """Errors and coverage of sigma by kind of label."""
+    rows = []
+    for run, by in found.items():
+        for target, figures in by.items():
+            for kind, f in figures.errors.items():
+                cover = f"{f['< 1 sigma']:.1f} / {f['< 2 sigma']:.1f}"
+                sizes = f"{f['mean absolute']:.4f}", f"{f['median']:+.4f}"
+                rows.append([*run, f"{target:g}", kind, f"{f['share']:.1f}", *sizes, cover])
+    columns = ["pair", "condition", "fill", "points/m²", "labels", "of visible, %"]
+    columns += ["mean abs, px", "median, px", "< 1 / 2 sigma, %"]
+    print_table("Errors of labels on visible pixels, by kind", columns, rows)
 
-    def labels(self, job: SceneInputs) -> dict[str, NDArray]:
-        """The layers of the block, put together from its windows."""
-        out: dict[str, NDArray] = {}
-        for rows, seen in self.windows(job):
-            found = label_window(job, rows, seen)
-            if found is None:
-                continue
-            cols = job.pair.cols(seen)
-            for name, part in job.pair.arrays(found[0]).items():
-                whole = out.setdefault(
-                    name,
-                    np.full(self.truth.kind.shape, np.nan if part.dtype.kind == "f" else 0)
-                    .astype(part.dtype),
-                )  # fmt: skip
-                whole[
-                    rows.start - self.rows.start : rows.stop - self.rows.start,
-                    cols.start - self.cols.start : cols.stop - self.cols.start,
-                ] = part
-        return out
 
-    def windows(self, job: SceneInputs) -> list[tuple[slice, slice]]:
-        """Of the blocks of stage project, as far as they lie in this one, as the pair sees them."""
-        return [
-            window
-            for r in range(self.rows.start, self.rows.stop, SHARD)
-            for c in range(self.cols.start, self.cols.stop, SHARD)
-            for window in job.windows.parts(
-                slice(r, min(r + SHARD, self.rows.stop)),
-                job.pair.cols(slice(c, min(c + SHARD, self.cols.stop))),
-                MAX_POINTS,
-            )
+def print_edges(found: dict[Run, dict[float, Figures]]) -> None:
+    """Shares by distance from the nearest edge and by surface, all pairs together."""
+    sums: dict[tuple, dict[tuple[str, str], list]] = defaultdict(lambda: defaultdict(list))
+    for (_, condition, fill), by in found.items():
+        for target, figures in by.items():
+            for place, counts in figures.rings.items():
+                sums[condition, fill, target][place].append(counts)
+    surfaces = list(dict.fromkeys(("all", *SURFACES.values())))
+    for (condition, fill, target), places in sums.items():
+        total = {place: sum(counts) for place, counts in places.items()}
+        visible = sum(total["all", name][0] for name in rings(total)[: len(DISTANCES_PX)])
+        rows = [
+            [name, f"{percent(total['all', name][0], visible):.1f}"]
+            + [shown(shares(total[of, name])) for of in surfaces]
+            for name in rings(total)
         ]
-
-    def figures(self, found: dict[str, NDArray]) -> dict[str, Any]:
-        """Shares (%) and errors (px) of the labels."""
-        groups = self.truth.groups()
-        land = self.truth.kind != WATER
-        visible, hidden = groups["visible"] & land, groups["hidden"] & land
-        known = is_labelled(found["status"])
-        error = found["disparity"].astype(np.float64) - self.truth.disparity
-        kinds = {
-            "measured": Status.LABELLED,
-            "between": Status.LABELLED_BETWEEN,
-            "by images": Status.LABELLED_BY_IMAGES,
-        }
-        kinds = {name: visible & (found["status"] == kind) for name, kind in kinds.items()}
-        edge = visible & np.isin(self.truth.kind, (ROOF_EDGE, TREE_EDGE))
-        steps = np.abs(np.diff(self.truth.disparity, axis=1, prepend=np.nan)) > 1.0
-        steps |= np.abs(np.diff(self.truth.disparity, axis=0, prepend=np.nan)) > 1.0
-        near = visible & known & binary_dilation(steps, np.ones((7, 7)))
-        sigma = found["uncertainty"].astype(np.float64)
-
-        def share(part: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
-            return 100.0 * float((part & of).sum()) / max(int(of.sum()), 1)
-
-        off = np.abs(np.nan_to_num(error)) > 1.0
-        result = (
-            {
-                "visible": share(known, visible),
-                "hidden": share(known, hidden),
-                "hidden by the LiDAR's world, too": share(known, hidden & ~groups["hidden_bared"]),
-                "over 1 px": share(off, visible & known),
-            }
-            | {name: share(part, visible) for name, part in kinds.items()}
-            | {
-                "edges": share(known, edge),
-                "edges > 1 px": share(off, edge & known),
-                "within 3 px of a step > 1 px": share(off, near),
-            }
-        )
-        for name, part in kinds.items():
-            e, s = error[part], sigma[part]
-            if e.size:
-                result |= {
-                    f"mean abs {name}": float(np.abs(e).mean()),
-                    f"bias {name}": float(np.median(e)),
-                    f"{name} < 1 sigma": 100.0 * float((np.abs(e) < s).mean()),
-                    f"{name} < 2 sigma": 100.0 * float((np.abs(e) < 2 * s).mean()),
-                }
-        return result
-
-    def losses(self, found: dict[str, NDArray]) -> dict[str, dict[str, float]]:
-        """By kind of surface: share of visible pixels, and of these by status, %."""
-        groups, land = self.truth.groups(), self.truth.kind != WATER
-        visible, hidden = groups["visible"] & land, groups["hidden"] & land
-        known = is_labelled(found["status"])
-        wrong = known & (np.abs(found["disparity"] - self.truth.disparity) > 1.0)
-        result = {}
-        for number, name in enumerate(CLASSES):
-            part = visible & (self.truth.kind == number)
-            if not part.any():
-                continue
-            statuses = found["status"][part]
-            result[name] = {
-                "all": 100.0 * part.sum() / visible.sum(),
-                "hidden labelled (of all hidden)": 100.0
-                * float((known & hidden & (self.truth.kind == number)).sum() / hidden.sum()),
-                "off (of all labelled)": 100.0 * float((wrong & part).sum() / known.sum()),
-            } | {s.name.lower(): 100.0 * float((statuses == s).mean()) for s in Status}
-        return result
+        title = f"By distance from the nearest edge: {condition}, {fill}, {target:g} points/m²"
+        columns = ["px", "of visible, %", *surfaces]
+        print_table(f"{title} (visible / hidden / off, %)", columns, rows)
 
 
-def draw(path: Path, scene: str, figures: dict[str, dict[float, dict[str, Any]]]) -> None:
-    """Shares of visible and of hidden pixels with a label by density, for each fill."""
+def rings(places: dict[tuple[str, str], object]) -> list[str]:
+    """Names of the distances."""
+    return list(dict.fromkeys(name for _, name in places))
+
+
+def print_surfaces(found: dict[Run, dict[float, Figures]]) -> None:
+    """Statuses of visible pixels by kind of surface."""
+    for run, by in found.items():
+        for target, figures in by.items():
+            print(f"\nStatus of visible pixels, %: {', '.join(run)}, {target:g} points/m²")
+            for name, row in figures.surfaces.items():
+                kept = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if v >= 0.005)
+                print(f"    {name}: {kept}")
+
+
+def draw(path: Path, found: dict[Run, dict[float, Figures]]) -> None:
+    """Shares of visible and of hidden pixels with a label by density, for each run."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    titles = {
-        "visible": "visible pixels with a label, %",
-        "hidden": "hidden pixels with a label, %",
-    }
-    for panel, (name, title) in zip(panels, titles.items()):
-        for fill, found, colour, shape in zip(figures, figures.values(), SERIES, "os^D"):
-            shares = [f[name] for f in found.values()]
-            panel.plot(list(found), shares, f"{shape}-", color=colour, ms=4, label=fill)
+    titles = ("visible pixels with a label, %", "hidden pixels with a label, %")
+    varied = [k for k in range(3) if len({run[k] for run in found}) > 1] or [2]
+    for number, (panel, title) in enumerate(zip(panels, titles)):
+        for (run, by), colour, shape in zip(found.items(), SERIES, "os^Dv<>p"):
+            label = ", ".join(run[k] for k in varied)
+            values = [shares(figures.counts)[number] for figures in by.values()]
+            panel.plot(list(by), values, f"{shape}-", color=colour, ms=4, label=label)
         panel.set_xscale("log", base=2)
-        densities = sorted({d for found in figures.values() for d in found})
+        densities = sorted({d for by in found.values() for d in by})
         panel.set_xticks(densities, [f"{d:.2g}" for d in densities])
         panel.set(title=title, xlabel="LiDAR points per m²", ylim=(0, None))
         panel.grid(alpha=0.3)
-    panels[0].legend(title="project.fill", frameon=False)
-    figure.suptitle(scene, fontsize="medium")
+    panels[0].legend(frameon=False)
+    figure.suptitle(", ".join(dict.fromkeys(run[0] for run in found)), fontsize="medium")
     figure.savefig(path, dpi=110)
 
 
+def as_json(found: dict[Run, dict[float, Figures]]) -> list[dict]:
+    """All figures."""
+    names = ("visible labelled, %", "hidden labelled, %", "off, %")
+    return [
+        {"pair": run[0], "condition": run[1], "fill": run[2], "points/m2": target}
+        | dict(zip(names, shares(figures.counts)))
+        | {"hidden in the LiDAR's world, too, labelled, %": figures.hidden_in_both}
+        | {"errors": figures.errors, "surfaces": figures.surfaces}
+        for run, by in found.items()
+        for target, figures in by.items()
+    ]
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", help="whose results/rectify, ingest and truth are made")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", nargs="*", help="whose results/rectify and ingest are made")
+    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="and N cities drawn anew")
     parser.add_argument("--results", type=Path, default=Path("results"))
+    parser.add_argument(
+        "--folder", type=Path, default=Path("results/density"), help="of what is made here, once"
+    )
+    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=["plain"])
     parser.add_argument("--densities", type=float, nargs="+", default=list(TARGETS))
-    parser.add_argument("--fill", nargs="+", default=["none", "surface", "surface_and_images"])
-    parser.add_argument("--first", type=int, nargs=2, default=(1024, 1024), help="row, column")
+    parser.add_argument("--fill", nargs="+", default=["surface"])
+    parser.add_argument("--first", type=int, nargs=2, help="row, column; default: in the middle")
     parser.add_argument("--size", type=int, default=1024, help="px; 0: to the end of the grid")
     parser.add_argument("--view", choices=("left", "right"), default="left")
-    parser.add_argument("--kinds", action="store_true", help="statuses by kind of surface")
+    parser.add_argument("--tables", nargs="+", choices=TABLES, default=[])
     parser.add_argument("--figure", type=Path, help="PNG of the shares by density")
+    parser.add_argument("--json", type=Path, help="file of all figures")
     options = parser.parse_args()
-    drawn: dict[str, dict[float, dict[str, Any]]] = {}
-    city = options.scene.rsplit("-", 1)[0]
-    rectified = options.results / "rectify" / city / options.scene
-    shape = EpipolarModel.load(rectified / "epipolar.json").shape
-    rows, cols = (
-        slice(at, min(at + (options.size or end), end)) for at, end in zip(options.first, shape)
-    )
-    megapixels = (rows.stop - rows.start) * (cols.stop - cols.start) / 1e6
-    block = Block(options.scene, options.results, rows, cols, options.view)
-    print(f"{options.scene}, {options.view}: {block.density:.2f} first returns per m²")
-    for fill in options.fill:
-        for target in options.densities:
-            job = block.job(None if target >= block.density else target, fill)
-            first = (slice(edge.start, edge.start + 32) for edge in (rows, cols))
-            label_window(job, *first)  # compiles
-            start = time.process_time()
-            found = block.labels(job)
-            took = (time.process_time() - start) / megapixels
-            figures = block.figures(found)
-            drawn.setdefault(fill, {})[min(target, block.density)] = figures
-            print(f"\n{fill}, {target:g} points/m²: {took:.1f} s a megapixel")
-            if target in TARGETS and fill != "none":
-                print("  to reach: {} / {} / {}".format(*TARGETS[target]))
-            print("  " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
-            if options.kinds:
-                for name, row in block.losses(found).items():
-                    shown = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if v >= 0.005)
-                    print(f"    {name}: {shown}")
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    found = labelled(options)
+    print_shares(found, options.densities)
+    for name, table in zip(TABLES, (print_errors, print_edges, print_surfaces)):
+        if name in options.tables:
+            table(found)
     if options.figure:
-        draw(options.figure, options.scene, drawn)
+        draw(options.figure, found)
+    if options.json:
+        options.json.write_text(json.dumps(as_json(found), indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

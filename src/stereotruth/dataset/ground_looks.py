@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyproj
 import rasterio
 import zarr
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
-from scipy.ndimage import distance_transform_edt, map_coordinates, median_filter
+from scipy.ndimage import distance_transform_edt
 
 from ..products import pictures
 from .scene_stores import SceneStores
@@ -23,7 +24,7 @@ from .scene_stores import SceneStores
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-LONGEST_PX = 1400  # of a picture
+LONGEST_PX = 1000  # of a picture
 SMOOTH = 5  # px over which heights are smoothed
 ROWS = 1024  # read at a time
 
@@ -35,7 +36,7 @@ def write_ground_looks(folder: Path, source: SceneStores) -> list[Path]:
     """
     scale = max(1, math.ceil(max(source.left.shape) / LONGEST_PX))
     disparity, height = _thin(source.disparity, scale), _thin(source.height, scale)
-    bands = source.colours[0] if source.colours else (source.left,) * 3
+    bands = source.colours[0] if source.colours else (source.left,)
     image = np.stack([_thin(band, scale) for band in bands], axis=-1)
     known = np.isfinite(height)
     if not known.any():
@@ -59,12 +60,17 @@ def write_ground_looks(folder: Path, source: SceneStores) -> list[Path]:
     labels = np.where(inside, disparity[j, i], np.nan)
     made = []
     for name, picture, alpha in (
-        ("left", pictures.stretch(left), (left != 0).any(axis=-1)),
+        ("left", _coloured(pictures.stretch(left)), (left != 0).any(axis=-1)),
         ("disparity", pictures.colours(labels), np.isfinite(labels)),
     ):
         made.append(folder / f"{source.scene}_{name}.tif")
         _write(made[-1], picture, alpha, crs, origin, step)
     return made
+
+
+def _coloured(picture: Picture) -> Picture:
+    """Three bands of one or three."""
+    return np.broadcast_to(picture, (*picture.shape[:2], 3))
 
 
 def _thin(array: zarr.Array, scale: int) -> NDArray:
@@ -103,11 +109,15 @@ def _heights(
     total = np.bincount(where, height, minlength=shape[0] * shape[1]).reshape(shape)
     nearest = distance_transform_edt(count == 0, return_distances=False, return_indices=True)
     filled = (total / np.maximum(count, 1))[tuple(nearest)]
-    return median_filter(filled, SMOOTH), origin, step
+    low = filled.min()  # in 32 bits, heights are to be small
+    smooth = cv2.medianBlur((filled - low).astype(np.float32), SMOOTH)
+    return smooth.astype(np.float64) + low, origin, step
 
 
-def _linear(band: NDArray, y: Floats, x: Floats) -> Floats:
-    return map_coordinates(band.astype(np.float64), [y, x], order=1, cval=0.0)
+def _linear(band: NDArray, y: Floats, x: Floats) -> NDArray[np.float32]:
+    """Bilinear values; beyond the border 0 has a say."""
+    at = x.astype(np.float32), y.astype(np.float32)
+    return cv2.remap(band.astype(np.float32), *at, cv2.INTER_LINEAR)
 
 
 def _write(

@@ -20,6 +20,8 @@ Picture = NDArray[np.uint8]
 
 
 CONTACT_TILES = 16  # most tiles on the contact sheet
+LINE_IN = 2.0  # inches of a line of them
+GAP_PX = 36  # between them, for what they are called
 
 
 def draw_coverage(
@@ -48,7 +50,7 @@ def draw_contact_sheet(
     tiles = []
     for row in (labelled[k] for k in picked):
         images = (read_image(folder / row[kind]) for kind in ("left", "right"))
-        grey = [pictures.shrink(pictures.stretch(image), 256) for image in images]
+        grey = [pictures.stretch(pictures.shrink(image, 256)) for image in images]
         step = max(1, row["size"] // 256)
         disparity = read_disparity(folder / row["disp"], nodata)[::step, ::step]
         tiles.append((row["tile"], *grey, disparity))
@@ -123,21 +125,27 @@ def contact_sheet(
     ``tiles``: (caption, left, right, disparity in px with NaN), all small already.
     """
     lines = -(-len(tiles) // 2)
-    figure = Figure(figsize=(13.0, 2.2 * lines + 0.8), layout="constrained")
-    axes = figure.subplots(lines, 6, squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
+    side = max(max(grey.shape) for _, grey, _, _ in tiles)
+    step = side + GAP_PX
+    # one picture of all: an axis for each would take most of the time
+    sheet = np.full((lines * step, 6 * step, 3), 255, np.uint8)
+    inches = LINE_IN * lines
+    figure = Figure(figsize=(13.0, inches + 0.8))
+    height = figure.get_figheight()
+    axis = figure.add_axes((0.01, 0.05 / height, 6 * LINE_IN / 13.0, inches / height))
     for k, (caption, left, right, disparity) in enumerate(tiles):
-        trio = axes[k // 2][3 * (k % 2) : 3 * (k % 2) + 3]
-        for axis, grey, name in zip(trio, (left, right), ("left", "right")):
-            axis.imshow(grey, cmap="gray", vmin=0, vmax=255)
-            axis.set_title(f"{caption}, {name}" if name == "left" else name, fontsize=8)
-        trio[2].imshow(colours(disparity, limits))
-        trio[2].set_title("disparity", fontsize=8)
+        row = k // 2 * step + GAP_PX
+        trio = (np.atleast_3d(left), np.atleast_3d(right), colours(disparity, limits))
+        for n, (picture, name) in enumerate(zip(trio, (f"{caption}, left", "right", "disparity"))):
+            col = (3 * (k % 2) + n) * step
+            high, wide = picture.shape[:2]
+            sheet[row : row + high, col : col + wide] = picture
+            axis.text(col + side / 2, row - 4, name, fontsize=8, ha="center", va="bottom")
+    axis.imshow(sheet)
+    axis.set_axis_off()
     mappable = ScalarMappable(cmap=pictures.DISPARITIES)
     mappable.set_clim(*limits)
-    figure.colorbar(
-        mappable, ax=axes, fraction=0.02, aspect=50, label="disparity, px (offset removed)"
-    )
-    figure.suptitle(title)
+    scale = figure.add_axes((0.94, 0.05 / height, 0.012, (inches - 0.3) / height))
+    figure.colorbar(mappable, cax=scale, label="disparity, px (offset removed)")
+    figure.suptitle(title, y=1 - 0.25 / height)
     save_figure(path, figure)

@@ -15,6 +15,10 @@ orientation, of about the same size and angle. Of these, errors are taken where 
 within ``ROW_PX``, as in the paper. Nothing is left out for the size of its error; what lies more
 than ``GROSS_PX`` from the tile's median is counted as gross mismatch.
 
+Of the tile's bands of ``BAND`` rows one in ``EVERY`` is looked at, and where these have fewer than
+``ENOUGH`` matches, the others, too: a sample of some thousand matches of most tiles, for a third of
+the time.
+
 The y-parallax, y_right − y_left, is taken without that limit on rows, from the matches whose error
 is within ``AGREE_PX`` of the median one, so that mismatches do not swamp it.
 
@@ -54,6 +58,10 @@ SIZE_RATIO = 1.3
 AGREE_PX = 1.0
 GROSS_PX = 3.0
 MIN_PARALLAX = 5  # matches; fewer give no y-parallax
+BAND = 64  # rows
+APRON = 12  # rows around a band that key points in it look at
+EVERY = 3  # of the bands one is looked at
+ENOUGH = 300  # matches in these: with fewer, the others are looked at, too
 PAIRS = 1 << 17  # of key points that are compared at a time
 
 
@@ -71,9 +79,18 @@ class KeyPoints(NamedTuple):
         return KeyPoints(*(values[index] for values in self))
 
 
-def key_points(image: NDArray[Any], where: Bools | None = None) -> KeyPoints:
-    """Key points of an image (0 is nodata) whose nearest pixel is in the mask ``where``."""
-    grey = stretch(image, percent=(0.1, 99.9))
+def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """What key points are found in; 0 is nodata."""
+    return stretch(image, percent=(0.1, 99.9))
+
+
+def key_points(image: NDArray[Any]) -> KeyPoints:
+    """Key points of an image (0 is nodata)."""
+    return _key_points(_grey(image))
+
+
+def _key_points(grey: NDArray[np.uint8], where: Bools | None = None) -> KeyPoints:
+    """Key points of a picture whose nearest pixel is in the mask ``where``."""
     mask = None if where is None else where.astype(np.uint8)
     found, descriptors = cv2.SIFT_create(enable_precise_upscale=True).detectAndCompute(grey, mask)
     if not found:
@@ -227,6 +244,38 @@ def match_figures(errors: Floats, parallax: Floats) -> dict[str, float | int | N
     return values
 
 
+class Places(NamedTuple):
+    """n matches: where in the left and the right image, px."""
+
+    x: Floats
+    y: Floats
+    x_right: Floats
+    y_right: Floats
+
+
+def _match_band(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    where: Bools,
+    reach: tuple[float, float],
+    first: int,
+) -> Places:
+    """Matches of the left key points in the rows [first, first + BAND) that ``where`` has."""
+    start = max(first - APRON, 0)
+    rows = slice(start, first + BAND + APRON)
+    row = np.arange(len(where))[rows, None]
+    here = where[rows] & (row >= first) & (row < first + BAND)
+    if not here.any():
+        return Places(*np.empty((4, 0)))
+    near = (row >= first - ROW_SEARCH_PX - 1) & (row <= first + BAND + ROW_SEARCH_PX)
+    there = np.broadcast_to(near, here.shape)
+    a, b = _key_points(left[rows], here), _key_points(right[rows], there)
+    if not (a.x.size and b.x.size):
+        return Places(*np.empty((4, 0)))
+    i, j = match(a, b, reach)
+    return Places(a.x[i], a.y[i] + start, b.x[j], b.y[j] + start)
+
+
 def match_tile(
     left: NDArray[Any],
     right: NDArray[Any],
@@ -234,15 +283,18 @@ def match_tile(
     surface_class: NDArray[np.uint8] | None = None,
 ) -> TileMatches:
     """Matches of a tile pair [h, w] (0 is nodata) against its disparity (px, NaN without label)."""
-    where = constant_labels(disparity)
-    a, b = key_points(left, where), key_points(right)
     known = np.isfinite(disparity)
-    if a.x.size and b.x.size:
+    reach = (0.0, 0.0)
+    if known.any():
         reach = disparity[known].min() - MARGIN_PX, disparity[known].max() + MARGIN_PX
-        i, j = match(a, b, reach)
-    else:
-        i = j = np.empty(0, np.intp)
-    x, y = a.x[i], a.y[i]
+    where, images = constant_labels(disparity), tuple(map(_grey, (left, right)))
+    bands = range(0, len(left), BAND)
+    found: dict[int, Places] = {}
+    for part in (bands[::EVERY], bands):
+        if sum(places.x.size for places in found.values()) < ENOUGH:
+            missing = (first for first in part if first not in found)
+            found |= {first: _match_band(*images, where, reach, first) for first in missing}
+    x, y, x_right, y_right = (np.concatenate(c) for c in zip(*(found[k] for k in sorted(found))))
     at = np.floor(y + 0.5).astype(np.intp), np.floor(x + 0.5).astype(np.intp)
     between = _bilinear(disparity, x, y)
     if surface_class is None:
@@ -250,8 +302,8 @@ def match_tile(
     return TileMatches(
         x=x,
         y=y,
-        x_right=b.x[j],
-        y_right=b.y[j],
+        x_right=x_right,
+        y_right=y_right,
         label=disparity[at],
         label_bilinear=np.where(np.isfinite(between), between, disparity[at]),
         surface_class=surface_class[at],

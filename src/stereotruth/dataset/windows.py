@@ -19,7 +19,7 @@ from ..job import progress
 from .scene_stores import SceneStores
 
 MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image border
-OVERVIEW_PX = 1400  # longer side of the pictures in the coverage figure
+OVERVIEW_PX = 1000  # longer side of the pictures in the coverage figure
 REASONS = (
     "left image incomplete",
     "right crop outside the right image",

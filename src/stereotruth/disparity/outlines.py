@@ -33,8 +33,7 @@ NEAR = 3.0  # within which points tell heights and the direction of a step
 BAND = 2.5  # and how far off the edge points still have a say
 ROUGH = 0.08  # with more points below the low and above the high surface, these are crowns
 SLACK_CELLS = 0.12  # horizontal noise of points, in cells
-MARGIN_CELLS = 0.2  # added to either side of the feasible span,
-LIKELY = 0.6  # of which so much is taken: an edge hardly ever lies at the end of what is feasible
+MARGIN_CELLS = 0.2  # added to either side of the feasible span
 SMALLEST = 0.1  # area of a triangle that is worth a cut, in squares of the mean distance
 WIDEST = 1.5  # half the width of a strip that still tells something, in mean distances
 _MOST = 4096  # points that have a say at most
@@ -317,7 +316,7 @@ def _cuts(
             for j in range(found):
                 off = spans[0, j] - mean_a + (spans[1, j] - mean_b) * at
                 width = max(width, abs(off) / norm)
-        width = LIKELY * width + MARGIN_CELLS * PART
+        width += MARGIN_CELLS * PART
         if width > WIDEST * distance:
             continue
         # (u - a - b v) / norm, in x and y from the first vertex

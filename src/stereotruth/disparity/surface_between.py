@@ -392,7 +392,8 @@ def between_labels(
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
     keep the label that these give if it is the surer one (one point is less than three around it),
     or if ``keep_own``. Points before the surface tell of something else in the pixel; points behind
-    it are hidden by it, as the ground under a roof is that a tower leans over. ``left``, ``right``: patches that tell the frames.
+    are hidden by it, as the ground is that a tower leans over. ``left``, ``right``: patches that
+    tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN

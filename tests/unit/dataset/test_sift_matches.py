@@ -76,6 +76,21 @@ def test_disparities_are_right_in_sign_and_without_bias(pair):
     assert np.allclose(found.label_bilinear, plane(found.x, found.y) + RAISED * on_block, atol=1e-6)
 
 
+def test_a_sample_of_bands_has_the_matches_of_all_of_them_there(pair, monkeypatch):
+    monkeypatch.setattr(sift_matches, "ENOUGH", 10**6)
+    everything = sift_matches.match_tile(*pair)
+    monkeypatch.setattr(sift_matches, "ENOUGH", 1)
+    sample = sift_matches.match_tile(*pair)
+    band = np.floor(everything.y + 0.5) // sift_matches.BAND
+    here = band % sift_matches.EVERY == 0
+    assert 0.3 < here.mean() < 0.5  # two of five bands
+    for name in ("x", "y", "x_right", "y_right", "label"):
+        assert np.array_equal(getattr(sample, name), getattr(everything, name)[here]), name
+    assert sample.figures()["sift_mean_absolute_error_px"] == pytest.approx(
+        everything.figures()["sift_mean_absolute_error_px"], rel=0.2
+    )
+
+
 def test_no_key_point_on_steps_or_beside_missing_labels(pair):
     found = sift_matches.match_tile(*pair)
     x = np.rint(found.x)

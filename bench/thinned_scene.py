@@ -1,0 +1,89 @@
+"""Labels of a scene with check points from every n-th of its LiDAR points. See README.md.
+
+The whole way from LAZ to labels, refinement included, sees the points that are left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+import laspy
+import numpy as np
+from label_tables import print_table, shown
+
+from stereotruth.alignment.adjustment import epipolar_model
+from stereotruth.alignment.align import align
+from stereotruth.alignment.label_uncertainty import LabelUncertainty
+from stereotruth.alignment.refine import refine
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
+from stereotruth.epipolar.image_reader import open_pair
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.evaluation.checkpoints import evaluate_checkpoints
+from stereotruth.lidar.ingest import ingest
+from stereotruth.products.files import whole_folder
+from stereotruth.products.provenance import source_digest
+
+
+def thinned(scene: Path, every: int, folder: Path) -> list[Path]:
+    """Point stores of every n-th point, made once."""
+    made = folder / f"every_{every}"
+    if not made.is_dir():
+        with whole_folder(made) as scratch:
+            for file in sorted((scene / "lidar").glob("*.la[sz]")):
+                points = laspy.read(file)
+                points.points = points.points[np.arange(0, len(points), every)]
+                points.write(scratch / file.name)
+                ingest(scratch / file.name, scratch / f"{file.stem}.points")
+                (scratch / file.name).unlink()
+    return sorted(made.glob("*.points"))
+
+
+def rectified(scene: Path, stores: list[Path], folder: Path) -> list[Path]:
+    """The rectified pair, aligned by control points and these points."""
+    images = [scene / f"{view}.tif" for view in ("left", "right")]
+    made = folder / "rectified"
+    if not made.is_dir():
+        alignment, _ = refine(align(*images, scene / "gcps.csv"), *images, stores)
+        model = epipolar_model(alignment)
+        with whole_folder(made) as scratch, open_pair(*images) as pair:
+            rectify(
+                *pair,
+                model,
+                None,
+                *(scratch / f"{image.stem}.zarr" for image in images),
+                workers=1,
+                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
+            )
+    return [made / f"{image.stem}.zarr" for image in images]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path, help="left.tif, right.tif, two CSV files, lidar/")
+    parser.add_argument("--every", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--fill", nargs="+", default=["surface"])
+    parser.add_argument("--folder", type=Path, default=Path("results/thinned_scene"))
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    rows = []
+    for every in options.every:
+        stores = thinned(options.scene, every, options.folder)
+        pair = rectified(options.scene, stores, options.folder / f"every_{every}_pair")
+        for fill in options.fill:
+            store = options.folder / f"every_{every}_{fill}.zarr"
+            project_scene(
+                *pair, stores, store, Settings(fill=fill), code=source_digest("disparity.project")
+            )
+            f = evaluate_checkpoints(store, options.scene / "checkpoints.csv")
+            share = 100.0 * f["labelled"] / f["points"]
+            cells = [f"{f['median']:+.3f}", f"{f['nmad']:.3f}", f"{f['y_parallax_rms']:.3f}"]
+            rows.append([str(every), fill, shown([share]), *cells])
+    columns = ["every", "fill", "check points labelled, %", "median, px", "NMAD, px"]
+    print_table("Labels less check points", [*columns, "y-parallax rms, px"], rows)
+
+
+if __name__ == "__main__":
+    main()
