@@ -10,8 +10,9 @@ lattice and sums are of integers, so that neither window nor order of the points
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
 
 Steps = NDArray[np.int32]
 
@@ -22,7 +23,7 @@ FEWEST_AROUND = 36  # of the nine squares: a quarter of their cells
 REACH = 3 * SIDE  # cells around a vertex that have a say in whether it stays
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _by_square(square: Steps, start: Steps) -> Steps:
     """Vertices in the order of their squares; ``start`` [squares + 1] takes where each begins."""
     start[:] = 0
@@ -38,7 +39,7 @@ def _by_square(square: Steps, start: Steps) -> Steps:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _enough(start: Steps, s: int, cols: int) -> bool:
     """Whether a square and those around it hold points enough."""
     if start[s + 1] - start[s] < FEWEST:
@@ -52,7 +53,7 @@ def _enough(start: Steps, s: int, cols: int) -> bool:
     return around >= FEWEST_AROUND
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _plane(
     x: Steps, y: Steps, h: Steps, kinds: NDArray[np.uint8], order: Steps, start: Steps, s: int,
     cols: int, mid: tuple[int, int], off: float,
@@ -85,7 +86,7 @@ def _plane(
     return True, gx, gy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def even_squares(
     x: Steps, y: Steps, h: Steps, kinds: NDArray[np.uint8], square: Steps, shape: tuple[int, int],
     side: int, corner: tuple[int, int], off: float,

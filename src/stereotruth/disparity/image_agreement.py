@@ -19,11 +19,11 @@ depend on blocks.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
 from ..epipolar.warping import warp_rows
+from ..kernels import kernel
 from .image_patches import Patch
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
     return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _surface_mean(
     values: Singles,
     disparity: Singles,

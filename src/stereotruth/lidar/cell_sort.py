@@ -7,9 +7,9 @@ from typing import BinaryIO
 
 import numpy as np
 import zarr
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import kernel
 from .lattice import CELL_BITS, cell_key
 from .point_store import CHUNK_POINTS, CODEC, SHARD_POINTS, STORE_ATTRS
 
@@ -21,14 +21,14 @@ _RECORD_BYTES = 16  # of a point before it has its final place: position and att
 SCRATCH_POINTS = 1 << 24  # of these kept in memory, 256 MiB
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Integers) -> None:
     """Number of the cell of each point in a raster of cells, its first cell at row, col."""
     for i in range(out.size):
         out[i] = ((lattice[1, i] >> CELL_BITS) - row) * width + (lattice[0, i] >> CELL_BITS) - col
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sort(
     lattice: Integers,
     attributes: NDArray[np.uint32],
@@ -63,7 +63,7 @@ def _sort(
         limits[c, 0], limits[c, 1] = min(limits[c, 0], height), max(limits[c, 1], height)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gather(
     records: NDArray[np.int32],
     pieces: Integers,

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..errors import InputError
+from ..kernels import kernel
 from ..products.grids import require_complete
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
@@ -86,7 +86,7 @@ class Points:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _select(
     position: NDArray[np.int32],
     attributes: Bytes,

@@ -13,10 +13,10 @@ import numpy as np
 import pyproj
 
 from ..errors import InputError
+from ..kernels import inlined, kernel
 from ..products.files import replacing
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
-from .kernels import inlined, kernel
 from .layout import frame_of, half_size, image_axes
 from .settings import Settings
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at

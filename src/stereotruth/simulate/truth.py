@@ -11,11 +11,11 @@ import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..job import progress
+from ..kernels import inlined, kernel
 from ..products.grids import building
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
-from .kernels import inlined, kernel
 from .lidar import coverage, covered
 from .render import in_collar, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
