@@ -69,11 +69,7 @@ def settings(made: Class | None = None, *, more: bool = False) -> Any:
     """
     if made is None:
         return lambda given: settings(given, more=more)
-    config = ConfigDict(
-        extra="ignore" if more else "forbid",
-        populate_by_name=True,
-        use_attribute_docstrings=True,
-    )
+    config = ConfigDict(extra="ignore" if more else "forbid", populate_by_name=True)
     found = validated(made, frozen=True, config=config)
     init = found.__init__
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
 import re
+import textwrap
 import types
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import ValidationError
@@ -26,13 +31,24 @@ class Key(NamedTuple):
     meaning: str
 
 
+@cache
+def _said(of: type) -> dict[str, str]:
+    """The docstrings of a class's own keys. (Pydantic would read them at the start of each job.)"""
+    (made,) = ast.parse(textwrap.dedent(inspect.getsource(of))).body
+    return {
+        ast.unparse(key.target): ast.literal_eval(text.value)
+        for key, text in pairwise(made.body)
+        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+
+
 def fields_of(of: Any) -> dict[str, Key]:
     """The keys of a class of settings by the names that the user writes."""
     found = {}
     for name, info in of.__pydantic_fields__.items():
         key = info.alias or name
-        parents = (vars(c).get("__pydantic_fields__", {}).get(name) for c in of.__mro__)
-        said = next((f.description for f in parents if f and f.description), "")
+        classes = (c for c in of.__mro__ if "__pydantic_fields__" in vars(c))
+        said = next((_said(c)[name] for c in classes if name in _said(c)), "")
         meaning = " ".join(said.split())
         found[key] = Key(key, info.annotation, info.metadata, meaning)
     return found

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ..epipolar.model import EpipolarModel
+from ..kernels import kernel
 from .aligned_pair import Alignment
 
 Floats = NDArray[np.float64]
@@ -96,7 +96,7 @@ class LabelUncertainty:
         return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bilinear(nodes: Floats, v: Floats, u: Floats, out: Floats) -> None:
     """``out`` [k, v.size, u.size]: values between ``nodes`` [k, rows, cols]."""
     last_row, last_col = nodes.shape[1] - 1, nodes.shape[2] - 1

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.resampling import RADIUS, sample, tap_weights
+from ..kernels import inner, kernel
 from .window_fit import gain_and_correlation, shift, weighted_mean
 
 Floats = NDArray[np.float64]
@@ -18,7 +18,7 @@ ITERATIONS = 12
 CONVERGED = 0.003  # px
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def warp_patch(
     source: Picture, col: float, row: float, carry: Floats, scale: tuple[float, float], out: Picture
 ) -> None:
@@ -39,7 +39,7 @@ def warp_patch(
             out[j, i] = sample(source, first_row, first_col, down, across)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _inner(picture: Picture, window: Floats) -> None:
     """Fill a window [n, 3] by the values and slopes of a picture inside its margin of one px."""
     k = 0
@@ -51,7 +51,7 @@ def _inner(picture: Picture, window: Floats) -> None:
             k += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def least_squares_match(
     template: Picture,
     source: Picture,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 from ..epipolar.rpc import SensorModel
 from ..lidar.lattice import PER_M
@@ -172,7 +172,7 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     """
     offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
     sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
-    return HeightOffset(offset, sigma, float(norm.isf(CHANCE / 2)) * sigma)
+    return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:
@@ -196,4 +196,4 @@ def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) ->
     others = np.eye(4) - np.outer(along, along)
     square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
     sigma = float(np.hypot(np.sqrt(square / 3) / length, LIDAR_SIGMA_M))
-    return HeightOffset(amount / length, sigma, float(t.isf(CHANCE_OF_RPCS / 2, 3)) * sigma)
+    return HeightOffset(amount / length, sigma, -float(stdtrit(3, CHANCE_OF_RPCS / 2)) * sigma)

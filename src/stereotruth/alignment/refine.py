@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ..epipolar.image_reader import Source, open_pair
 from ..epipolar.settings import Settings as Bands
@@ -148,7 +148,7 @@ def _subset(ties: TiePoints, which: Bools) -> TiePoints:
 
 
 def _chance(found: Estimate) -> float:
-    return float(f"{chi2.sf(found.statistic, found.freedom):.3g}")
+    return float(f"{chdtrc(found.freedom, found.statistic):.3g}")
 
 
 def _search(
@@ -232,7 +232,7 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
             f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
             + (", and the points' heights" if with_gcps else "")
         ]
-    if chi2.sf(found.contradiction, found.contradiction_freedom) > DOUBTFUL:
+    if chdtrc(found.contradiction_freedom, found.contradiction) > DOUBTFUL:
         return []
     others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [

@@ -8,13 +8,14 @@ pixels lie. The slopes are the mean of both windows', so that noise draws nothin
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inlined, inner
 
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def weighted_mean(window: Floats, weight: Floats) -> float:
     """Mean grey value of a window."""
     mean, total = 0.0, 0.0
@@ -24,7 +25,7 @@ def weighted_mean(window: Floats, weight: Floats) -> float:
     return mean / total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def gain_and_correlation(
     left: Floats, right: Floats, weight: Floats, mean_left: float, mean_right: float
 ) -> tuple[float, float]:
@@ -43,13 +44,13 @@ def gain_and_correlation(
     return np.sqrt(ll / rr), lr / np.sqrt(ll * rr)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def mean_slopes(left: Floats, right: Floats, gain: float, k: int) -> tuple[float, float]:
     """Slopes of grey values along columns and rows at a pixel, of both windows."""
     return 0.5 * (left[k, 1] + gain * right[k, 1]), 0.5 * (left[k, 2] + gain * right[k, 2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def misfit(
     left: Floats, right: Floats, mean_left: float, mean_right: float, gain: float, k: int
 ) -> float:
@@ -57,7 +58,7 @@ def misfit(
     return left[k, 0] - mean_left - gain * (right[k, 0] - mean_right)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def shift(
     left: Floats,
     right: Floats,

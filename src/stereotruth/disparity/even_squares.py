@@ -10,8 +10,9 @@ lattice and sums are of integers, so that neither window nor order of the points
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
 
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
@@ -23,7 +24,7 @@ FEWEST_AROUND = 36  # of the nine squares: a quarter of their cells
 REACH = 3 * SIDE  # cells around a vertex that have a say in whether it stays
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _by_square(square: Steps, start: Steps) -> Steps:
     """Vertices in the order of their squares; ``start`` [squares + 1] takes where each begins."""
     start[:] = 0
@@ -39,7 +40,7 @@ def _by_square(square: Steps, start: Steps) -> Steps:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _enough(start: Steps, s: int, cols: int) -> bool:
     """Whether a square and those around it hold points enough."""
     if start[s + 1] - start[s] < FEWEST:
@@ -53,7 +54,7 @@ def _enough(start: Steps, s: int, cols: int) -> bool:
     return around >= FEWEST_AROUND
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _moments(places: Steps, start: Steps, first: int, out: Ints) -> None:
     """Of a row of squares from square ``first`` on: sums over the vertices of each to ``out``.
 
@@ -74,7 +75,7 @@ def _moments(places: Steps, start: Steps, first: int, out: Ints) -> None:
         row[4], row[5], row[6], row[7] = suv, svv, suw, svw
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _plane(
     places: Steps, moments: Ints, start: Steps, s: int, i: int, j: int, cols: int, side: int,
     off: float,
@@ -117,7 +118,7 @@ def _plane(
     return True, gx, gy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _placed(
     x: Steps, y: Steps, h: Steps, kinds: NDArray[np.uint8], order: Steps, start: Steps,
     shape: tuple[int, int], side: int, corner: tuple[int, int], places: Steps, kind: Steps,
@@ -137,7 +138,7 @@ def _placed(
                 kind[s] = -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def even_squares(
     x: Steps, y: Steps, h: Steps, kinds: NDArray[np.uint8], square: Steps, shape: tuple[int, int],
     side: int, corner: tuple[int, int], off: float,

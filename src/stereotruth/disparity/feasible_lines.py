@@ -8,8 +8,9 @@ constraint: the lines that fit are a convex polygon, found by clipping. It serve
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inner
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,7 +22,7 @@ STEEPEST = 1.2  # slope of an edge against its first guess
 CORNERS = 24  # of the polygon of feasible lines at most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def clip(a: Floats, b: Floats, n: int, p: float, q: float, r: float, c: Floats, d: Floats) -> int:
     """The part of a convex polygon (a, b)[n] with p a + q b <= r, to (c, d); its corners."""
     m = 0
@@ -38,7 +39,7 @@ def clip(a: Floats, b: Floats, n: int, p: float, q: float, r: float, c: Floats, 
     return m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _feasible(
     u: Floats, v: Floats, high: Bools, order: Ints, n: int, extent: float, band: float,
     slack: float, limit: Floats, polygon: Floats, spare: Floats,
@@ -90,7 +91,7 @@ def _feasible(
     return m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _no_gap(
     u: Floats, v: Floats, high: Bools, n: int, band: float, limit: Floats, polygon: Floats, m: int,
     spare: Floats,
@@ -131,7 +132,7 @@ def _no_gap(
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def line_between(
     u: Floats, v: Floats, high: Bools, n: int, extent: float, reach: float, distance: float,
     band: float, slack: float, limit: Floats, polygon: Floats,

@@ -22,12 +22,12 @@ depend on blocks.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
 from ..epipolar.warping import warp_rows
+from ..kernels import kernel
 from .image_patches import Patch
 
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ def apart_from_steps(disparity: Floats) -> Bools:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _surface_mean(
     values: Singles,
     disparity: Singles,

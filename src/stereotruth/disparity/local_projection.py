@@ -16,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from ..kernels import inner, kernel
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from .view_geometry import ViewGeometry
 
@@ -45,7 +45,7 @@ _CHECKS = np.vstack(
 _BLOCK = 512  # points that are worked on at once; see _at_points
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
     """The polynomial with coefficients c[i:i+20] in the order of _TERMS (nested)."""
     return (
@@ -63,7 +63,7 @@ def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fit(
     values: Floats,
     checks: Floats,
@@ -107,7 +107,7 @@ def _fit(
                     good[cube] = False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _at_points(
     low: Ints,
     shape: Ints,
@@ -161,7 +161,7 @@ def _at_points(
     return bad
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _at_means(
     low: Ints,
     shape: Ints,

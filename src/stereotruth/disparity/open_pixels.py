@@ -23,11 +23,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.warping import warp_rows
+from ..kernels import kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -48,7 +48,7 @@ MARGIN = REACH + AROUND + ROUNDS + BACKERS  # px around a pixel that have a say
 _STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _candidates(
     row: Steps, col: Steps, known: Floats, slope: Floats, own: Floats, own_slope: Floats,
     highest: Floats, plane: Floats, source: Steps, number: Steps,
@@ -85,7 +85,7 @@ def _candidates(
         number[i] = n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _evidence(
     row: Steps, col: Steps, left: Floats, there: Floats, known: Floats, residual: Floats,
     spread: Floats, plane: Floats, number: Steps, ratio: Floats,
@@ -123,7 +123,7 @@ def _evidence(
             ratio[i, k] = min(max(value, -CAP), CAP)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _settle(
     row: Steps, col: Steps, index: Steps, known: Floats, plane: Floats,
     number: Steps, ratio: Floats, belief: Floats, spare: Floats,
@@ -180,7 +180,7 @@ def _settle(
         belief[:] = spare
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _backed(
     row: Steps, col: Steps, best: Ints, index: Steps, plane: Floats, number: Steps, ratio: Floats,
     out: Floats,

@@ -17,9 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from .feasible_lines import CORNERS, clip, line_between
 from .vertices import PART, PART_BITS
 
@@ -39,7 +39,7 @@ WIDEST = 1.5  # half the width of a strip that still tells something, in mean di
 _MOST = 4096  # points that have a say at most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _handed_on(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, plane: Floats, smooth: float,
     step: float,
@@ -67,7 +67,7 @@ def _handed_on(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _around(
     x: Ints, y: Ints, beside: Ints, row_start: Ints, a: int, ox: float, oy: float, reach: float,
     which: Ints, dx: Floats, dy: Floats,
@@ -98,14 +98,14 @@ def _around(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _above(x: Ints, y: Ints, h: Ints, plane: Floats, a: int, w: int, ox: float, oy: float) -> float:
     """Height of the plane of vertex w at the place (ox, oy) from vertex a."""
     u, v = ox - float(x[w] - x[a]), oy - float(y[w] - y[a])
     return float(h[w]) + plane[w, 0] * u + plane[w, 1] * v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _another_surface(
     x: Ints, y: Ints, h: Ints, plane: Floats, vertices: Steps, one: int, own: float, ox: float,
     oy: float, step: float, near: float, which: Ints, dx: Floats, dy: Floats, n: int,
@@ -138,7 +138,7 @@ def _another_surface(
     return other, other_h, lift > 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _side(h: float, at_l: float, at_t: float, away: float, distance: float, step: float) -> int:
     """Of a point between two planes, ``at_l`` and ``at_t`` high there: 1 on the low, 2 on the
     high one, 0 on neither, or where they meet."""
@@ -151,7 +151,7 @@ def _side(h: float, at_l: float, at_t: float, away: float, distance: float, step
     return 2 if abs(h - at_t) <= tolerance else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _sides_nearby(
     h: Ints, plane: Floats, sheet: Floats, distance: float, step: float, which: Ints, dx: Floats,
     dy: Floats, n: int, told: Floats,
@@ -186,7 +186,7 @@ def _sides_nearby(
     return not few and beyond <= ROUGH * (told[0, 0] + told[1, 0])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _sides(
     h: Ints, plane: Floats, sheet: Floats, distance: float, step: float, nx: float, ny: float,
     which: Ints, dx: Floats, dy: Floats, n: int, u: Floats, v: Floats, high: Bools,
@@ -212,7 +212,7 @@ def _sides(
     return m, least, most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _parts(
     x: Ints, y: Ints, h: Ints, vertices: Steps, sheet: Floats, ox: float, oy: float, step: float,
     slack: float, p: float, q: float, r: float, width: float,
@@ -235,7 +235,7 @@ def _parts(
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cuts(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, plane: Floats,
     beside: Ints, row_start: Ints, distance: float, step: float,
@@ -334,7 +334,7 @@ def _cuts(
         anchor[t, 0], anchor[t, 1] = low, top
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pieces(
     x: Ints, y: Ints, corner: Steps, line: Floats, sheets: Floats,
     faces: Floats, face_of: Steps, face_high: Bools, steps: Floats, step_of: Steps,

@@ -19,9 +19,9 @@ in float64, whatever the order. No shortcut is taken: the coefficient is that of
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from .image_patches import Patch
 from .pixel_points import BITS, PX, PixelPoints
 
@@ -39,7 +39,7 @@ _WIDE = 1032  # the pixels under them; limits the window to 777 px
 CONSTANT = 1e-13
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _products(
     a: Singles,
     b: Singles,
@@ -105,7 +105,7 @@ def _products(
                 t11 -= work[3 * _WIDE + c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _sums(
     a: Singles, row: int, col: int, count: int, window: int, work: Floats, out: Floats
 ) -> None:
@@ -127,7 +127,7 @@ def _sums(
                 total -= work[x]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _moments(
     square: Floats, beside: Floats, sums: Floats, c: int, fx: float, fy: float
 ) -> tuple[float, float]:
@@ -146,7 +146,7 @@ def _moments(
     return total, gy * gy * one + fy * fy * two + 2.0 * gy * fy * mixed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _correlate(
     points: Records,
     start: Ints,

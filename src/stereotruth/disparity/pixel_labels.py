@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
+from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .local_projection import LocalProjection
 from .pixel_points import PX, PixelPoints
@@ -59,7 +59,7 @@ class Pixels:
     moments: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _collect(
     points: Records,
     start: Ints,
@@ -185,7 +185,7 @@ class Labels:
     variance: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _plane(
     disparity: Floats,
     x: Floats,
@@ -261,7 +261,7 @@ def at_points(pixels: Pixels, valid: Bools, px_per_m: float) -> Labels:
     return Labels(np.where(valid, pixels.disparity, np.nan), level, variance)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rests(
     moments: Floats, count: Ints, valid: Bools, slope: Floats, squares: Floats, freedom: Floats
 ) -> None:
@@ -280,7 +280,7 @@ def _rests(
             freedom[j, i] = count[j, i] - 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pooled(
     squares: Floats, freedom: Floats, valid: Bools, few: float, least: float, out: Floats
 ) -> None:

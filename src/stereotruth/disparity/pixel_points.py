@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import kernel
 from .image_patches import MASKED, USABLE, Patch
 
 Ints = NDArray[np.int64]
@@ -70,14 +70,14 @@ class PixelPoints:
         return out.reshape(self.shape)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _any(start: Ints, chosen: NDArray[np.bool_], out: NDArray[np.bool_]) -> None:
     for p in range(out.size):
         for k in range(start[p], start[p + 1]):
             out[p] |= chosen[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _take(
     lon_q: Ints,
     lat_q: Ints,
@@ -142,7 +142,7 @@ def _take(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _scatter(points: Records, pixel: NDArray[np.int32], place: Ints, out: Records) -> None:
     for k in range(pixel.size):
         out[place[pixel[k]]] = points[k]

@@ -21,8 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,13 +37,13 @@ _SPLIT = 20  # bits; see _in_circle
 # ---------------------------------------------------------------------------------- exact tests
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _turn(x: Ints, y: Ints, a: int, b: int, c: int) -> int:
     """Twice the signed area of a triangle: positive if it runs counter-clockwise."""
     return (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _in_circle(x: Ints, y: Ints, a: int, b: int, c: int, d: int) -> bool:
     """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie.
 
@@ -84,7 +85,7 @@ def _in_circle(x: Ints, y: Ints, a: int, b: int, c: int, d: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
     return y[s] < y[t] or (y[s] == y[t] and x[s] < x[t])
 
@@ -92,7 +93,7 @@ def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
 # ------------------------------------------------------------------------------------ insertion
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
     """Order of insertion: rounds that double the vertices, each along a Hilbert curve."""
     for k in range(x.size):
@@ -121,7 +122,7 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
         out[k] = ((12 - level) << 40) | key
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _replace(neighbour: Steps, t: int, old: int, new: int) -> None:
     if t >= 0:
         for i in range(3):
@@ -129,13 +130,13 @@ def _replace(neighbour: Steps, t: int, old: int, new: int) -> None:
                 neighbour[t, i] = new
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _set(corner: Steps, neighbour: Steps, t: int, v: tuple, n: tuple) -> None:
     corner[t, 0], corner[t, 1], corner[t, 2] = v
     neighbour[t, 0], neighbour[t, 1], neighbour[t, 2] = n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _insert_all(x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps) -> int:
     """Delaunay triangles of vertices inside the square of the last four; returns their number.
 
@@ -241,7 +242,7 @@ class Triangles:
     radius: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _circumradius(x: Ints, y: Ints, a: int, b: int, c: int) -> float:
     u, v = float(x[b] - x[a]), float(y[b] - y[a])
     s, t = float(x[c] - x[b]), float(y[c] - y[b])
@@ -250,7 +251,7 @@ def _circumradius(x: Ints, y: Ints, a: int, b: int, c: int) -> float:
     return np.sqrt(sides) / (2.0 * float(_turn(x, y, a, b, c)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _tidy(
     x: Ints, y: Ints, corner: Steps, neighbour: Steps, vertices: int, limit: float
 ) -> tuple[Steps, Steps, Floats]:

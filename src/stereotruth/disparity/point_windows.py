@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG
 from ..lidar.point_store import PointStore
@@ -36,6 +35,27 @@ class Reach(NamedTuple):
     high: float
     around: Box
     top: float
+
+
+def corners_of_hull(x: Floats, y: Floats) -> list[int]:
+    """Which points are corners of the convex hull of all, counterclockwise.
+
+    Andrew's monotone chain. SciPy's hull takes a quarter of a job's start-up to import.
+    """
+    order = np.lexsort((y, x)).tolist()
+    xs, ys = x.tolist(), y.tolist()
+    found: list[int] = []
+    for way in (order, order[::-1]):  # the lower side, then the upper
+        side: list[int] = []
+        for k in way:
+            while len(side) > 1:
+                i, j = side[-2:]
+                if (xs[j] - xs[i]) * (ys[k] - ys[i]) > (ys[j] - ys[i]) * (xs[k] - xs[i]):
+                    break
+                side.pop()
+            side.append(k)
+        found += side[:-1]
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +144,7 @@ class PointWindows:
             moves = np.hstack([*(self.rays.track @ corners.T), np.zeros((2, 1))])
             moves *= reach.top - reach.low
             ground = (ground[:, :, None] + moves[:, None]).reshape(2, -1)
-        hull = ground[:, ConvexHull(ground.T).vertices]
+        hull = ground[:, corners_of_hull(*ground)]
         after = np.roll(hull, -1, axis=1)
         rise = after[1] - hull[1]
         slope = (after[0] - hull[0]) / np.where(rise == 0.0, np.inf, rise)

@@ -7,10 +7,10 @@ covered; the uncovered point nearest to the centre tells the surface.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
+from ..kernels import inner, kernel
 from .pixel_points import PX, PixelPoints
 
 Ints = NDArray[np.int64]
@@ -45,7 +45,7 @@ def _surrounded(limit: int) -> NDArray[np.bool_]:
 _SURROUNDED = _surrounded(EMPTY_OCTANTS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _octant(du: float, dv: float) -> int:
     """0 … 7 in the order of the angle: quadrant, then its first or second half."""
     mixed = (du < 0) != (dv < 0)
@@ -53,7 +53,7 @@ def _octant(du: float, dv: float) -> int:
     return quadrant + (1 if (abs(dv) > abs(du)) != mixed else 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _range(
     points: Records, start: Ints, p: int, flags: NDArray[np.uint8], low: Steps, high: Steps
 ) -> int:
@@ -68,7 +68,7 @@ def _range(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _ranges(
     points: Records,
     start: Ints,
@@ -81,7 +81,7 @@ def _ranges(
         count[p] = _range(points, start, p, flags, low, high)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
     """Greatest disparity in each of the _FINE² parts of a pixel."""
     first = p * _FINE * _FINE
@@ -92,7 +92,7 @@ def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
         tops[at] = max(tops[at], points[k].disparity)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _possible(across: int, down: int) -> int:
     """Octants that a pixel so many px off can lie in."""
     octants = 255
@@ -103,7 +103,7 @@ def _possible(across: int, down: int) -> int:
     return octants
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _uncovered(
     points: Records,
     start: Ints,
@@ -173,7 +173,7 @@ def _uncovered(
             count[p] = _range(points, start, p, flags, low, high)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _nearest(
     points: Records, start: Ints, q: int, across: int, down: int, flags: NDArray[np.uint8], best
 ) -> tuple[int, int]:
@@ -191,7 +191,7 @@ def _nearest(
     return distance, disparity
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _on_edge(
     points: Records,
     start: Ints,
@@ -226,7 +226,7 @@ def _on_edge(
     return np.sqrt(other) < np.sqrt(float(distance)) + 2.0 * margin * PX
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _seen(
     points: Records,
     start: Ints,

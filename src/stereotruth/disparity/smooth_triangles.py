@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from ..lidar.lattice import CELL_BITS, LATTICE_M
 from .even_squares import REACH as EVEN_REACH
 from .outlines import REACH, Pieces, cut_at_outlines
@@ -104,7 +104,7 @@ class Scale:
         return cls(distance, smooth, swept, int(np.ceil(halo / PART)) + EVEN_REACH + 2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _gradient(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float, float, float]:
     """Slopes (height steps per part of a cell) of a triangle, and twice its area."""
     u, v, s, t = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
@@ -113,7 +113,7 @@ def _gradient(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float,
     return float(p * t - q * v) / area, float(q * u - p * s) / area, area
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gentlest(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, smooth: float, least: float
 ) -> Floats:
@@ -140,13 +140,13 @@ def _gentlest(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _misfit(x: Ints, y: Ints, h: Ints, v: int, w: int, gx: float, gy: float) -> float:
     """Height (steps) of w above the plane of slopes (gx, gy) through v."""
     return float(h[w] - h[v]) - gx * float(x[w] - x[v]) - gy * float(y[w] - y[v])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _firm(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, slopes: Floats, smooth: float,
     step: float,
@@ -167,7 +167,7 @@ def _firm(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _incident(corner: Steps, vertices: int) -> tuple[Steps, Steps]:
     """Triangles at each vertex: ``list[start[v] : start[v + 1]]``."""
     start = np.zeros(vertices + 1, np.int32)
@@ -186,7 +186,7 @@ def _incident(corner: Steps, vertices: int) -> tuple[Steps, Steps]:
     return start, out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _joined(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, firm: Bools, start: Steps,
     around: Steps, smooth: float, step: float,
@@ -215,7 +215,7 @@ def _joined(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _squares(
     x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
@@ -245,7 +245,7 @@ def _squares(
     return total, number
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _variances(
     neighbour: Steps, smooth: Bools, total: Floats, number: Floats, few: float, least: float
 ) -> Floats:

@@ -20,9 +20,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
 from .image_patches import MASKED, USABLE, Patch
 from .local_projection import LocalProjection
@@ -53,7 +53,7 @@ _STATUS = np.array(
 _CHUNK = 1 << 15  # prisms that are projected at once
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _crossing(xa: float, ya: float, xb: float, yb: float, y: float) -> float:
     """Where an edge meets a row; the same for both triangles beside it."""
     if yb < ya or (yb == ya and xb < xa):
@@ -61,7 +61,7 @@ def _crossing(xa: float, ya: float, xb: float, yb: float, y: float) -> float:
     return xa + (y - ya) * ((xb - xa) / (yb - ya))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _span(x: tuple, y: tuple, row: float) -> tuple[float, float]:
     """Lowest and highest column of a triangle in a row, (inf, -inf) for none."""
     low, high = np.inf, -np.inf
@@ -76,7 +76,7 @@ def _span(x: tuple, y: tuple, row: float) -> tuple[float, float]:
     return low, high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _plane(x: tuple, y: tuple, d: tuple) -> tuple[float, float]:
     """Slopes of a value given at three places of an image; not finite if they lie in a line."""
     u, v, s, t = x[1] - x[0], y[1] - y[0], x[2] - x[0], y[2] - y[0]
@@ -85,12 +85,12 @@ def _plane(x: tuple, y: tuple, d: tuple) -> tuple[float, float]:
     return (p * t - q * v) / area, (q * u - p * s) / area
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _triple(values: Floats, t: Steps) -> tuple[float, float, float]:
     return values[t[0]], values[t[1]], values[t[2]]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _face_in_left(
     x: tuple, y: tuple, d: tuple, first: tuple[int, int], number: int, nearest: Floats, shown: Steps
 ) -> None:
@@ -120,7 +120,7 @@ def _face_in_left(
                 shown[j, i] = number
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _nearest_smooth(
     xy: Floats, corner: Steps, first: tuple[int, int], nearest: Floats, shown: Steps
 ) -> None:
@@ -135,7 +135,7 @@ def _nearest_smooth(
         _face_in_left(x, y, d, first, t, nearest, shown)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _face_in_right(
     x: tuple, y: tuple, d: tuple, first: tuple[int, int], width: int, start: Steps, place: Floats,
     limit: Floats, hidden: Bools,
@@ -170,7 +170,7 @@ def _face_in_right(
             hidden[k] = min(max(value, lowest), highest) > limit[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _smooth_in_right(
     xy: Floats, corner: Steps, first: tuple[int, int], width: int, start: Steps, place: Floats,
     limit: Floats, hidden: Bools,
@@ -186,7 +186,7 @@ def _smooth_in_right(
 _FACES = ((0, 1, 2), (0, 1, 3), (1, 3, 4), (1, 2, 4), (2, 4, 5), (2, 0, 5), (0, 5, 3))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _prisms_in_left(xy: Floats, first: tuple[int, int], nearest: Floats) -> None:
     """``xy`` [4, prisms, 6]."""
     any_prism = np.empty(nearest.shape, np.int32)
@@ -197,7 +197,7 @@ def _prisms_in_left(xy: Floats, first: tuple[int, int], nearest: Floats) -> None
             _face_in_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, t, nearest, any_prism)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _prisms_in_right(
     xy: Floats, first: tuple[int, int], width: int, start: Steps, place: Floats, limit: Floats,
     hidden: Bools,
@@ -212,7 +212,7 @@ def _prisms_in_right(
             )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _at_pixels(
     xy: Floats, h: Ints, classes: NDArray[np.uint8], count: Steps, corner: Steps, noise: Floats,
     shown: Steps, first: tuple[int, int], slope: Floats, variance: Floats, height: Floats,

@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
+from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
 from .even_squares import EVEN_PX, SIDE, even_squares
 from .rays import Rays
@@ -45,7 +45,7 @@ class Vertices:
     count: Steps
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _whole(number: int, inverse: float) -> int:
     """``number`` // d, ``inverse`` = 1 / d; a division takes ten times as long.
 
@@ -54,7 +54,7 @@ def _whole(number: int, inverse: float) -> int:
     return np.int64((number + 0.5) * inverse)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _raise_tops(
     lon_q: Ints,
     lat_q: Ints,
@@ -88,7 +88,7 @@ def _raise_tops(
             top_class[j, i] = max(top_class[j, i], classes[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _numbered(top: Steps, number: Steps) -> int:
     """Numbers the cells with points in their order, -1 for others; returns how many there are."""
     n = 0
@@ -100,7 +100,7 @@ def _numbered(top: Steps, number: Steps) -> int:
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sum_tops(
     index: Steps, place: Steps, top: Steps, number: Steps, tolerance: int, sums: Steps
 ) -> None:
@@ -116,7 +116,7 @@ def _sum_tops(
             sums[n, 3] += depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _means(
     number: Steps, top: Steps, top_class: NDArray[np.uint8], sums: Steps, cell: tuple[int, int],
     before: tuple[int, int], squares: int, x: Steps, y: Steps, h: Steps,
@@ -141,7 +141,7 @@ def _means(
             square[k] = (j + before[1]) // SIDE * squares + (i + before[0]) // SIDE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _thinned(
     number: Steps, sums: Steps, x: Steps, y: Steps, h: Steps, kinds: NDArray[np.uint8],
     cell: tuple[int, int], before: tuple[int, int], first: tuple[int, int],

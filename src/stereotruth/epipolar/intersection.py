@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from .model import EpipolarModel
 from .rpc import project_point
 from .spline_kernels import inverse_point
@@ -18,13 +18,13 @@ FRESH = 64  # px along a row after which the derivatives are taken anew
 DEG = 1.0 / 111_000.0  # per metre, about
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _project_both(sensors: Floats, lon: float, lat: float, h: float, out: Floats) -> None:
     out[0], out[1] = project_point(sensors[0], lon, lat, h)
     out[2], out[3] = project_point(sensors[1], lon, lat, h)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _solver(sensors: Floats, lon: float, lat: float, h: float, out: Floats) -> None:
     """Fill ``out`` [3, 4]: (d lon, d lat, d h) by which 4 image residuals (px) are taken out."""
     ahead, behind, jacobian = np.empty(4), np.empty(4), np.empty((4, 3))
@@ -40,7 +40,7 @@ def _solver(sensors: Floats, lon: float, lat: float, h: float, out: Floats) -> N
     out[2] = inverse[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _refine(
     sensors: Floats, solver: Floats, image: Floats, ground: Floats, steps: int, there: Floats
 ) -> bool:
@@ -61,7 +61,7 @@ def _refine(
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _intersect(
     sensors: Floats,
     left: Floats,

@@ -7,8 +7,9 @@ image is downsampled. Nodata is NaN.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -39,7 +40,7 @@ TAP_POLYNOMIALS = (
 ONE, TWO, THREE, FOUR, FIVE, SIX, SEVEN = np.arange(1, 8, dtype=np.uint64)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _kernel(s: float) -> float:
     """Keys' six-point kernel (IEEE TASSP 29, 1981, section VI); reproduces cubic polynomials."""
     s = abs(s)
@@ -52,7 +53,7 @@ def _kernel(s: float) -> float:
     return 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
     """Weights of the source samples first, first + 1, … for the value at ``at``; sum 1."""
     if scale == 1.0:  # the same without branches
@@ -73,7 +74,7 @@ def tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
         weights[k] /= total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _row_weights(f: Picture, weights: Picture) -> None:
     """Weights [6, n] of the taps of n px, each of which lies ``f`` in [0, 1] past its third tap.
 
@@ -85,7 +86,7 @@ def _row_weights(f: Picture, weights: Picture) -> None:
             weights[tap, k] = ((a * f[k] + b) * f[k] + c) * f[k] + d
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _column(
     source: Picture, at: np.uint64, width: np.uint64, down: tuple[np.float32, ...]
 ) -> np.float32:
@@ -100,7 +101,7 @@ def _column(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _six_by_six(
     source: Picture, first: np.uint64, width: np.uint64, across: Picture, down: Picture, k: int
 ) -> np.float32:
@@ -123,7 +124,7 @@ def _six_by_six(
     return ((a + e) + (c + g)) + ((b + f) + (d + h))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _at_an_edge(
     source: Picture,
     row: int,
@@ -155,7 +156,7 @@ def _at_an_edge(
     return _six_by_six(patch, np.uint64(0), np.uint64(8), across, down, k)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _along_row(
     lattice: Floats, step: int, y: int, x: int, axis: int, whole: Floats, part: Picture
 ) -> None:
@@ -187,7 +188,7 @@ def _along_row(
         k += count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _resample(source: Picture, lattice: Floats, step: int, out: NDArray[np.uint16]) -> int:
     """:func:`resample` without widening; a tile's source stays in the processor's cache."""
     rows, cols = source.shape
@@ -228,7 +229,7 @@ def _resample(source: Picture, lattice: Floats, step: int, out: NDArray[np.uint1
     return valid
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def sample(source: Picture, first_row: int, first_col: int, down: Floats, across: Floats) -> float:
     """Weighted sum of source samples; NaN where a sample with weight is nodata or missing."""
     rows, cols = source.shape
@@ -260,7 +261,7 @@ def sample(source: Picture, first_row: int, first_col: int, down: Floats, across
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _resample_widened(
     source: Picture,
     lattice: Floats,
@@ -298,7 +299,7 @@ def _resample_widened(
     return valid
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def resample(
     source: Picture,
     lattice: Floats,

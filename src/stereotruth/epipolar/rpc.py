@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from ..kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ VECTORS = ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff
 
 # error_model="numpy" (no exception on division by zero) lets LLVM vectorise the loops, if what they
 # call is inlined: 6 instead of 22 ns a point.
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
     """The 20-term polynomial of RPC00B with coefficients c[i:i+20] at L=x, P=y, H=z (nested)."""
     return (
@@ -77,7 +78,7 @@ def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _cubic_dx(c: Floats, i: int, x: float, y: float, z: float) -> float:
     """Derivative of :func:`_cubic` by x (normalised longitude)."""
     return (
@@ -88,7 +89,7 @@ def _cubic_dx(c: Floats, i: int, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _cubic_dy(c: Floats, i: int, x: float, y: float, z: float) -> float:
     """Derivative of :func:`_cubic` by y (normalised latitude)."""
     return (
@@ -99,7 +100,7 @@ def _cubic_dy(c: Floats, i: int, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def project_point(packed: Floats, lon: float, lat: float, height: float) -> tuple[float, float]:
     """Image (col, row) in px of one ground point; ``packed`` is ``SensorModel.packed()``.
 
@@ -121,7 +122,7 @@ def project_point(packed: Floats, lon: float, lat: float, height: float) -> tupl
     return col, row
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def project_block(
     packed: Floats, lon: Floats, lat: Floats, height: Floats, col: Floats, row: Floats
 ) -> None:
@@ -130,14 +131,14 @@ def project_block(
         col[i], row[i] = project_point(packed, lon[i], lat[i], height[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def project_points(packed: Floats, lon: Floats, lat: Floats, height: Floats, out: Floats) -> None:
     """Fill ``out`` [2, n] with (col, row) of n ground points (degrees, degrees, m)."""
     # A function of its own: LLVM must not see that both results go to one array.
     project_block(packed, lon, lat, height, out[0], out[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def localize_point(packed: Floats, col: float, row: float, height: float) -> tuple[float, float]:
     """Ground (lon, lat) in degrees where the ray of a pixel meets an ellipsoidal height in m.
 
@@ -178,7 +179,7 @@ def localize_point(packed: Floats, col: float, row: float, height: float) -> tup
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def localize_points(packed: Floats, col: Floats, row: Floats, height: Floats, out: Floats) -> None:
     """Fill ``out`` [2, n] with (lon, lat) of n image points (px, px, m)."""
     for i in range(col.size):

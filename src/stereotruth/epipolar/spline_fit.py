@@ -28,7 +28,7 @@ def _design(domain: tuple[float, float, float, float], n: int, image: Floats) ->
         s = (coordinate - domain[axis]) / (domain[axis + 2] - domain[axis]) * (n - 3)
         i = np.clip(np.floor(s).astype(int), 0, n - 4)
         dense = np.zeros((s.size, n))
-        for a, w in enumerate(cubic_weights.py_func(s - i)):
+        for a, w in enumerate(cubic_weights(s - i)):
             dense[np.arange(s.size), i + a] = w
         weights.append(dense)
     return (weights[1][:, :, None] * weights[0][:, None, :]).reshape(-1, n * n)

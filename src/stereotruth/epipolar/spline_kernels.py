@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inlined, inner, kernel
 from .rpc import project_block
 
 Floats = NDArray[np.float64]
@@ -20,7 +20,7 @@ _BLOCK = 256  # points worked on together
 POWERS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6  # of weights
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def cubic_weights(f: float) -> tuple[float, float, float, float]:
     """Weights of the four coefficients around a place ``f`` in [0, 1] of a cell."""
     e = 1.0 - f
@@ -32,18 +32,18 @@ def cubic_weights(f: float) -> tuple[float, float, float, float]:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _slopes(f: float) -> tuple[float, float, float, float]:
     e = 1.0 - f
     return -0.5 * e * e, (1.5 * f - 2.0) * f, (2.0 - 1.5 * e) * e, 0.5 * f * f
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _row_sum(m: Floats, k: int, w: tuple[float, float, float, float]) -> float:
     return m[k] * w[0] + m[k + 1] * w[1] + m[k + 2] * w[2] + m[k + 3] * w[3]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _patch(
     m: Floats,
     k: int,
@@ -60,7 +60,7 @@ def _patch(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def forward_with_slopes(
     m: Floats, col: float, row: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -98,7 +98,7 @@ def forward_with_slopes(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _cell(m: Floats, s: float, t: float) -> int:
     """Number of the spline's cell in which a place lies; -1 outside of the domain."""
     last = int(m[10]) - 4
@@ -107,7 +107,7 @@ def _cell(m: Floats, s: float, t: float) -> int:
     return j * (last + 1) + i if inside else -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _bicubic(
     f: float,
     g: float,
@@ -124,12 +124,12 @@ def _bicubic(
     return a + g * (b + g * (c + g * d))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _powers(m: Floats, k: int) -> tuple[float, float, float, float]:
     return m[k], m[k + 1], m[k + 2], m[k + 3]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def forward_point(m: Floats, col: float, row: float) -> tuple[float, float]:
     """Epipolar (x, y) in px of one image point; ``m`` is a packed image model."""
     s = (col - m[6]) * m[7]
@@ -150,7 +150,7 @@ def forward_point(m: Floats, col: float, row: float) -> tuple[float, float]:
     return x, y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _cell_of_all(m: Floats, col: Floats, row: Floats, f: Floats, g: Floats) -> int:
     """Number of the spline's cell in which a block of points lies, with their places f, g in it.
 
@@ -173,21 +173,21 @@ def _cell_of_all(m: Floats, col: Floats, row: Floats, f: Floats, g: Floats) -> i
     return low
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _affine(m: Floats, k: int, col: Floats, row: Floats, out: Floats) -> None:
     a, b, c = m[k], m[k + 1], m[k + 2]
     for i in range(col.size):
         out[i] = a * col[i] + b * row[i] + c
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _add_bicubic(m: Floats, k: int, f: Floats, g: Floats, out: Floats) -> None:
     p0, p1, p2, p3 = _powers(m, k), _powers(m, k + 4), _powers(m, k + 8), _powers(m, k + 12)
     for i in range(f.size):
         out[i] += _bicubic(f[i], g[i], p0, p1, p2, p3)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _forward_block(
     m: Floats, col: Floats, row: Floats, f: Floats, g: Floats, x: Floats, y: Floats
 ) -> None:
@@ -210,7 +210,7 @@ def _forward_block(
         _add_bicubic(m, k + 16 * (n - 3) ** 2, f, g, x)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def inverse_point(m: Floats, x: float, y: float) -> tuple[float, float]:
     """Image (col, row) in px of one epipolar point, by Newton; (NaN, NaN) if it diverges."""
     det = m[0] * m[4] - m[1] * m[3]
@@ -231,7 +231,7 @@ def inverse_point(m: Floats, x: float, y: float) -> tuple[float, float]:
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def map_points(m: Floats, inverse: bool, a: Floats, b: Floats, out: Floats) -> None:
     """Fill ``out`` [2, n] with the forward or the inverse map of n points."""
     for i in range(a.size):
@@ -240,7 +240,7 @@ def map_points(m: Floats, inverse: bool, a: Floats, b: Floats, out: Floats) -> N
         out[1, i] = v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def ground_points_to_epipolar(
     sensors: Floats,
     left: Floats,

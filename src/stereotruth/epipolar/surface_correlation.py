@@ -6,9 +6,9 @@ Where heights step, a square window mixes surfaces and fails although the dispar
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import inner, kernel
 from .one_surface import BEND, SURFACE_PX
 
 Singles = NDArray[np.float32]
@@ -19,7 +19,7 @@ Singles = NDArray[np.float32]
 BLOCK = 256
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def surface_of_row(
     disparity: Singles, slope: Singles, y: int, x0: int, size: int, c: Singles
 ) -> None:
@@ -30,19 +30,19 @@ def surface_of_row(
         c[2 * BLOCK + k] = slope[1, y, x0 + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def columns_inside(x0: int, size: int, cols: int, across: int) -> tuple[int, int]:
     """Pixels [first, end) of a block whose neighbour ``across`` columns on lies in the image."""
     return max(0, -across - x0), min(size, cols - across - x0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def tolerance_px(down: int, across: int) -> float:
     """By how much a pixel so many px away may be off the plane through the centre."""
     return np.float32(SURFACE_PX + BEND * max(abs(down), abs(across)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _correlation(
     left: Singles, warped: Singles, disparity: Singles, counted: Singles, slope: Singles, half: int,
     out: Singles,

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..kernels import kernel
 from .lattice import CELL_BITS, cell_key
 from .point_store import CELL, CELLS, POINT_BYTES, POINTS, WORDS
 
@@ -22,14 +22,14 @@ Words = NDArray[np.uint32]
 SCRATCH_POINTS = (1 << 28) // POINT_BYTES  # kept in memory, 256 MiB
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Integers) -> None:
     """Number of the cell of each point in a raster of cells, its first cell at row, col."""
     for i in range(out.size):
         out[i] = ((lattice[1, i] >> CELL_BITS) - row) * width + (lattice[0, i] >> CELL_BITS) - col
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sort(
     lattice: Integers,
     attributes: Words,

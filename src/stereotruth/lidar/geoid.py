@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from numba import njit
 from pyproj import CRS
 from rasterio.windows import Window
 
 from ..errors import InputError
+from ..kernels import kernel
 from ..products.ungeoreferenced import open_raster
 
 FORMATS = ("GTX", "GTiff")
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bilinear(
     rows: np.ndarray,
     grid: tuple[float, float, float, float],

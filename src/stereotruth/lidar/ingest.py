@@ -22,11 +22,11 @@ from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import progress
+from ..kernels import kernel
 from ..products.files import whole_folder
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
@@ -56,7 +56,7 @@ def _refuse_coarse(header: laspy.LasHeader, transform: ToWGS84, file: Path) -> N
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _round(lon: Floats, lat: Floats, height: Floats, out: Integers, limits: Integers) -> bool:
     """Fill ``out`` [3, n] with lattice coordinates and widen ``limits`` [2, 3] by them.
 

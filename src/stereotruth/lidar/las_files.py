@@ -10,10 +10,10 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..kernels import inner, kernel
 from ..products.remote_files import open_file, size_of
 from .las_layout import check_layout, wrong_count
 
@@ -238,14 +238,14 @@ class PointTally:
 
 
 # Kernels free the GIL; nothing in them depends on how the points are cut into chunks.
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _integer(raw: Bytes, i: int, at: int) -> int:
     value = np.int64(raw[i, at]) | np.int64(raw[i, at + 1]) << 8
     value |= np.int64(raw[i, at + 2]) << 16 | np.int64(raw[i, at + 3]) << 24
     return np.int64(np.int32(value))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _unpack(
     raw: Bytes,
     extended: bool,

@@ -36,10 +36,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..kernels import kernel
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
@@ -119,7 +119,7 @@ class Points:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _select(
     stored: Words,
     start: Integers,

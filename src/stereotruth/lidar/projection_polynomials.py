@@ -14,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
 
 Floats = NDArray[np.float64]
 Exact = Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Floats]]
@@ -32,7 +33,7 @@ _BLOCK = 256
 _AT_ONCE = 256  # patches fitted in one go
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _locate(
     per_unit: float,
     x: Floats,
@@ -60,7 +61,7 @@ def _locate(
     return low == high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _polynomial(c: Floats, u: Floats, v: Floats, w: Floats, out: Floats) -> None:
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
     for k in range(u.size):
@@ -68,7 +69,7 @@ def _polynomial(c: Floats, u: Floats, v: Floats, w: Floats, out: Floats) -> None
         out[k] = value + w[k] * (c6 + u[k] * c7 + v[k] * c8)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _evaluate(
     keys: NDArray[np.int64],
     coefficients: Floats,

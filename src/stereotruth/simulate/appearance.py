@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .kernels import inlined
+from ..kernels import inlined
 from .surfaces import CELL_M, GROUND, ROOF, TREE, WATER, in_shadow
 
 SKY = 0.34  # diffuse share of the light

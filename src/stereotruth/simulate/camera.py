@@ -15,8 +15,8 @@ import math
 
 import numpy as np
 
+from ..kernels import inlined, kernel
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
-from .kernels import inlined, kernel
 
 ALTITUDE_M = 505e3
 INCLINATION_DEG = 97.4

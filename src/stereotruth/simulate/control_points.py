@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..kernels import kernel
 from ..products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
-from .kernels import kernel
 from .layout import scene_coordinates
 from .render import ImagedScene, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, cast, terrain_heights

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .kernels import inlined, kernel
+from ..kernels import inlined, kernel
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563

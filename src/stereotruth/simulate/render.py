@@ -14,12 +14,12 @@ from rasterio.rpc import RPC as RPCMetadata
 
 from ..errors import InputError
 from ..job import progress
+from ..kernels import inlined, kernel
 from ..products.files import replacing
 from .appearance import reflectance
 from .camera import aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
-from .kernels import inlined, kernel
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import IN_IMAGES, Surfaces, cast, horizon, terrain_heights

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .kernels import inlined, kernel
+from ..kernels import inlined, kernel
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR = 1, 2

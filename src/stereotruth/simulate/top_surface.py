@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..kernels import kernel
 from .cities import CitySpec
-from .kernels import kernel
 from .layout import frame_of
 from .surfaces import IN_IMAGES, cast
 from .world import build_surfaces

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..job import progress
+from ..kernels import inlined, kernel
 from ..products.grids import building
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
-from .kernels import inlined, kernel
-from .lidar import coverage, covered
+from .lidar_coverage import coverage, covered
 from .render import in_collar, prepare
 from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 log = logging.getLogger("stereotruth")
 
@@ -207,4 +210,6 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
 
 def open_truth(path: str | Path) -> xr.Dataset:
     """The truth of a scene as a lazy xarray Dataset on dimensions (row, col)."""
+    import xarray as xr  # a quarter of a job's start-up, and the job that makes it needs none
+
     return xr.open_zarr(path, consolidated=True, chunks=None)

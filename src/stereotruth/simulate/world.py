@@ -12,9 +12,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..kernels import kernel
 from .buildings import FLAT, choose_changed, place_buildings
 from .cities import CitySpec
-from .kernels import kernel
 from .layout import draw_zones, extent
 from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, horizon, lidar_horizon, terrain_heights
 from .terrain import (

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...epipolar.one_surface import BEND, SURFACE_PX
+from ...kernels import inner, kernel
 from .estimates import Estimate, cells, ratio
 
 Bools = NDArray[np.bool_]
@@ -77,7 +77,7 @@ def _beats(there: Floats, here: Floats) -> Bools:
         return (there >= CLEAR) & (there - here >= MARGIN)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _weights(f: float, out: Floats) -> None:
     """Cubic convolution (Keys 1981, a = -1/2) at ``f`` px after the second of four pixels."""
     out[0] = -0.5 * f + f * f - 0.5 * f * f * f
@@ -86,7 +86,7 @@ def _weights(f: float, out: Floats) -> None:
     out[3] = -0.5 * f * f + 0.5 * f * f * f
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _correlate(
     right: Picture, values: Floats, rows: NDArray, first: NDArray, taps: Floats, n: int, shift: int
 ) -> float:
@@ -116,7 +116,7 @@ def _correlate(
     return (sab - sa * sb / n) / np.sqrt(va * vb)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _best(
     right: Picture,
     values: Floats,
@@ -143,7 +143,7 @@ def _best(
     return best, at
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _scan(
     left: Picture,
     right: Picture,

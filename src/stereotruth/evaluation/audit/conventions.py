@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...epipolar.one_surface import BEND, SURFACE_PX
+from ...kernels import kernel
 from .estimates import Estimate, cells, ratio, share
 from .matches import Matches
 
@@ -74,7 +74,7 @@ def label_values(labels: NDArray[Any], disparity_range: tuple[float, float]) -> 
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _surface_mean(labels: NDArray, xs: NDArray, ys: NDArray, out: Floats) -> None:
     rows, cols = labels.shape
     for k in range(xs.size):

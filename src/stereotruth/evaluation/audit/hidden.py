@@ -12,11 +12,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...epipolar.surface_correlation import surface_correlation
 from ...epipolar.warping import warp_rows
+from ...kernels import kernel
 from .estimates import Estimate, cells, location
 
 Bools = NDArray[np.bool_]
@@ -28,7 +28,7 @@ CLEAR = 0.15  # of correlation: crowns fold, too, and what lies below them is se
 LARGER, SMALLER = "larger", "smaller"
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _behind(labels: NDArray, tolerance: float, larger: bool, out: Bools) -> None:
     rows, cols = labels.shape
     for y in range(rows):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...alignment.window_fit import (
@@ -13,6 +12,7 @@ from ...alignment.window_fit import (
     shift,
     weighted_mean,
 )
+from ...kernels import inner, kernel
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -26,7 +26,7 @@ LABELLED = 0.6  # of a window, by weight, where labels are held against a match
 LABEL_MOVE_PX = 3.0  # by which that may move the match: a window's middle may stand out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _taps(f: float, value: Floats, slope: Floats) -> None:
     """Weights of four coefficients, the second of which lies ``f`` px before the position."""
     g = 1.0 - f
@@ -40,7 +40,7 @@ def _taps(f: float, value: Floats, slope: Floats) -> None:
     slope[3] = f * f / 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats, k: int) -> bool:
     """Fill ``out[k]`` by value and slopes of a spline; False next to its border and outside."""
     if not (x >= 2.0 and y >= 2.0 and x <= c.shape[1] - 4.0 and y <= c.shape[0] - 4.0):
@@ -62,7 +62,7 @@ def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats, k: int) -
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _solve(a: Floats, b: Floats) -> bool:
     """Solve a @ p = b, positive definite, in place: p in ``b``, the inverse in ``a``."""
     n = b.size
@@ -84,7 +84,7 @@ def _solve(a: Floats, b: Floats) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _match(
     left: Picture, right: Picture, weight: Floats, x0: int, y0: int, d: float, p: float, out: Floats
 ) -> None:
@@ -148,7 +148,7 @@ def _match(
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def match_all(left: Picture, right: Picture, weight: Floats, start: Floats, out: Floats) -> None:
     """:func:`_match` from each ``start`` [n, 4]: x, y, disparity, parallax; ``out`` is [n, 6]."""
     for k in range(start.shape[0]):
@@ -156,7 +156,7 @@ def match_all(left: Picture, right: Picture, weight: Floats, start: Floats, out:
         _match(left, right, weight, x0, y0, start[k, 2], start[k, 3], out[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _offset(
     left: Picture,
     right: Picture,
@@ -220,7 +220,7 @@ def _offset(
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def offset_all(
     left: Picture, right: Picture, labels: Picture, weight: Floats, start: Floats, out: Floats
 ) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ...kernels import kernel
 from .estimates import NOTHING, Estimate, cells, ratio
 
 Picture = NDArray[np.float32]
@@ -46,7 +46,7 @@ def _alike(image: Picture) -> Picture:
     return np.ascontiguousarray(found, np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _miss(
     left: Picture, right: Picture, labels: Picture, at: NDArray, x: int, y: int, out: Floats
 ) -> None:

@@ -16,11 +16,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ...error_statistics import median_and_nmad
+from ...kernels import kernel
 from .edges import Edges, measure
 from .height_raster import Floats, Window
 
@@ -79,7 +79,7 @@ class Part:
         return self.window.at(self.x + east, self.y + north) - self.z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cost(
     heights: NDArray[np.float32],
     col: Floats,

@@ -30,7 +30,6 @@ import dask
 import numpy as np
 import pyproj
 import zarr
-from numba import njit
 from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
@@ -39,6 +38,7 @@ from ...epipolar.model import EpipolarModel
 from ...epipolar.rpc import SensorModel
 from ...errors import InputError
 from ...job import block_progress
+from ...kernels import inner, kernel
 from ...products.files import replacing
 from ...products.grids import Layer, blocks, require_complete
 from ...products.provenance import digest
@@ -58,7 +58,7 @@ NODATA = -9999.0
 LAYERS = {"height": Layer("float32", math.nan, {"units": "m", "long_name": "surface height"})}
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _triangle(
     a: tuple[float, float, float],
     b: tuple[float, float, float],
@@ -85,7 +85,7 @@ def _triangle(
                     out[i, j] = z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _surface(
     col: Floats, row: Floats, z: Floats, d: NDArray[np.float32], step: float, out: NDArray
 ) -> None:

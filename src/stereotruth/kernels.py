@@ -1,0 +1,26 @@
+"""How numerics are compiled, in one place: loops that Python calls, and functions within them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from numba import njit
+from numba.extending import register_jitable
+
+_OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
+
+kernel: Callable = njit(cache=True, nogil=True, **_OPTIONS)
+"""A compiled loop over points or pixels, which Python calls."""
+
+inner: Callable = register_jitable(**_OPTIONS)
+"""A function that kernels call; plain Python where Python calls it.
+
+It is compiled within its kernels: without a door for Python, and once for all constants of a type.
+"""
+
+inlined: Callable = register_jitable(forceinline=True, _nrt=False, **_OPTIONS)
+"""An inner function whose code enters its callers', and that allocates nothing.
+
+Without reference counting of the arrays that it looks at: counting took two thirds of the time
+of the simulator's rays (1000 against 290 ns a ray, textures and shadows included).
+"""

@@ -1,0 +1,34 @@
+"""What a job imports before it does anything: most of the time that a small one takes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from ..synthetic.rules import FOLDER
+
+HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pyproj", "rasterio"} | {
+    "scipy.spatial", "scipy.special", "scipy.stats", "torch", "xarray", "zarr"
+}  # fmt: skip
+# What the job of each script uses in every run; a new one costs each of its jobs its import.
+STARTS = {
+    "simulate_image": {"numba", "rasterio", "scipy.spatial", "scipy.special"},
+    "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "align": {"cv2", "matplotlib", "numba", "rasterio"},
+    "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special", "zarr"},
+    "rectify": {"dask", "numba", "rasterio", "zarr"},
+    "project": {"dask", "numba", "zarr"},
+    "project_strip": {"dask", "numba", "zarr"},
+    "grid_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "match": {"cv2", "rasterio"},
+}
+
+
+@pytest.mark.parametrize("script", STARTS)
+def test_a_job_imports_what_it_uses(script) -> None:
+    words = f"import runpy, sys; runpy.run_path({str(FOLDER / f'scripts/{script}.py')!r})"
+    shown = f"{words}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) & HEAVY == STARTS[script]
