@@ -17,7 +17,7 @@ STARTS = {
     "simulate_image": {"numba", "rasterio", "scipy.spatial", "scipy.special"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
     "align": {"cv2", "matplotlib", "numba", "rasterio"},
-    "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special", "zarr"},
+    "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special"},
     "rectify": {"dask", "numba", "rasterio", "zarr"},
     "project": {"dask", "numba", "zarr"},
     "project_strip": {"dask", "numba", "zarr"},
