@@ -143,7 +143,8 @@ def _at_points(
         cube = ((i - low[0]) * shape[1] + j - low[1]) * shape[2] + k - low[2]
         if not good[cube]:
             bad += end - start
-        c[:] = coefficients[cube]
+        for m in range(80):  # a slice takes seconds to compile
+            c[m] = coefficients[cube, m]
         size = end - start
         for m in range(size):
             place[m] = (lon_q[start + m] & mask) * _SCALE - 4.0

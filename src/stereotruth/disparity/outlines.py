@@ -63,7 +63,7 @@ def _handed_on(
                 far = u * u + s * s
                 if abs(off) <= step and far < nearest[v]:
                     nearest[v] = far
-                    out[v] = plane[w]
+                    out[v, 0], out[v, 1] = plane[w, 0], plane[w, 1]
     return out
 
 
@@ -308,7 +308,10 @@ def _cuts(
         found = line_between(u, v, high, m, extent, reach, distance, band, slack, limit, spans)
         if found < 3:
             continue
-        mean_a, mean_b = spans[0, :found].mean(), spans[1, :found].mean()
+        mean_a = mean_b = 0.0
+        for j in range(found):
+            mean_a, mean_b = mean_a + spans[0, j], mean_b + spans[1, j]
+        mean_a, mean_b = mean_a / found, mean_b / found
         norm = np.sqrt(1.0 + mean_b * mean_b)
         width = 0.0
         for w in corner[t]:
