@@ -130,7 +130,7 @@ def main() -> None:
     table: dict[str, dict[str, dict]] = {}
     first: dict[str, Scores] = {}
     chosen = given.change or list(CHANGES)
-    print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>40}" for name in chosen), flush=True)
+    print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>46}" for name in chosen), flush=True)
     for number, method in enumerate(given.method):
         name, settings = parsed(method)
         if "weights" in settings:
@@ -144,13 +144,13 @@ def main() -> None:
             table[name][change] = of
             first.setdefault(change, scores)
             epe, d1 = of.values()
-            lines[0] += f"{epe['value']:.2f} / {d1['value']:.1f}".rjust(40)
+            lines[0] += f"{epe['value']:.2f} / {d1['value']:.1f}".rjust(46)
             if number and epe["less_low"] is not None:  # enough tiles for an interval
                 apart = (
                     f"{x['less_value']:+.2f} ({x['less_low']:+.2f}, {x['less_high']:+.2f})"
                     for x in of.values()
                 )
-                lines[1] += " / ".join(apart).rjust(40)
+                lines[1] += " / ".join(apart).rjust(46)
         print(*lines[: 2 if number else 1], sep="\n", flush=True)
     if given.json:
         given.json.write_text(json.dumps(table, indent=2) + "\n")
