@@ -1,7 +1,8 @@
 """How methods bear what the synthetic pairs lack: noise, haze, shadows that moved, few grey levels.
 
 The right images of a dataset's test pairs are changed (noise: both), each method matches them, and
-EPE and D1 are printed beside those of the pairs as they are. See README.md beside this file.
+EPE and D1 are printed beside those of the pairs as they are, and how much each method differs from
+the first on the same tiles. See README.md beside this file.
 
 python bench/degraded.py --method sgm --method stereonet=results/train/.../best.pt
 """
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from whole_scene import parsed
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.matching.benchmark.scores import Collector, Scorer
+from stereotruth.matching.benchmark.differences import difference
+from stereotruth.matching.benchmark.scores import Collector, Scorer, Scores
 from stereotruth.matching.image_faults import (
     FAULTS,
     Fault,
@@ -34,6 +36,7 @@ from stereotruth.products.rasters import read_image
 
 Change = Callable[[Image, Image, np.random.Generator], tuple[Image, Image]]
 THRESHOLD_PX = 3.0
+SAMPLES = 1000  # of the tiles
 
 
 def noise(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -74,19 +77,40 @@ def changed(
     return as_images(images, (left, right))
 
 
-def score(matcher: Matcher, dataset: StereoDataset, changes: tuple[Change, ...]) -> dict:
-    """EPE (px) and D1 (%) over the labelled pixels of the test pairs, holes filled."""
+def score(matcher: Matcher, dataset: StereoDataset, changes: tuple[Change, ...]) -> Scores:
+    """Scores of the test pairs after the changes."""
     scorer = Scorer(dataset.disparity_range, (THRESHOLD_PX,), dataset.grows_with_height)
     collector = Collector(scorer.thresholds_px)
     for number, pair in enumerate(dataset.pairs("test", labelled=True)):
         images = changed(read_image(pair.left), read_image(pair.right), changes, [1, number])
         found = matcher(*images, dataset.disparity_range)
         collector.add(pair.name, pair.city, scorer.sums(found, dataset.labels(pair)))
-    row = collector.scores().row()
-    return {
-        "epe_px": round(row["filled_epe_px"], 3),
-        "d1_percent": round(100 * row[f"filled_d1_{THRESHOLD_PX:g}_px_share"], 2),
-    }
+    return collector.scores()
+
+
+def figures(scores: Scores, first: Scores | None = None) -> dict[str, dict[str, float | None]]:
+    """EPE (px) and D1 (%) over the labelled pixels, holes filled.
+
+    With ``first``: what of them differs from those of another method on the same tiles (less than
+    0: this one is better), and the 95 % interval by resampling the tiles of both together.
+    """
+    found = {}
+    for name, key, scale, column in (
+        ("epe_px", "filled_epe_px", 1, 4),  # the last: its column in Scores.sums
+        ("d1_percent", f"filled_d1_{THRESHOLD_PX:g}_px_share", 100, 5),
+    ):
+        of = {"value": scale * scores.row()[key]}
+        if first is not None:
+            sums = (
+                {t: s[0, [0, column]] for t, s in zip(x.tiles, x.sums)} for x in (first, scores)
+            )
+            paired = difference(*sums, times=SAMPLES, seed=1)
+            of |= {
+                f"less_{k}": None if paired[k] is None else scale * paired[k]
+                for k in ("value", "low", "high")
+            }
+        found[name] = {k: None if v is None else round(v, 3) for k, v in of.items()}
+    return found
 
 
 def main() -> None:
@@ -103,23 +127,33 @@ def main() -> None:
     given = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     dataset = StereoDataset("synthetic", given.dataset, "stereotruth", tuple(given.range))
-    figures: dict[str, dict[str, dict]] = {}
+    table: dict[str, dict[str, dict]] = {}
+    first: dict[str, Scores] = {}
     chosen = given.change or list(CHANGES)
-    print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>28}" for name in chosen), flush=True)
-    for method in given.method:
+    print(f"{'EPE, px / D1, %':<22}" + "".join(f"{name:>46}" for name in chosen), flush=True)
+    for number, method in enumerate(given.method):
         name, settings = parsed(method)
         if "weights" in settings:
             settings["precision"] = "bfloat16"
         matcher = make_method(name, settings, given.threads)
-        figures[name] = {}
-        print(f"{name:<22}", end="", flush=True)
+        table[name] = {}
+        lines = [f"{name:<22}", f"{'  less the first':<22}"]
         for change in chosen:
-            of = figures[name][change] = score(matcher, dataset, CHANGES[change])
-            cell = f"{of['epe_px']:.2f} / {of['d1_percent']:.1f}"
-            print(f"{cell:>28}", end="", flush=True)
-        print()
+            scores = score(matcher, dataset, CHANGES[change])
+            of = figures(scores, first.get(change))
+            table[name][change] = of
+            first.setdefault(change, scores)
+            epe, d1 = of.values()
+            lines[0] += f"{epe['value']:.2f} / {d1['value']:.1f}".rjust(46)
+            if number and epe["less_low"] is not None:  # enough tiles for an interval
+                apart = (
+                    f"{x['less_value']:+.2f} ({x['less_low']:+.2f}, {x['less_high']:+.2f})"
+                    for x in of.values()
+                )
+                lines[1] += " / ".join(apart).rjust(46)
+        print(*lines[: 2 if number else 1], sep="\n", flush=True)
     if given.json:
-        given.json.write_text(json.dumps(figures, indent=2) + "\n")
+        given.json.write_text(json.dumps(table, indent=2) + "\n")
 
 
 if __name__ == "__main__":

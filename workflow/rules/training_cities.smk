@@ -55,6 +55,6 @@ rule training_cities:
         script=content_of("../scripts/training_cities.py"),
         code=source_digest("evaluation.exact_tiles"),
     message:
-        "{wildcards.count} tiles of training cities"
+        "{wildcards.tiles} tiles of training cities"
     script:
         "../scripts/training_cities.py"

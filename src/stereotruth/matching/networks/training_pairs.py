@@ -49,7 +49,8 @@ def augmented(
         offset = rng.normal(0, by.brightness, (2, 1, 1, 1)).astype(np.float32)
         images = images * factor + offset
     if by.noise:
-        images = images + np.float32(by.noise) * rng.standard_normal(images.shape, dtype=np.float32)
+        sigma = np.float32(rng.uniform(0, by.noise))
+        images = images + sigma * rng.standard_normal(images.shape, dtype=np.float32)
     return images, disparity
 
 

@@ -32,7 +32,7 @@ class Augmentation:
     """of a random offset to each image by itself"""
 
     noise: Annotated[NotNegative, Unit("standard deviations of the image")] = 0
-    """of each pixel"""
+    """of each pixel of both images, at most: each pair has its own, from 0 to this"""
 
     blur: Annotated[Share, Unit("share of the pairs")] = 0
     """one image, left or right, out of focus, by up to 2.3 px"""

@@ -155,3 +155,15 @@ def test_faults_of_images_are_planted_before_they_are_scaled(dataset: StereoData
         torch.testing.assert_close(first[2], second[2], equal_nan=True)
     faulty.epoch = 1
     assert not torch.equal(faulty[0][0], second[0]) or not torch.equal(faulty[0][1], second[1])
+
+
+def test_each_pair_has_its_own_noise_up_to_the_most(dataset: StereoDataset) -> None:
+    clean = LabelledPairs.of(dataset, "train", crops_per_pair=30)
+    noisy = replace(clean, augmentation=Augmentation(noise=0.4))
+    found = []
+    for k in range(len(clean)):
+        left, right = (a - b for a, b in zip(noisy[k][:2], clean[k][:2]))
+        assert float(left.std()) == pytest.approx(float(right.std()), rel=0.05)
+        found.append(float(left.std()))
+    assert max(found) < 0.42 and min(found) < 0.04 and max(found) > 0.36
+    assert np.mean(found) == pytest.approx(0.2, abs=0.05)  # 90 draws from 0 to 0.4: 0.012
