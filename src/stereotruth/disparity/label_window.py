@@ -32,7 +32,7 @@ from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
 from .pixel_points import Collection, PixelPoints
 from .point_windows import Box, Reach
 from .scene_inputs import SceneInputs
-from .seen_surface import seen_surface
+from .seen_surface import MAX_COVER_PX, seen_surface
 from .settings import Settings
 from .smooth_triangles import ground_surface
 from .status import WATER_CLASS, Status, is_labelled
@@ -112,7 +112,8 @@ def _on_surface(
     surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell)
     between = surface_between(surface, local, first, points.shape, px_per_m)
     paper = settings.representative == "paper"
-    labels, status = between_labels(between, own, left, right, first, keep_own=paper)
+    porous = scene.scale.distance_px > MAX_COVER_PX / 2.0
+    labels, status = between_labels(between, own, left, right, first, paper, porous)
     status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
     if settings.edge_margin_px > 0.0:
         status[is_labelled(status) & edge] = Status.EDGE_IN_PIXEL

@@ -152,7 +152,8 @@ def test_without_fill_labels_are_those_of_pixels_with_points(box) -> None:
     assert np.isnan(bare["disparity"].values[~measured]).all()
 
 
-def test_points_behind_the_seen_surface_are_no_edge() -> None:
+@pytest.mark.parametrize("porous", [True, False])
+def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(porous) -> None:
     """A roof over sparse ground points: these are hidden by it, those before it are not."""
     shape = (8, 8)
     level, zeros = np.full(shape, 10.0), np.zeros(shape)
@@ -172,11 +173,11 @@ def test_points_behind_the_seen_surface_are_no_edge() -> None:
     own = Labels(points, np.zeros((2, *shape)), zeros)
     left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
     right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
-    labels, status = between_labels(between, own, left, right, (4, 12))
+    labels, status = between_labels(between, own, left, right, (4, 12), porous=porous)
     assert list(status[2, 2:5]) == [
         Status.LABELLED,
-        Status.LABELLED_BETWEEN,
+        Status.LABELLED_BETWEEN if porous else Status.EDGE_IN_PIXEL,
         Status.EDGE_IN_PIXEL,
     ]
-    assert labels.disparity[2, 2:4] == pytest.approx([10.2, 10.0])
-    assert np.isnan(labels.disparity[2, 4])
+    assert labels.disparity[2, 2] == pytest.approx(10.2)
+    assert np.isfinite(labels.disparity[2, 2:5]).tolist() == [True, porous, False]
