@@ -41,6 +41,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "",
         "errors",
         "job",
+        "kernels",
         "products",
         "products.files",
         "products.grids",
