@@ -7,7 +7,7 @@ images, with nothing that refines it. Everything is made once, and found again b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -103,6 +103,26 @@ class Condition:
         return [folder / image.name for image in images]
 
 
+def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], folder: Path) -> None:
+    """Align a pair, refine that by the points if there are any, and rectify it.
+
+    Makes ``epipolar.json``, ``left.zarr`` and ``right.zarr`` in the folder.
+    """
+    alignment = align(*images, gcps)
+    if stores:
+        alignment, _ = refine(alignment, *images, stores)
+    model = epipolar_model(alignment)
+    with open_pair(*images) as opened:
+        rectify(
+            *opened,
+            model,
+            folder / "epipolar.json",
+            *(folder / f"{view}.zarr" for view in VIEWS),
+            workers=1,
+            left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
+        )
+
+
 CONDITIONS = {
     "plain": Condition(),
     "exact": Condition(exact_gcps=True, refined=False),
@@ -151,19 +171,7 @@ class Pair:
         simulate_points(self.city, self.spec, *tables, seed=SEED)
         images = condition.images(self, folder)
         gcps = tables[1] if condition.exact_gcps else tables[0]
-        alignment = align(*images, gcps, scene=self.name)
-        if condition.refined:
-            alignment, _ = refine(alignment, *images, self.points)
-        model = epipolar_model(alignment)
-        with open_pair(*images) as opened:
-            rectify(
-                *opened,
-                model,
-                folder / "epipolar.json",
-                *(folder / f"{view}.zarr" for view in VIEWS),
-                workers=1,
-                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
-            )
+        rectify_pair(images, gcps, self.points if condition.refined else [], folder)
         for image in images:
             if image.parent == folder:
                 image.unlink()

@@ -12,15 +12,10 @@ from pathlib import Path
 import laspy
 import numpy as np
 from label_tables import print_table, shown
+from synthetic_pairs import VIEWS, rectify_pair
 
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.align import align
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
-from stereotruth.alignment.refine import refine
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.settings import Settings
-from stereotruth.epipolar.image_reader import open_pair
-from stereotruth.epipolar.rectify import rectify
 from stereotruth.evaluation.checkpoints import evaluate_checkpoints
 from stereotruth.lidar.ingest import ingest
 from stereotruth.products.files import whole_folder
@@ -43,21 +38,12 @@ def thinned(scene: Path, every: int, folder: Path) -> list[Path]:
 
 def rectified(scene: Path, stores: list[Path], folder: Path) -> list[Path]:
     """The rectified pair, aligned by control points and these points."""
-    images = [scene / f"{view}.tif" for view in ("left", "right")]
     made = folder / "rectified"
     if not made.is_dir():
-        alignment, _ = refine(align(*images, scene / "gcps.csv"), *images, stores)
-        model = epipolar_model(alignment)
-        with whole_folder(made) as scratch, open_pair(*images) as pair:
-            rectify(
-                *pair,
-                model,
-                None,
-                *(scratch / f"{image.stem}.zarr" for image in images),
-                workers=1,
-                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
-            )
-    return [made / f"{image.stem}.zarr" for image in images]
+        images = [scene / f"{view}.tif" for view in VIEWS]
+        with whole_folder(made) as scratch:
+            rectify_pair(images, scene / "gcps.csv", stores, scratch)
+    return [made / f"{view}.zarr" for view in VIEWS]
 
 
 def main() -> None:

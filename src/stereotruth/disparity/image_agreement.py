@@ -56,7 +56,7 @@ def apart_from_steps(disparity: Floats) -> Bools:
     """Pixels [h, w] whose neighbours all have a disparity within SURFACE_PX of theirs."""
     rows, cols = disparity.shape
     around = np.pad(disparity, 1, constant_values=np.nan)
-    out = np.isfinite(disparity)
+    out = np.ones(disparity.shape, np.bool_)
     for down in range(3):
         for across in range(3):
             near = around[down : down + rows, across : across + cols]

@@ -112,6 +112,7 @@ def _on_surface(
     surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell)
     between = surface_between(surface, local, first, points.shape, px_per_m)
     paper = settings.representative == "paper"
+    # less than two distances of points around a hidden one are looked at for what covers it
     porous = scene.scale.distance_px > MAX_COVER_PX / 2.0
     labels, status = between_labels(between, own, left, right, first, paper, porous)
     status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
