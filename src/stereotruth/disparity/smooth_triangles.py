@@ -49,6 +49,9 @@ SUPPORT = 2
 # Trees and huts of fewer pixels are told by the images: where points are farther apart than this,
 # a label between them needs a higher correlation.
 NOTICED_PX = 1.5
+# Crowns are domes: a triangle no higher than this (less where points are sparse: Scale.trust) whose
+# neighbours' far vertices all lie on its plane or below is a part of one, however steeply these fall.
+DOME_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -216,6 +219,33 @@ def _joined(
 
 
 @kernel
+def _domed(
+    x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, radius: Floats, smooth: float,
+    step: float, height: float,
+) -> Bools:  # fmt: skip
+    """Triangles no higher than ``height`` around which all falls away."""
+    out = np.zeros(len(corner), np.bool_)
+    for t in range(len(corner)):
+        a, b, c = corner[t]
+        low, high = min(h[a], h[b], h[c]), max(h[a], h[b], h[c])
+        if radius[t] > smooth or high - low > height:
+            continue
+        gx, gy, _ = _gradient(x, y, h, a, b, c)
+        good = True
+        for i in range(3):
+            u = neighbour[t, i]
+            if u < 0:
+                good = False
+                break
+            far = corner[u, 0] + corner[u, 1] + corner[u, 2] - a - b - c + corner[t, i]
+            if _misfit(x, y, h, a, far, gx, gy) > step:
+                good = False
+                break
+        out[t] = good
+    return out
+
+
+@kernel
 def _squares(
     x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
@@ -301,6 +331,8 @@ def ground_surface(
     smooth = _joined(x, y, h, corner, radius, firm, start, around, scale.smooth, step)
     beside = triangles.neighbour
     smooth &= np.where(beside >= 0, smooth[beside], False).sum(axis=1) >= SUPPORT
+    height = scale.trust * DOME_PX / STEP_PX * step
+    smooth |= _domed(x, y, h, corner, beside, radius, scale.smooth, step, height)
     total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
