@@ -246,7 +246,7 @@ def project_scene(
         100.0 * summary["labelled_share"],
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )
-    if settings.images_window > 1 and summary["labelled_share"] < 0.4:
+    if settings.method in ("correlation", "both") and summary["labelled_share"] < 0.4:
         log.warning(
             "only %.0f %% of the pixels with points are seen alike in both images: check the "
             "vertical datum of the LiDAR (geoid in scenes.tsv), its CRS and the GCP residuals",

@@ -106,8 +106,8 @@ class Settings(Representative, Occlusion):
 
     @property
     def images_window(self) -> int:
-        """Side in px of the window that the method compares in both images; 1 for none."""
-        return self.window if self.method in ("correlation", "both") else 1
+        """Side in px of the window that both images must hold around a label; 1: its pixel."""
+        return self.window if self.method == "correlation" else 1
 
     @property
     def margin(self) -> int:

@@ -220,10 +220,11 @@ def _joined(
 
 @kernel
 def _domed(
-    x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, radius: Floats, smooth: float,
-    step: float, height: float,
+    x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, radius: Floats, slopes: Floats,
+    smooth: float, step: float, height: float,
 ) -> Bools:  # fmt: skip
-    """Triangles no higher than ``height`` around which all falls away."""
+    """Triangles no higher than ``height`` of a dome: all around lies on their planes or below, and
+    they on or below the slopes of each vertex."""
     out = np.zeros(len(corner), np.bool_)
     for t in range(len(corner)):
         a, b, c = corner[t]
@@ -238,9 +239,13 @@ def _domed(
                 good = False
                 break
             far = corner[u, 0] + corner[u, 1] + corner[u, 2] - a - b - c + corner[t, i]
+            v = corner[t, i]
             if _misfit(x, y, h, a, far, gx, gy) > step:
                 good = False
-                break
+            for k in range(1, 3):
+                w = corner[t, (i + k) % 3]
+                if not _misfit(x, y, h, v, w, slopes[v, 0], slopes[v, 1]) <= step:
+                    good = False
         out[t] = good
     return out
 
@@ -332,7 +337,7 @@ def ground_surface(
     beside = triangles.neighbour
     smooth &= np.where(beside >= 0, smooth[beside], False).sum(axis=1) >= SUPPORT
     height = scale.trust * DOME_PX / STEP_PX * step
-    smooth |= _domed(x, y, h, corner, beside, radius, scale.smooth, step, height)
+    smooth |= _domed(x, y, h, corner, beside, radius, slopes, scale.smooth, step, height)
     total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
