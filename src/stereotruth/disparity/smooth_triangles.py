@@ -2,7 +2,8 @@
 
 A triangle is *smooth* if its heights follow the gradient that the surface has at each of its
 vertices (the gentlest of the triangles there), or the plane of such a triangle beside it (creases,
-ridges) within STEP_PX, and if SUPPORT of its neighbours do, too. Every other one spans a *step*.
+ridges) within STEP_PX, and if SUPPORT of its neighbours do, too; or if it is part of a dome (a
+crown), that falls away from those planes to all sides. Every other one spans a *step*.
 
 Thresholds are px of disparity, multiples of the mean distance of points, or cells of half a pixel.
 Everything follows from the triangles around a place alone; results have the same bytes for any
@@ -49,9 +50,9 @@ SUPPORT = 2
 # Trees and huts of fewer pixels are told by the images: where points are farther apart than this,
 # a label between them needs a higher correlation.
 NOTICED_PX = 1.5
-# Crowns are domes: a triangle no higher than this (less where points are sparse: Scale.trust) whose
-# neighbours' far vertices all lie on its plane or below is a part of one, however steeply these fall.
-DOME_PX = 2.0
+# Crowns bulge: all around lies below their planes, however steeply it falls, while at the foot of a
+# step it rises. A triangle of a dome is no higher than this, less where points are sparse (trust).
+DOME_PX = 3.0
 
 
 @dataclass(frozen=True)
@@ -223,29 +224,30 @@ def _domed(
     x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, radius: Floats, slopes: Floats,
     smooth: float, step: float, height: float,
 ) -> Bools:  # fmt: skip
-    """Triangles no higher than ``height`` of a dome: all around lies on their planes or below, and
-    they on or below the slopes of each vertex."""
+    """Triangles no higher than ``height`` that bulge: what is beside them lies on their planes or
+    below, and their vertices on the slopes of each other or below, by ``step`` at most above."""
     out = np.zeros(len(corner), np.bool_)
     for t in range(len(corner)):
         a, b, c = corner[t]
         low, high = min(h[a], h[b], h[c]), max(h[a], h[b], h[c])
-        if radius[t] > smooth or high - low > height:
+        good = radius[t] <= smooth and high - low <= height
+        for v, w, u in ((a, b, c), (b, c, a), (c, a, b)):
+            if not good:
+                break
+            for other in (w, u):
+                if not _misfit(x, y, h, v, other, slopes[v, 0], slopes[v, 1]) <= step:
+                    good = False
+        if not good:
             continue
         gx, gy, _ = _gradient(x, y, h, a, b, c)
-        good = True
         for i in range(3):
             u = neighbour[t, i]
             if u < 0:
                 good = False
                 break
             far = corner[u, 0] + corner[u, 1] + corner[u, 2] - a - b - c + corner[t, i]
-            v = corner[t, i]
             if _misfit(x, y, h, a, far, gx, gy) > step:
                 good = False
-            for k in range(1, 3):
-                w = corner[t, (i + k) % 3]
-                if not _misfit(x, y, h, v, w, slopes[v, 0], slopes[v, 1]) <= step:
-                    good = False
         out[t] = good
     return out
 
