@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from .image_agreement import apart_from_steps, outvoted, outvoted_nearby, warp_to_left
+from .image_agreement import (
+    apart_from_steps,
+    beside_changes,
+    outvoted,
+    outvoted_nearby,
+    usual_correlation,
+    warp_to_left,
+)
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .open_pixels import surfaces_by_images
@@ -302,10 +309,13 @@ def _test_agreement(
     clear = apart_from_steps(labels.disparity)
     found = surface_correlation(shown, warped, *surface, settings.window, clear)
     changed = outvoted(found, *surface, settings.correlation_threshold)
+    trust = scene.scale.trust
+    unchanged = np.where(changed, np.nan, found)
+    usual = usual_correlation(unchanged, *surface, settings.correlation_threshold, trust)
     if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
-        limits = settings.correlation_threshold, scene.scale.trust
-        changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
+        changed |= is_labelled(status) & outvoted_nearby(found, *surface, usual, trust)
+    changed |= is_labelled(status) & beside_changes(changed, found, usual)
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
     return found

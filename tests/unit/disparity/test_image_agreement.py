@@ -7,9 +7,11 @@ import pytest
 
 from stereotruth.disparity.image_agreement import (
     apart_from_steps,
+    beside_changes,
     outvoted,
     outvoted_nearby,
     surface_mean,
+    usual_correlation,
     warp_to_left,
 )
 from stereotruth.disparity.image_patches import read_patch
@@ -125,7 +127,8 @@ def test_what_is_small_is_told_by_what_is_usual_around_it(noise, size, trust) ->
     level = np.zeros((80, 80))
     correlation = surface_correlation(left, warped, level, LEVEL, 9)
     assert not outvoted(correlation, level, LEVEL, 0.5).any()
-    found = outvoted_nearby(correlation, level, LEVEL, 0.5, trust)
+    usual = usual_correlation(correlation, level, LEVEL, 0.5, trust)
+    found = outvoted_nearby(correlation, level, LEVEL, usual, trust)
     assert found[38:42, 38:42].all()
     assert not found[:24].any() and not found[:, 58:].any()
 
@@ -142,10 +145,34 @@ def test_a_roof_that_is_blurred_into_the_ground_is_no_change() -> None:
     assert not clear[:, 38:42].any() and clear[1:-1, 1:38].all() and clear[1:-1, 42:-1].all()
     warped[:, 39:41] = np.nan
     mixed = surface_correlation(left, warped, disparity, LEVEL, 9)
-    assert outvoted_nearby(mixed, disparity, LEVEL, 0.5, 1.0)[20:60, 41:44].all()
+    usual = usual_correlation(mixed, disparity, LEVEL, 0.5, 1.0)
+    assert outvoted_nearby(mixed, disparity, LEVEL, usual, 1.0)[20:60, 41:44].all()
     found = surface_correlation(left, warped, disparity, LEVEL, 9, clear)
     assert found[20:60, 41:46] == pytest.approx(1.0, abs=1e-4)
-    assert not outvoted_nearby(found, disparity, LEVEL, 0.5, 1.0).any()
+    usual = usual_correlation(found, disparity, LEVEL, 0.5, 1.0)
+    assert not outvoted_nearby(found, disparity, LEVEL, usual, 1.0).any()
+
+
+@pytest.mark.parametrize("noise", [20.0, 100.0])
+def test_the_rim_of_a_change_belongs_to_it(noise) -> None:
+    """Ground that a building hides which only the images have: its corners are outvoted by what
+    is around; no pixel counts as changed whose window holds nothing of it."""
+    left = texture((100, 100))
+    warped = left + np.random.default_rng(1).normal(0.0, noise, left.shape)
+    warped[30:70, 30:70] = texture((40, 40), seed=2)
+    level, slope = np.zeros((100, 100)), np.zeros((2, 100, 100))
+    correlation = surface_correlation(left, warped, level, slope, 9)
+    changed = outvoted(correlation, level, slope, 0.5)
+    inside = np.zeros((100, 100), np.bool_)
+    inside[30:70, 30:70] = True
+    assert changed[45:55, 45:55].all() and not changed[30:34, 30:34].any()
+    unchanged = np.where(changed, np.nan, correlation)
+    usual = usual_correlation(unchanged, level, slope, 0.5, 1.0)
+    found = changed | beside_changes(changed, correlation, usual)
+    assert (found & inside).sum() > 0.97 * inside.sum()
+    touched = np.zeros((100, 100), np.bool_)
+    touched[26:74, 26:74] = True
+    assert not (found & ~touched).any()
 
 
 def test_steps_are_told_from_slopes() -> None:
