@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..kernels import inner, kernel
 from ..lidar.lattice import CELL_BITS, LATTICE_M
 from .even_squares import REACH as EVEN_REACH
+from .ground_in_view import Window
 from .outlines import REACH, Pieces, cut_at_outlines
 from .pixel_labels import FEW_NOISE_M, HEIGHT_NOISE_M
 from .point_triangles import triangulate
@@ -286,10 +287,14 @@ class GroundSurface:
 
 
 def ground_surface(
-    vertices: Vertices, scale: Scale, px_per_m: float, cell: tuple[int, int]
+    vertices: Vertices,
+    scale: Scale,
+    px_per_m: float,
+    cell: tuple[int, int],
+    window: Window | None = None,
 ) -> GroundSurface:
     """Triangles of ``vertices``, told apart by STEP_PX; ``px_per_m``: disparity per m of height;
-    ``cell``: (lon, lat) size in lattice steps."""
+    ``cell``: (lon, lat) size in lattice steps. With a ``window``, those that it may see alone."""
     x, y, h = vertices.x, vertices.y, vertices.h_q
     triangles = triangulate(x, y, scale.swept)
     corner, radius = triangles.corner, triangles.radius
@@ -305,10 +310,14 @@ def ground_surface(
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
     plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)
+    seen = np.ones(len(corner), np.bool_)
+    if window is not None:
+        reach = REACH * scale.distance + 2.0 * scale.smooth
+        seen = window.in_view(vertices, corner, reach) | (radius > scale.smooth)
     cut, pieces = cut_at_outlines(
-        x, y, h, corner, radius, smooth, plane, scale.distance, scale.smooth, step, *floors
+        x, y, h, corner, radius, smooth, seen, plane, scale.distance, scale.smooth, step, *floors
     )
-    whole = corner[~smooth & ~cut]
+    whole, smooth = corner[~smooth & ~cut & seen], smooth & seen
     span = np.stack([h[whole].min(axis=1), h[whole].max(axis=1)], axis=1)
     vertices, faces, strips = _with_pieces(vertices, corner, pieces, cell)
     return GroundSurface(
