@@ -1,22 +1,23 @@
 """Which triangles a window's labels can follow from.
 
 The points of a window lie up to a halo around all that it shows and what may hide it, since
-triangles follow from the points around them. What is cut, drawn and projected are only those that
-may be seen in the window's pixels, from either camera: half of all, or less. A square of ground is
-in view if a surface there, at any height of the points around it, may be; a triangle if it touches
-such a square.
+triangles follow from the points around them, and the box of these holds more: low ground where
+only a tower would hide something. A square of ground is in view if a surface there, at any height
+of the points around it, may be seen in the window's pixels from either camera. Triangles are made
+of the points in the halo of such squares; of the triangles, those that touch a square in view are
+cut at outlines, projected and drawn: half of all, or less.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inner, kernel
 from .local_projection import LocalProjection
-from .vertices import PART, PART_BITS, Vertices
+from .vertices import PART_BITS, Vertices
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -80,66 +81,97 @@ def _touching(x: Ints, y: Ints, corner: Steps, squares: Bools) -> Bools:
     return out
 
 
+@kernel
+def _inside(x: Ints, y: Ints, squares: Bools) -> Bools:
+    """Which vertices lie in one of the ``squares``."""
+    out = np.empty(x.size, np.bool_)
+    for k in range(x.size):
+        out[k] = squares[y[k] >> SQUARE_BITS, x[k] >> SQUARE_BITS]
+    return out
+
+
 @dataclass(frozen=True, eq=False)
-class Window:
-    """A window of ``shape`` (rows, cols) whose first pixel is (row, col) ``first``, and what
-    projects the ground into both images there; ``cell``: (lon, lat) size in lattice steps."""
+class GroundInView:
+    """``squares`` [rows, cols] of the ground, from the vertices' origin, that a window may see."""
 
-    local: LocalProjection
-    first: tuple[int, int]
-    shape: tuple[int, int]
-    cell: tuple[int, int]
+    squares: Bools
 
-    def in_view(self, vertices: Vertices, corner: Steps, reach: float) -> Bools:
-        """Which triangles [m, 3] of ``vertices`` this window may see, from either camera.
+    @classmethod
+    def of(
+        cls,
+        vertices: Vertices,
+        reach: float,
+        local: LocalProjection,
+        first: tuple[int, int],
+        shape: tuple[int, int],
+        cell: tuple[int, int],
+    ) -> GroundInView:
+        """Of a window of ``shape`` (rows, cols) whose first pixel is (row, col) ``first``.
 
-        Their surfaces may be as high as any vertex up to ``reach`` (parts of a cell) from the
-        middle of a triangle, and no triangle is wider.
+        Surfaces may be as high as any of the ``vertices`` up to ``reach`` (parts of a cell) away.
+        ``local`` projects all that lies in the box of the vertices; ``cell``: (lon, lat) size in
+        lattice steps.
         """
-        if vertices.x.size == 0 or len(corner) == 0:
-            return np.zeros(len(corner), np.bool_)
-        grid = tuple((int(v.max()) >> SQUARE_BITS) + 1 for v in (vertices.y, vertices.x))
+        grid = tuple((int(v.max(initial=0)) >> SQUARE_BITS) + 1 for v in (vertices.y, vertices.x))
         far = np.iinfo(np.int64).max
         low, high = np.full(grid, far), np.full(grid, -far)
         _ranges(vertices.x, vertices.y, vertices.h_q, low, high)
         around = (int(reach) >> SQUARE_BITS) + 1
         low, high = -_greatest_around(-low, around), _greatest_around(high, around)
         squares = high >= low
-        squares[squares] = self._seen(vertices, *np.nonzero(squares), low[squares], high[squares])
-        return _touching(vertices.x, vertices.y, corner, squares)
+        if squares.any():
+            places = _corners(vertices, cell, *np.nonzero(squares), low[squares], high[squares])
+            xy = local.at_points(*places).reshape(4, 8, -1)
+            squares[squares] = _seen(xy, first, shape)
+        return cls(squares)
 
-    def _seen(self, vertices: Vertices, row: Ints, col: Ints, low: Ints, high: Ints) -> Bools:
-        """Which squares [n] this window may see between two heights."""
-        lattice = []
-        parts = col, row
-        for k, (place, q) in enumerate(
-            ((vertices.x, vertices.lon_q), (vertices.y, vertices.lat_q))
-        ):
-            edges = np.stack([parts[k], parts[k] + 1]) * ((1 << SQUARE_BITS) // PART * self.cell[k])
-            edges += q[0] - (place[0] * self.cell[k] >> PART_BITS)
-            # the projection knows the places of points alone
-            lattice.append(np.clip(edges, q.min(), q.max()))
-        corners = [
-            (lattice[0][i], lattice[1][j], height)
+    def touching(self, vertices: Vertices, corner: Steps) -> Bools:
+        """Which triangles [m, 3] may be seen."""
+        return _touching(vertices.x, vertices.y, corner, self.squares)
+
+    def with_halo(self, vertices: Vertices, halo: int) -> Vertices:
+        """The vertices up to ``halo`` cells around all that may be seen."""
+        around = (halo >> (SQUARE_BITS - PART_BITS)) + 1
+        wide = _greatest_around(self.squares.astype(np.int64), around) > 0
+        kept = _inside(vertices.x, vertices.y, wide)
+        return Vertices(*(getattr(vertices, f.name)[kept] for f in fields(Vertices)))
+
+
+def _corners(
+    vertices: Vertices, cell: tuple[int, int], row: Ints, col: Ints, low: Ints, high: Ints
+) -> Ints:
+    """Lattice coordinates [3, 8 n] of the corners of squares at two heights."""
+    edges = []
+    for part, q, place, step in (
+        (col, vertices.lon_q, vertices.x, cell[0]),
+        (row, vertices.lat_q, vertices.y, cell[1]),
+    ):
+        at = np.stack([part, part + 1]) * (step << (SQUARE_BITS - PART_BITS))
+        at += q[0] - (place[0] * step >> PART_BITS)
+        # the projection knows the places of points alone
+        edges.append(np.clip(at, q.min(), q.max()))
+    return np.hstack(
+        [
+            np.stack([edges[0][i], edges[1][j], height])
             for i in range(2)
             for j in range(2)
             for height in (low, high)
         ]
-        places = np.hstack([np.stack(each) for each in corners])
-        xy = self.local.at_points(*places).reshape(4, 8, -1)
-        disparity = xy[0] - xy[2]
-        xy = np.where(np.isfinite(xy), xy, np.nan)
-        least, most = xy.min(axis=1) - SPARE_PX, xy.max(axis=1) + SPARE_PX
-        (top, side), (rows, cols) = self.first, self.shape
-        unknown = np.isnan(least).any(axis=0)
-        with np.errstate(invalid="ignore"):
-            in_left = (least[0] <= side + cols - 1) & (most[0] >= side)
-            in_left &= (least[1] <= top + rows - 1) & (most[1] >= top)
-            known = in_left & ~unknown
-            if not known.any():
-                return in_left | unknown
-            shift = disparity[:, known]
-            in_right = least[2] <= side + cols - 1 - shift.min() + DRAWN_OUT_PX
-            in_right &= most[2] >= side - shift.max() - DRAWN_OUT_PX
-            in_right &= (least[3] <= top + rows - 1) & (most[3] >= top)
-        return in_left | in_right | unknown
+    )
+
+
+def _seen(xy: Floats, first: tuple[int, int], shape: tuple[int, int]) -> Bools:
+    """Which squares a window may see, by the places ``xy`` [4, 8, n] of their corners (px)."""
+    (top, side), (rows, cols) = first, shape
+    unknown = ~np.isfinite(xy).all(axis=(0, 1))
+    disparity = xy[0] - xy[2]
+    least, most = xy.min(axis=1) - SPARE_PX, xy.max(axis=1) + SPARE_PX
+    with np.errstate(invalid="ignore"):
+        in_rows = (least[[1, 3]] <= top + rows - 1) & (most[[1, 3]] >= top)
+        in_left = in_rows[0] & (least[0] <= side + cols - 1) & (most[0] >= side)
+        shift = disparity[:, in_left & ~unknown]
+        if shift.size == 0:
+            return in_left | unknown
+        nearest, farthest = shift.max() + DRAWN_OUT_PX, shift.min() - DRAWN_OUT_PX
+        in_right = (least[2] <= side + cols - 1 - farthest) & (most[2] >= side - nearest)
+    return in_left | (in_rows[1] & in_right) | unknown

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from .ground_in_view import Window as GroundWindow
+from .ground_in_view import GroundInView
 from .image_agreement import apart_from_steps, outvoted, outvoted_nearby, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
@@ -110,8 +110,9 @@ def _on_surface(
     pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
     enough = pixels.count >= max(settings.min_points, 1)
     own = _labels(scene, pixels, enough, wide)
-    window = GroundWindow(local, first, points.shape, scene.rays.cell)
-    surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell, window)
+    cell = scene.rays.cell
+    view = GroundInView.of(vertices, scene.scale.width, local, first, points.shape, cell)
+    surface = ground_surface(vertices, scene.scale, px_per_m, cell, view)
     between = surface_between(surface, local, first, points.shape, px_per_m)
     paper = settings.representative == "paper"
     # less than two distances of points around a hidden one are looked at for what covers it

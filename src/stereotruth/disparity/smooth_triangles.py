@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..kernels import inner, kernel
 from ..lidar.lattice import CELL_BITS, LATTICE_M
 from .even_squares import REACH as EVEN_REACH
-from .ground_in_view import Window
+from .ground_in_view import GroundInView
 from .outlines import REACH, Pieces, cut_at_outlines
 from .pixel_labels import FEW_NOISE_M, HEIGHT_NOISE_M
 from .point_triangles import triangulate
@@ -69,6 +69,11 @@ class Scale:
     smooth: float
     swept: float
     halo: int
+
+    @property
+    def width(self) -> float:
+        """Parts of a cell between a place of a triangle and any point that tells heights there."""
+        return max(REACH * self.distance + 2.0 * self.smooth, 2.0 * self.swept)
 
     @property
     def distance_px(self) -> float:
@@ -291,10 +296,12 @@ def ground_surface(
     scale: Scale,
     px_per_m: float,
     cell: tuple[int, int],
-    window: Window | None = None,
+    view: GroundInView | None = None,
 ) -> GroundSurface:
     """Triangles of ``vertices``, told apart by STEP_PX; ``px_per_m``: disparity per m of height;
-    ``cell``: (lon, lat) size in lattice steps. With a ``window``, those that it may see alone."""
+    ``cell``: (lon, lat) size in lattice steps. With a ``view``, those in it alone."""
+    if view is not None:
+        vertices = view.with_halo(vertices, scale.halo)
     x, y, h = vertices.x, vertices.y, vertices.h_q
     triangles = triangulate(x, y, scale.swept)
     corner, radius = triangles.corner, triangles.radius
@@ -311,9 +318,8 @@ def ground_surface(
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
     plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)
     seen = np.ones(len(corner), np.bool_)
-    if window is not None:
-        reach = REACH * scale.distance + 2.0 * scale.smooth
-        seen = window.in_view(vertices, corner, reach) | (radius > scale.smooth)
+    if view is not None:
+        seen = view.touching(vertices, corner)
     cut, pieces = cut_at_outlines(
         x, y, h, corner, radius, smooth, seen, plane, scale.distance, scale.smooth, step, *floors
     )
