@@ -21,7 +21,7 @@ GAP = 4.6  # points expected in an area that is empty with a chance of 1 %
 STEEPEST = 1.2  # slope of an edge against its first guess
 CORNERS = 24  # of the polygon of feasible lines at most
 STATES = 64  # polygons that are kept while they are clipped
-RINGS = 4  # of points that are sorted at once, each twice as far along as the one before
+RINGS = 32  # by which points are sorted
 
 
 @inner
@@ -67,96 +67,69 @@ def _clipped(
     return n
 
 
+@inlined
+def _by_distance(v: Floats, n: int, reach: float, start: Steps, order: Steps) -> None:
+    """Numbers of the points by growing |v|, to ``order`` [n]: by rings, ``start`` [RINGS + 1], then
+    by insertion."""
+    start[:] = 0
+    scale = RINGS / reach
+    for i in range(n):
+        start[min(np.int64(abs(v[i]) * scale), RINGS - 1) + 1] += 1
+    for ring in range(RINGS):
+        start[ring + 1] += start[ring]
+    for i in range(n):
+        ring = min(np.int64(abs(v[i]) * scale), RINGS - 1)
+        order[start[ring]] = i
+        start[ring] += 1
+    for at in range(1, n):
+        i, k = order[at], at
+        far = abs(v[i])
+        while k > 0 and abs(v[order[k - 1]]) > far:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+
+
 @inner
 def _feasible(
-    u: Floats, v: Floats, high: Bools, n: int, s: int, reach: float, band: float, slack: float,
-    limit: Floats, lines: Floats, size: Steps, taken: Floats, left: Steps, order: Steps,
-    value: Floats,
+    u: Floats, v: Floats, high: Bools, order: Steps, n: int, s: int, band: float, slack: float,
+    limit: Floats, lines: Floats, size: Steps, taken: Floats, value: Floats,
 ) -> int:  # fmt: skip
     """The lines u = a + b v with low points at smaller and high ones at greater u.
 
-    Points are taken by growing |v| to both sides, up to ``limit`` [2] (v < 0, v >= 0). The first
-    that no line fits ends its side there: ``limit`` is set to its |v|. Polygon ``s`` of ``lines``
-    [STATES + 1, 2, CORNERS] is clipped by the points beyond ``taken[s]``, and what is left of it is
-    the next one, whose last point lies ``taken`` far along. Returns the number of the last one.
-
-    Ring by ring: a point that is far from all lines that are left stays so, and is neither sorted
-    nor looked at again. ``left``, ``order``, ``value`` [n] are room to work in.
+    Points are taken in ``order``, by growing |v| to both sides, up to ``limit`` [2] (v < 0,
+    v >= 0). The first that no line fits ends its side there: ``limit`` is set to its |v|. Polygon
+    ``s`` of ``lines`` [STATES + 1, 2, CORNERS] is clipped by the points beyond ``taken[s]``, and
+    what is left of it is the next one, whose last point lies ``taken`` far along. Returns the
+    number of the last one. ``value`` [CORNERS] is room to work in.
     """
-    m = size[s]
-    least_a, most_a, least_b, most_b = np.inf, -np.inf, np.inf, -np.inf
-    for j in range(m):
-        least_a, most_a = min(least_a, lines[s, 0, j]), max(most_a, lines[s, 0, j])
-        least_b, most_b = min(least_b, lines[s, 1, j]), max(most_b, lines[s, 1, j])
-    for i in range(n):
-        left[i] = i
-    remaining, first = n, taken[s]
-    ring = reach / (1 << (RINGS - 1))
-    while remaining:
-        if ring >= reach:
-            ring = np.inf
-        kept = 0
-        for at in range(remaining):  # without branches, which the processor could not foretell
-            i = left[at]
-            far = abs(v[i])
-            # most points are far from all lines that are left
-            lowest = least_a + min(least_b * v[i], most_b * v[i])
-            topmost = most_a + max(least_b * v[i], most_b * v[i])
-            low = (lowest < u[i] - slack) & (u[i] <= topmost + band)
-            top = (topmost > u[i] + slack) & (u[i] >= lowest - band)
-            left[kept] = i
-            kept += (far > first) & (top if high[i] else low)
-        remaining, kept = kept, 0
-        ready = 0
-        for at in range(remaining):
-            i = left[at]
-            far = abs(v[i])
-            if far > ring:
-                left[kept] = i
-                kept += 1
-                continue
-            k = ready
-            while k > 0 and abs(v[order[k - 1]]) > far:
-                order[k] = order[k - 1]
-                k -= 1
-            order[k] = i
-            ready += 1
-        remaining = kept
-        ring *= 2.0
-        for at in range(ready):
-            i = order[at]
-            side = 1 if v[i] >= 0.0 else 0
-            if abs(v[i]) > limit[side]:
-                continue
-            low, top = np.inf, -np.inf
-            for j in range(m):
-                value[j] = lines[s, 0, j] + lines[s, 1, j] * v[i]
-                low, top = min(low, value[j]), max(top, value[j])
-            if u[i] < low - band or u[i] > top + band:
-                continue
-            if high[i]:  # a + b v <= u + slack
-                if top <= u[i] + slack:
-                    continue
-                found = _clipped(lines, s, m, s + 1, value, 1.0, u[i] + slack)
-            else:
-                if low >= u[i] - slack:
-                    continue
-                found = _clipped(lines, s, m, s + 1, value, -1.0, slack - u[i])
-            if found < 3:
-                limit[side] = abs(v[i])
-                continue
-            m = min(found, CORNERS - 4)
-            least_a, most_a, least_b, most_b = np.inf, -np.inf, np.inf, -np.inf
-            new = s + 1
-            if new == STATES:  # none is kept beyond
-                new = s
-            for j in range(m):
-                a, b = lines[s + 1, 0, j], lines[s + 1, 1, j]
-                lines[new, 0, j], lines[new, 1, j] = a, b
-                least_a, most_a = min(least_a, a), max(most_a, a)
-                least_b, most_b = min(least_b, b), max(most_b, b)
-            s = new
-            size[s], taken[s] = m, abs(v[i])
+    m, first = size[s], taken[s]
+    for at in range(n):
+        i = order[at]
+        far = abs(v[i])
+        low, top = np.inf, -np.inf
+        for j in range(m):
+            here = lines[s, 0, j] + lines[s, 1, j] * v[i]
+            value[j] = here
+            low, top = min(low, here), max(top, here)
+        # most points bound none of the lines that are left
+        bounds_low = (low < u[i] - slack) & (u[i] <= top + band)
+        bounds_high = (top > u[i] + slack) & (u[i] >= low - band)
+        side = 1 if v[i] >= 0.0 else 0
+        known = (far <= first) | (far > limit[side])
+        if known | (not (bounds_high if high[i] else bounds_low)):
+            continue
+        sign = 1.0 if high[i] else -1.0
+        found = _clipped(lines, s, m, s + 1, value, sign, sign * u[i] + slack)
+        if found < 3:
+            limit[side] = far
+            continue
+        m = min(found, CORNERS - 4)
+        new = s + 1 if s + 1 < STATES else s  # none is kept beyond
+        for j in range(m if new == s else 0):
+            lines[new, 0, j], lines[new, 1, j] = lines[s + 1, 0, j], lines[s + 1, 1, j]
+        s = new
+        size[s], taken[s] = m, far
     return s
 
 
@@ -205,23 +178,23 @@ def _no_gap(
 def line_between(
     u: Floats, v: Floats, high: Bools, n: int, extent: float, reach: float, distance: float,
     band: float, slack: float, limit: Floats, lines: Floats, size: Steps, taken: Floats,
-    left: Steps, order: Steps, value: Floats,
+    value: Floats, order: Steps, start: Steps,
 ) -> int:  # fmt: skip
     """The lines between ``n`` low and high points, as the corners (a, b) of a polygon.
 
     Returns its number among ``lines`` [STATES + 1, 2, CORNERS]; it has ``size`` [STATES + 1]
     corners, three at least. Points up to ``reach`` along count, ``band`` off and with ``slack`` in
     their place; ``limit`` [2] takes how far along either way the lines hold. |a| <= ``extent``.
-    ``taken`` [STATES + 1], ``left``, ``order`` [n], ``value`` [CORNERS] are room to work in.
+    ``taken`` [STATES + 1], ``value`` [CORNERS], ``order`` [n], ``start`` [RINGS + 1] are room to
+    work in.
     """
     for j in range(4):
         lines[0, 0, j] = extent if j == 1 or j == 2 else -extent
         lines[0, 1, j] = STEEPEST if j > 1 else -STEEPEST
     size[0], taken[0] = 4, -1.0
     limit[:] = reach
-    s = _feasible(
-        u, v, high, n, 0, reach, band, slack, limit, lines, size, taken, left, order, value
-    )  # fmt: skip
+    _by_distance(v, n, reach, start, order)
+    s = _feasible(u, v, high, order, n, 0, band, slack, limit, lines, size, taken, value)
     if limit[0] < reach or limit[1] < reach:
         for side in range(2):
             if limit[side] < reach:
@@ -229,7 +202,5 @@ def line_between(
         # as far as the points of both sides still count, nothing changes
         while s > 0 and taken[s] > min(limit[0], limit[1]):
             s -= 1
-        s = _feasible(
-            u, v, high, n, s, reach, band, slack, limit, lines, size, taken, left, order, value
-        )  # fmt: skip
+        s = _feasible(u, v, high, order, n, s, band, slack, limit, lines, size, taken, value)
     return _no_gap(u, v, high, n, distance, limit, lines, size, s, value)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inlined, inner, kernel
-from .feasible_lines import CORNERS, STATES, STEEPEST, clip, line_between
+from .feasible_lines import CORNERS, RINGS, STATES, STEEPEST, clip, line_between
 from .vertices import PART, PART_BITS
 
 Floats = NDArray[np.float64]
@@ -289,7 +289,7 @@ def _cuts(
     which = np.empty(_MOST, np.int32)
     dx, dy = np.empty(_MOST), np.empty(_MOST)
     u, v, high = np.empty(_MOST), np.empty(_MOST), np.empty(_MOST, np.bool_)
-    left, order = np.empty(_MOST, np.int32), np.empty(_MOST, np.int32)
+    order, start = np.empty(_MOST, np.int32), np.empty(RINGS + 1, np.int32)
     lines, value = np.empty((STATES + 1, 2, CORNERS)), np.empty(CORNERS)
     size, taken, limit = np.empty(STATES + 1, np.int32), np.empty(STATES + 1), np.empty(2)
     sheet, told = np.empty((2, 3)), np.empty((2, 5))
@@ -344,8 +344,8 @@ def _cuts(
             u, v, high,
         )  # fmt: skip
         at = line_between(
-            u, v, high, m, extent, reach, distance, band, slack, limit, lines, size, taken, left,
-            order, value,
+            u, v, high, m, extent, reach, distance, band, slack, limit, lines, size, taken, value,
+            order, start,
         )  # fmt: skip
         found = size[at]
         mean_a = mean_b = 0.0
