@@ -222,6 +222,19 @@ def _joined(
 
 
 @kernel
+def _supported(smooth: Bools, neighbour: Steps) -> Bools:
+    """The smooth triangles of which SUPPORT neighbours are smooth, too."""
+    out = np.zeros(len(smooth), np.bool_)
+    for t in range(len(smooth)):
+        number = 0
+        for i in range(3):
+            u = neighbour[t, i]
+            number += u >= 0 and smooth[u]
+        out[t] = smooth[t] and number >= SUPPORT
+    return out
+
+
+@kernel
 def _squares(
     x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
@@ -311,8 +324,7 @@ def ground_surface(
     firm = _firm(x, y, h, corner, radius, slopes, scale.smooth, step)
     start, around = _incident(corner, x.size)
     smooth = _joined(x, y, h, corner, radius, firm, start, around, scale.smooth, step)
-    beside = triangles.neighbour
-    smooth &= np.where(beside >= 0, smooth[beside], False).sum(axis=1) >= SUPPORT
+    smooth = _supported(smooth, triangles.neighbour)
     total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
@@ -336,33 +348,42 @@ def ground_surface(
     )
 
 
+@kernel
+def _placed(
+    pieces: Floats, of: Steps, corner: Steps, size: int, cell: tuple[int, int], lon_q: Ints,
+    lat_q: Ints, x: Ints, y: Ints,
+) -> None:  # fmt: skip
+    """Places of the corners of ``pieces`` [n, 3, :] (x, y from the first vertex of the triangle
+    ``of`` [n]), to the elements from ``size`` on."""
+    for n in range(len(of)):
+        first = corner[of[n], 0]
+        for i in range(3):
+            k = size + 3 * n + i
+            across, along = pieces[n, i, 0], pieces[n, i, 1]
+            lon_q[k] = lon_q[first] + np.int64(np.rint(across * (cell[0] / PART)))
+            lat_q[k] = lat_q[first] + np.int64(np.rint(along * (cell[1] / PART)))
+            x[k], y[k] = x[first] + np.int64(np.rint(across)), y[first] + np.int64(np.rint(along))
+
+
 def _with_pieces(
     vertices: Vertices, corner: Steps, pieces: Pieces, cell: tuple[int, int]
 ) -> tuple[Vertices, Steps, Steps]:
     """The vertices and the corners of pieces; these [n, 3] of faces and [k, 3] of strips."""
     size = vertices.x.size
-    places = np.concatenate([pieces.faces[..., :2].reshape(-1, 2), pieces.strips.reshape(-1, 2)])
-    first = corner[np.concatenate([np.repeat(pieces.face_of, 3), np.repeat(pieces.strip_of, 3)]), 0]
-    faces = pieces.faces.shape[0] * 3
-    height = np.concatenate([pieces.faces[..., 2].reshape(-1), np.repeat(pieces.heights[:, 0], 3)])
-    height = np.rint(height).astype(np.int64)
-    anchor = np.concatenate([np.repeat(pieces.anchor, 3), first[faces:]])
-    moved = (np.rint(places[:, k] * (cell[k] / PART)).astype(np.int64) for k in (0, 1))
-    added = Vertices(
-        *(q[first] + move for q, move in zip((vertices.lon_q, vertices.lat_q), moved)),
-        height,
-        *(
-            q[first] + np.rint(places[:, k]).astype(np.int64)
-            for k, q in enumerate((vertices.x, vertices.y))
-        ),
-        vertices.surface_class[anchor],
-        np.ones(len(places), np.int32),
-    )
-    joined = Vertices(
-        *(
-            np.concatenate([getattr(vertices, f.name), getattr(added, f.name)])
-            for f in fields(Vertices)
-        )
-    )
-    index = np.arange(size, size + len(places), dtype=np.int32)
-    return joined, index[:faces].reshape(-1, 3), index[faces:].reshape(-1, 3)
+    faces, strips = 3 * len(pieces.face_of), 3 * len(pieces.strip_of)
+    joined = {}
+    for f in fields(Vertices):
+        own = getattr(vertices, f.name)
+        joined[f.name] = np.empty(size + faces + strips, own.dtype)
+        joined[f.name][:size] = own
+    places = [joined[name] for name in ("lon_q", "lat_q", "x", "y")]
+    _placed(pieces.faces, pieces.face_of, corner, size, cell, *places)
+    _placed(pieces.strips, pieces.strip_of, corner, size + faces, cell, *places)
+    height, classes = joined["h_q"][size:], joined["surface_class"][size:]
+    np.rint(pieces.faces[..., 2].reshape(-1), out=height[:faces], casting="unsafe")
+    height[faces:] = np.repeat(np.rint(pieces.heights[:, 0]), 3)
+    classes[:faces] = np.repeat(vertices.surface_class[pieces.anchor], 3)
+    classes[faces:] = np.repeat(vertices.surface_class[corner[pieces.strip_of, 0]], 3)
+    joined["count"][size:] = 1
+    index = np.arange(size, size + faces + strips, dtype=np.int32).reshape(-1, 3)
+    return Vertices(**joined), index[: faces // 3], index[faces // 3 :]
