@@ -253,12 +253,10 @@ def _collect(
             for start in range(0, len(points), BLOCK):
                 where = slice(start, start + BLOCK)
                 lattice = points.lon_q[where], points.lat_q[where], points.h_q[where]
-                collection.add(*lattice, points.classification[where], local.at_points(*lattice))
+                classes = points.classification[where]
+                collection.add(*lattice, classes, local.at_points(*lattice))
                 if vertices is not None:
-                    # Later returns of a pulse lie below what the cameras see.
-                    top = points.return_number[where] <= 1
-                    classes = points.classification[where][top]
-                    vertices.add(*(values[top] for values in lattice), classes)
+                    vertices.add(*lattice, classes, points.return_number[where])
     points = collection.sorted()
     if points.points.size == 0 and not points.outside.any():
         return None
