@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, inlined
+from ..kernels import inlined, inner
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

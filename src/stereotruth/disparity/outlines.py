@@ -135,8 +135,9 @@ def _another_surface(
     oy: float, step: float, near: float, place: Steps, slopes: Floats, which: Steps, dx: Floats,
     dy: Floats, n: int,
 ) -> tuple[int, float, bool]:  # fmt: skip
-    """One of the ``place`` nearby whose plane may be that of the ``vertices`` which are off the plane of
-    vertex ``one`` (``own`` high in the middle); its height there; whether it is the higher one.
+    """One of the ``place`` nearby whose plane may be that of the ``vertices`` which are off the
+    plane of vertex ``one`` (``own`` high in the middle); its height there; whether it is the higher
+    one.
 
     -1 if there is none.
     """
@@ -454,9 +455,9 @@ def cut_at_outlines(
     """Which triangles [m] are cut, and their parts.
 
     ``x``, ``y``, ``h`` [n]: vertices in the order of their cells; ``corner`` [m, 3], ``radius``
-    [m]: triangles, ``smooth`` [m] those on one surface; ``seen`` [m]: those that are cut; ``plane`` [n, 2]: slopes of the surface at
-    each vertex, NaN for none; ``distance``: mean one of points; ``step``: heights off a plane by
-    more are not on it; ``few``, ``least``: see :func:`.smooth_triangles.ground_surface`.
+    [m]: triangles, ``smooth`` [m] those on one surface; of the others, those ``seen`` [m] are cut;
+    ``plane`` [n, 2]: slopes of the surface at each vertex, NaN for none; ``distance``: mean one of
+    points; ``step``: heights off a plane by more are not on it; ``few``, ``least``: see :func:`.smooth_triangles.ground_surface`.
     """
     for _ in range(2):
         plane = _handed_on(x, y, h, corner, radius, plane, smooth_radius, step)
