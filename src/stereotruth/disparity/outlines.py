@@ -457,7 +457,8 @@ def cut_at_outlines(
     ``x``, ``y``, ``h`` [n]: vertices in the order of their cells; ``corner`` [m, 3], ``radius``
     [m]: triangles, ``smooth`` [m] those on one surface; of the others, those ``seen`` [m] are cut;
     ``plane`` [n, 2]: slopes of the surface at each vertex, NaN for none; ``distance``: mean one of
-    points; ``step``: heights off a plane by more are not on it; ``few``, ``least``: see :func:`.smooth_triangles.ground_surface`.
+    points; ``step``: heights off a plane by more are not on it; ``few``, ``least``: see
+    :func:`.smooth_triangles.ground_surface`.
     """
     for _ in range(2):
         plane = _handed_on(x, y, h, corner, radius, plane, smooth_radius, step)
