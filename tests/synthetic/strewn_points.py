@@ -55,7 +55,7 @@ def surface_of(
     lon, lat = (np.rint(c[kept] / CELL_M * 3000).astype(np.int64) for c in (x, y))
     builder = VertexBuilder(FLAT, (0, 0), (1_000_000, 1_000_000))
     h = np.rint(height[kept] / LATTICE_M).astype(np.int64)
-    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8))
+    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
     per_cell = (CELL_M / spacing) ** 2 * (1 << 40) / 9e6
     scale = Scale.of(np.array([per_cell]), FLAT.cell)
     return ground_surface(builder.built(), scale, 1.0, FLAT.cell)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from .ground_in_view import GroundInView
 from .image_agreement import (
     apart_from_steps,
     beside_changes,
@@ -116,7 +117,9 @@ def _on_surface(
     pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
     enough = pixels.count >= max(settings.min_points, 1)
     own = _labels(scene, pixels, enough, wide)
-    surface = ground_surface(vertices, scene.scale, px_per_m, scene.rays.cell)
+    cell = scene.rays.cell
+    view = GroundInView.of(vertices, scene.scale.width, local, first, points.shape, cell)
+    surface = ground_surface(vertices, scene.scale, px_per_m, cell, view)
     between = surface_between(surface, local, first, points.shape, px_per_m)
     paper = settings.representative == "paper"
     # less than two distances of points around a hidden one are looked at for what covers it
@@ -257,12 +260,10 @@ def _collect(
             for start in range(0, len(points), BLOCK):
                 where = slice(start, start + BLOCK)
                 lattice = points.lon_q[where], points.lat_q[where], points.h_q[where]
-                collection.add(*lattice, points.classification[where], local.at_points(*lattice))
+                classes = points.classification[where]
+                collection.add(*lattice, classes, local.at_points(*lattice))
                 if vertices is not None:
-                    # Later returns of a pulse lie below what the cameras see.
-                    top = points.return_number[where] <= 1
-                    classes = points.classification[where][top]
-                    vertices.add(*(values[top] for values in lattice), classes)
+                    vertices.add(*lattice, classes, points.return_number[where])
     points = collection.sorted()
     if points.points.size == 0 and not points.outside.any():
         return None

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
-from .feasible_lines import CORNERS, clip, line_between
+from ..kernels import inlined, inner, kernel
+from .feasible_lines import CORNERS, RINGS, STATES, STEEPEST, clip, line_between
 from .vertices import PART, PART_BITS
 
 Floats = NDArray[np.float64]
@@ -36,6 +36,7 @@ SLACK_CELLS = 0.12  # horizontal noise of points, in cells
 MARGIN_CELLS = 0.2  # added to either side of the feasible span
 SMALLEST = 0.1  # area of a triangle that is worth a cut, in squares of the mean distance
 WIDEST = 1.5  # half the width of a strip that still tells something, in mean distances
+BLOCK_BITS = PART_BITS + 3  # of parts of a cell: vertices of a row are found by such blocks
 _MOST = 4096  # points that have a say at most
 
 
@@ -67,34 +68,57 @@ def _handed_on(
     return out
 
 
+@kernel
+def _by_block(x: Ints, y: Ints, beside: Ints, first: Steps) -> None:
+    """First vertex of each block of a row of cells, to ``first`` [rows, blocks + 1].
+
+    ``beside``: vertices in the order of their cells.
+    """
+    rows, blocks = first.shape[0], first.shape[1] - 1
+    k = 0
+    for row in range(rows):
+        for block in range(blocks):
+            first[row, block] = k
+            while (
+                k < beside.size
+                and y[beside[k]] >> PART_BITS == row
+                and x[beside[k]] >> BLOCK_BITS == block
+            ):
+                k += 1
+        first[row, blocks] = k
+
+
+@inlined
+def _row_of_disc(
+    first: Steps, row: int, mid_x: float, mid_y: float, reach: float
+) -> tuple[int, int]:
+    """From which to which vertex those of a row of cells within ``reach`` of a place are."""
+    south = float(row << PART_BITS)
+    off = max(mid_y - south - float(PART - 1), south - mid_y, 0.0)
+    half = np.sqrt(max(reach * reach - off * off, 0.0)) + 1.0
+    blocks = first.shape[1] - 1
+    begin = min(max(np.int64(mid_x - half) >> BLOCK_BITS, 0), blocks)
+    end = max(min((np.int64(mid_x + half) >> BLOCK_BITS) + 1, blocks), begin)
+    return first[row, begin], first[row, end]
+
+
 @inner
 def _around(
-    x: Ints, y: Ints, beside: Ints, row_start: Ints, a: int, ox: float, oy: float, reach: float,
-    which: Ints, dx: Floats, dy: Floats,
+    place: Steps, first: Steps, ax: int, ay: int, ox: float, oy: float, reach: float, which: Steps,
+    dx: Floats, dy: Floats,
 ) -> int:  # fmt: skip
-    """Fills in the vertices ``which`` within ``reach`` of the place (ox, oy) from vertex a, and
-    how far they are off; returns their number."""
+    """Fills in which of the vertices ``place`` lie within ``reach`` of the place (ox, oy) from
+    (ax, ay), and how far they are off; returns their number."""
     n = 0
-    rows = row_start.size - 1
-    mid_x, mid_y = x[a] + int(np.floor(ox)), y[a] + int(np.floor(oy))
-    far = int(np.ceil(reach))
-    top = min(((mid_y + far) >> PART_BITS) + 1, rows)
-    for row in range(max((mid_y - far) >> PART_BITS, 0), top):
-        first, end = row_start[row], row_start[row + 1]
-        while first < end:  # first vertex of the row that is far enough east
-            half = (first + end) >> 1
-            if x[beside[half]] < mid_x - far:
-                first = half + 1
-            else:
-                end = half
-        for k in range(first, row_start[row + 1]):
-            w = beside[k]
-            if x[w] > mid_x + far or n == _MOST:
-                break
-            px, py = float(x[w] - x[a]) - ox, float(y[w] - y[a]) - oy
-            if px * px + py * py <= reach * reach:
-                which[n], dx[n], dy[n] = w, px, py
-                n += 1
+    mid_x, mid_y = float(ax) + ox, float(ay) + oy
+    bottom = max(np.int64(mid_y - reach) >> PART_BITS, 0)
+    top = min((np.int64(mid_y + reach) >> PART_BITS) + 1, first.shape[0])
+    for row in range(bottom, top):
+        begin, end = _row_of_disc(first, row, mid_x, mid_y, reach)
+        for k in range(begin, min(end, begin + _MOST - n)):
+            px, py = float(place[k, 0] - ax) - ox, float(place[k, 1] - ay) - oy
+            which[n], dx[n], dy[n] = k, px, py
+            n += px * px + py * py <= reach * reach
     return n
 
 
@@ -108,10 +132,12 @@ def _above(x: Ints, y: Ints, h: Ints, plane: Floats, a: int, w: int, ox: float, 
 @inner
 def _another_surface(
     x: Ints, y: Ints, h: Ints, plane: Floats, vertices: Steps, one: int, own: float, ox: float,
-    oy: float, step: float, near: float, which: Ints, dx: Floats, dy: Floats, n: int,
+    oy: float, step: float, near: float, place: Steps, slopes: Floats, which: Steps, dx: Floats,
+    dy: Floats, n: int,
 ) -> tuple[int, float, bool]:  # fmt: skip
-    """A vertex nearby whose plane may be that of the ``vertices`` which are off the plane of
-    vertex ``one`` (``own`` high in the middle); its height there; whether it is the higher one.
+    """One of the ``place`` nearby whose plane may be that of the ``vertices`` which are off the
+    plane of vertex ``one`` (``own`` high in the middle); its height there; whether it is the higher
+    one.
 
     -1 if there is none.
     """
@@ -130,30 +156,32 @@ def _another_surface(
     for k in range(n):
         w = which[k]
         r2 = dx[k] * dx[k] + dy[k] * dy[k]
-        if np.isnan(plane[w, 0]) or r2 >= best:
+        if not place[w, 3] or r2 >= best:
             continue
-        at = float(h[w]) - plane[w, 0] * dx[k] - plane[w, 1] * dy[k]
+        at = float(place[w, 2]) - slopes[w, 0] * dx[k] - slopes[w, 1] * dy[k]
         if (at - own if lift > 0.0 else own - at) >= least:
             best, other, other_h = r2, w, at
     return other, other_h, lift > 0.0
 
 
-@inner
-def _side(h: float, at_l: float, at_t: float, away: float, distance: float, step: float) -> int:
-    """Of a point between two planes, ``at_l`` and ``at_t`` high there: 1 on the low, 2 on the
-    high one, 0 on neither, or where they meet."""
+@inlined
+def _side(
+    height: float, at_l: float, at_t: float, r2: float, distance: float, step: float
+) -> tuple[bool, bool]:
+    """Whether a point lies on either of two planes that are ``at_l`` and ``at_t`` high there, and
+    on the high one. ``r2``: squared distance from the middle.
+
+    Without branches, which the processor could not foretell.
+    """
     gap = at_t - at_l
-    if gap < 2.0 * step:
-        return 0
-    tolerance = min(step * (1.0 + away / (4.0 * distance)), gap / 3.0)
-    if abs(h - at_l) <= tolerance:
-        return 1
-    return 2 if abs(h - at_t) <= tolerance else 0
+    off_l, off_t = abs(height - at_l), abs(height - at_t)
+    tolerance = min(step * (1.0 + np.sqrt(r2) / (4.0 * distance)), gap / 3.0)
+    return (gap >= 2.0 * step) & (min(off_l, off_t) <= tolerance), off_t < off_l
 
 
 @inner
 def _sides_nearby(
-    h: Ints, plane: Floats, sheet: Floats, distance: float, step: float, which: Ints, dx: Floats,
+    place: Steps, sheet: Floats, distance: float, step: float, which: Steps, dx: Floats,
     dy: Floats, n: int, told: Floats,
 ) -> bool:  # fmt: skip
     """Sums over the points of either side to ``told`` [2, 5]: number, places, heights off the
@@ -164,51 +192,57 @@ def _sides_nearby(
     told[:] = 0.0
     beyond = 0
     for k in range(n):
-        w = which[k]
-        height = float(h[w])
+        height = float(place[which[k], 2])
         at_l = sheet[0, 0] + sheet[0, 1] * dx[k] + sheet[0, 2] * dy[k]
         at_t = sheet[1, 0] + sheet[1, 1] * dx[k] + sheet[1, 2] * dy[k]
-        if height < at_l - step or height > at_t + step:
-            beyond += 1
-        if np.isnan(plane[w, 0]):
-            continue
-        away = np.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
-        side = _side(height, at_l, at_t, away, distance, step) - 1
-        if side < 0:
-            continue
-        off = height - (at_t if side else at_l)
-        told[side, 0] += 1.0
-        told[side, 1] += dx[k]
-        told[side, 2] += dy[k]
-        told[side, 3] += off
-        told[side, 4] += off * off
+        beyond += (height < at_l - step) | (height > at_t + step)
+        r2 = dx[k] * dx[k] + dy[k] * dy[k]
+        on_one, is_high = _side(height, at_l, at_t, r2, distance, step)
+        if on_one and place[which[k], 3]:
+            side = np.int64(is_high)
+            off = height - (at_t if is_high else at_l)
+            told[side, 0] += 1.0
+            told[side, 1] += dx[k]
+            told[side, 2] += dy[k]
+            told[side, 3] += off
+            told[side, 4] += off * off
     few = min(told[0, 0], told[1, 0]) == 0.0
     return not few and beyond <= ROUGH * (told[0, 0] + told[1, 0])
 
 
 @inner
 def _sides(
-    h: Ints, plane: Floats, sheet: Floats, distance: float, step: float, nx: float, ny: float,
-    which: Ints, dx: Floats, dy: Floats, n: int, u: Floats, v: Floats, high: Bools,
-) -> tuple[int, float, float]:  # fmt: skip
+    place: Steps, first: Steps, ax: int, ay: int, ox: float, oy: float, reach: float,
+    sheet: Floats, distance: float, step: float, nx: float, ny: float, widest: float, u: Floats,
+    v: Floats, high: Bools,
+) -> tuple[int, int, int]:  # fmt: skip
     """Places of the points of either side across (nx, ny) and along the step, and which are
-    high; their number; least and greatest height of all."""
-    m, least, most = 0, np.inf, -np.inf
-    for k in range(n):
-        w = which[k]
-        height = float(h[w])
-        least, most = min(least, height), max(most, height)
-        if np.isnan(plane[w, 0]):
-            continue
-        at_l = sheet[0, 0] + sheet[0, 1] * dx[k] + sheet[0, 2] * dy[k]
-        at_t = sheet[1, 0] + sheet[1, 1] * dx[k] + sheet[1, 2] * dy[k]
-        away = np.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
-        side = _side(height, at_l, at_t, away, distance, step)
-        if side == 0:
-            continue
-        u[m], v[m] = nx * dx[k] + ny * dy[k], nx * dy[k] - ny * dx[k]
-        high[m] = side == 2
-        m += 1
+    high; their number; least and greatest height of all within ``reach``.
+
+    Those that lie more than ``widest`` beyond the steepest lines through the middle, low ones, and
+    high ones on their own side, can neither bound the step nor tell a gap.
+    """
+    m = 0
+    least, most = np.int32(np.iinfo(np.int32).max), np.int32(np.iinfo(np.int32).min)
+    mid_x, mid_y = float(ax) + ox, float(ay) + oy
+    bottom = max(np.int64(mid_y - reach) >> PART_BITS, 0)
+    top = min((np.int64(mid_y + reach) >> PART_BITS) + 1, first.shape[0])
+    for row in range(bottom, top):
+        begin, end = _row_of_disc(first, row, mid_x, mid_y, reach)
+        for k in range(begin, min(end, begin + _MOST - m)):
+            px, py = float(place[k, 0] - ax) - ox, float(place[k, 1] - ay) - oy
+            r2 = px * px + py * py
+            inside = r2 <= reach * reach
+            height = place[k, 2]
+            least = min(least, height) if inside else least
+            most = max(most, height) if inside else most
+            across, along = nx * px + ny * py, nx * py - ny * px
+            at_l = sheet[0, 0] + sheet[0, 1] * px + sheet[0, 2] * py
+            at_t = sheet[1, 0] + sheet[1, 1] * px + sheet[1, 2] * py
+            on_one, is_high = _side(float(height), at_l, at_t, r2, distance, step)
+            u[m], v[m], high[m] = across, along, is_high
+            near = across <= widest + STEEPEST * abs(along)
+            m += inside & on_one & near & (place[k, 3] != 0)
     return m, least, most
 
 
@@ -238,7 +272,7 @@ def _parts(
 @kernel
 def _cuts(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, plane: Floats,
-    beside: Ints, row_start: Ints, distance: float, step: float,
+    beside: Ints, place: Steps, slopes: Floats, first: Steps, distance: float, step: float,
     line: Floats, sheets: Floats, noise: Floats, anchor: Steps, few: float, least: float,
 ) -> None:  # fmt: skip
     """For each of the triangles that may span a step of two surfaces: where, and their planes.
@@ -247,14 +281,18 @@ def _cuts(
     the triangle's first vertex; w NaN for none. ``sheets`` [m, 8]: low, high plane: height at the
     first vertex, slopes; least and greatest height around. ``noise`` [m, 2]: variance of heights
     about both. ``anchor`` [m, 2]: vertices that tell the planes' classes. ``beside``: the vertices
-    of triangles that are not smooth, those of a row of cells from ``row_start`` on.
+    of triangles that are not smooth, their ``place`` [n, 4] (x, y, h, whether they have a plane)
+    and its ``slopes`` [n, 2];
+    ``first``: see :func:`_by_block`.
     """
     reach, near, band = REACH * distance, NEAR * distance, BAND * distance
     slack = SLACK_CELLS * PART
-    which = np.empty(_MOST, np.int64)
+    which = np.empty(_MOST, np.int32)
     dx, dy = np.empty(_MOST), np.empty(_MOST)
     u, v, high = np.empty(_MOST), np.empty(_MOST), np.empty(_MOST, np.bool_)
-    spans, limit = np.empty((4, CORNERS)), np.empty(2)
+    order, start = np.empty(_MOST, np.int32), np.empty(RINGS + 1, np.int32)
+    lines, value = np.empty((STATES + 1, 2, CORNERS)), np.empty(CORNERS)
+    size, taken, limit = np.empty(STATES + 1, np.int32), np.empty(STATES + 1), np.empty(2)
     sheet, told = np.empty((2, 3)), np.empty((2, 5))
     for t in range(len(corner)):
         line[t, 3] = np.nan
@@ -278,21 +316,22 @@ def _cuts(
         one_only = top_h - low_h <= 2.0 * step
         if low < 0 or (one_only and not bare):
             continue
-        n = _around(x, y, beside, row_start, a, ox, oy, near, which, dx, dy)
+        n = _around(place, first, x[a], y[a], ox, oy, near, which, dx, dy)
         if one_only:
             other, other_h, is_top = _another_surface(
-                x, y, h, plane, corner[t], low, 0.5 * (low_h + top_h), ox, oy, step, near, which,
-                dx, dy, n,
+                x, y, h, plane, corner[t], low, 0.5 * (low_h + top_h), ox, oy, step, near, place,
+                slopes, which, dx, dy, n,
             )  # fmt: skip
             if other < 0:
                 continue
+            other = beside[other]
             if is_top:
                 top, top_h = other, other_h
             else:
                 low, low_h = other, other_h
         sheet[0, 0], sheet[0, 1], sheet[0, 2] = low_h, plane[low, 0], plane[low, 1]
         sheet[1, 0], sheet[1, 1], sheet[1, 2] = top_h, plane[top, 0], plane[top, 1]
-        if not _sides_nearby(h, plane, sheet, distance, step, which, dx, dy, n, told):
+        if not _sides_nearby(place, sheet, distance, step, which, dx, dy, n, told):
             continue
         nx = told[1, 1] / told[1, 0] - told[0, 1] / told[0, 0]
         ny = told[1, 2] / told[1, 0] - told[0, 2] / told[0, 0]
@@ -300,24 +339,26 @@ def _cuts(
         if length == 0.0:
             continue
         nx, ny = nx / length, ny / length
-        n = _around(x, y, beside, row_start, a, ox, oy, reach, which, dx, dy)
-        m, least_h, most_h = _sides(
-            h, plane, sheet, distance, step, nx, ny, which, dx, dy, n, u, v, high
-        )
         extent = 4.0 * radius[t]
-        found = line_between(u, v, high, m, extent, reach, distance, band, slack, limit, spans)
-        if found < 3:
-            continue
+        m, least_h, most_h = _sides(
+            place, first, x[a], y[a], ox, oy, reach, sheet, distance, step, nx, ny, extent + band,
+            u, v, high,
+        )  # fmt: skip
+        at = line_between(
+            u, v, high, m, extent, reach, distance, band, slack, limit, lines, size, taken, value,
+            order, start,
+        )  # fmt: skip
+        found = size[at]
         mean_a = mean_b = 0.0
         for j in range(found):
-            mean_a, mean_b = mean_a + spans[0, j], mean_b + spans[1, j]
+            mean_a, mean_b = mean_a + lines[at, 0, j], mean_b + lines[at, 1, j]
         mean_a, mean_b = mean_a / found, mean_b / found
         norm = np.sqrt(1.0 + mean_b * mean_b)
         width = 0.0
         for w in corner[t]:
-            at = nx * (float(y[w] - y[a]) - oy) - ny * (float(x[w] - x[a]) - ox)
+            along = nx * (float(y[w] - y[a]) - oy) - ny * (float(x[w] - x[a]) - ox)
             for j in range(found):
-                off = spans[0, j] - mean_a + (spans[1, j] - mean_b) * at
+                off = lines[at, 0, j] - mean_a + (lines[at, 1, j] - mean_b) * along
                 width = max(width, abs(off) / norm)
         width += MARGIN_CELLS * PART
         if width > WIDEST * distance:
@@ -329,8 +370,8 @@ def _cuts(
             continue
         line[t, 0], line[t, 1], line[t, 2], line[t, 3] = p, q, r, width
         for side in range(2):
-            at, gx, gy = sheet[side]
-            sheets[t, 3 * side] = at + told[side, 3] / told[side, 0] - gx * ox - gy * oy
+            level, gx, gy = sheet[side]
+            sheets[t, 3 * side] = level + told[side, 3] / told[side, 0] - gx * ox - gy * oy
             sheets[t, 3 * side + 1], sheets[t, 3 * side + 2] = gx, gy
             noise[t, side] = max((told[side, 4] + few) / (told[side, 0] + 1.0), least)
         sheets[t, 6], sheets[t, 7] = least_h, most_h
@@ -408,15 +449,16 @@ class Pieces:
 
 
 def cut_at_outlines(
-    x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, smooth: Bools, plane: Floats,
-    distance: float, smooth_radius: float, step: float, few: float, least: float,
+    x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, smooth: Bools, seen: Bools,
+    plane: Floats, distance: float, smooth_radius: float, step: float, few: float, least: float,
 ) -> tuple[Bools, Pieces]:  # fmt: skip
     """Which triangles [m] are cut, and their parts.
 
     ``x``, ``y``, ``h`` [n]: vertices in the order of their cells; ``corner`` [m, 3], ``radius``
-    [m]: triangles, ``smooth`` [m] those on one surface; ``plane`` [n, 2]: slopes of the surface at
-    each vertex, NaN for none; ``distance``: mean one of points; ``step``: heights off a plane by
-    more are not on it; ``few``, ``least``: see :func:`.smooth_triangles.ground_surface`.
+    [m]: triangles, ``smooth`` [m] those on one surface; of the others, those ``seen`` [m] are cut;
+    ``plane`` [n, 2]: slopes of the surface at each vertex, NaN for none; ``distance``: mean one of
+    points; ``step``: heights off a plane by more are not on it; ``few``, ``least``: see
+    :func:`.smooth_triangles.ground_surface`.
     """
     for _ in range(2):
         plane = _handed_on(x, y, h, corner, radius, plane, smooth_radius, step)
@@ -424,15 +466,19 @@ def cut_at_outlines(
     at_step = np.zeros(x.size, np.bool_)
     at_step[corner[~smooth].reshape(-1)] = True
     beside = np.flatnonzero(at_step)
-    rows = y[beside] >> PART_BITS
-    row_start = np.searchsorted(rows, np.arange(int(rows.max(initial=-1)) + 2))
-    of = np.flatnonzero(~smooth & (radius <= smooth_radius)).astype(np.int32)
+    slopes = plane[beside]
+    place = np.stack([x[beside], y[beside], h[beside], ~np.isnan(slopes[:, 0])], axis=1)
+    place = place.astype(np.int32)
+    cells, rows = (int(v[beside].max(initial=-1)) for v in (x >> BLOCK_BITS, y >> PART_BITS))
+    first = np.empty((rows + 1, cells + 2), np.int32)
+    _by_block(x, y, beside, first)
+    of = np.flatnonzero(~smooth & seen & (radius <= smooth_radius)).astype(np.int32)
     size = of.size
     line, sheets, noise = np.empty((size, 4)), np.empty((size, 8)), np.empty((size, 2))
     anchor = np.empty((size, 2), np.int32)
     _cuts(
-        x, y, h, corner[of], radius[of], plane, beside, row_start, distance, step, line, sheets,
-        noise, anchor, few, least,
+        x, y, h, corner[of], radius[of], plane, beside, place, slopes, first, distance, step,
+        line, sheets, noise, anchor, few, least,
     )  # fmt: skip
     told = ~np.isnan(line[:, 3])
     of, line, sheets, noise, anchor = (each[told] for each in (of, line, sheets, noise, anchor))

@@ -95,7 +95,7 @@ def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
 
 @kernel
 def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
-    """Order of insertion: rounds that double the vertices, each along a Hilbert curve."""
+    """Order of insertion: rounds of four times the vertices each, along a Hilbert curve."""
     for k in range(x.size):
         mixed = (np.uint64(x[k]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
             np.uint64(y[k]) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -104,8 +104,8 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
         mixed *= np.uint64(0xBF58476D1CE4E5B9)
         mixed ^= mixed >> np.uint64(32)
         level = np.int64(0)
-        while level < 12 and mixed & np.uint64(1):
-            mixed >>= np.uint64(1)
+        while level < 6 and mixed & np.uint64(3) == np.uint64(3):
+            mixed >>= np.uint64(2)
             level += 1
         px, py = x[k], y[k]
         key = np.int64(0)
@@ -119,7 +119,7 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
                     px, py = ~px, ~py
                 px, py = py, px
             side >>= 1
-        out[k] = ((12 - level) << 40) | key
+        out[k] = ((6 - level) << 40) | key
 
 
 @inner
@@ -137,9 +137,10 @@ def _set(corner: Steps, neighbour: Steps, t: int, v: tuple, n: tuple) -> None:
 
 
 @kernel
-def _insert_all(x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps) -> int:
+def _insert_all(x: Ints, y: Ints, corner: Steps, neighbour: Steps) -> int:
     """Delaunay triangles of vertices inside the square of the last four; returns their number.
 
+    Vertices are inserted in their order: those of a place should follow each other, in memory too.
     ``corner`` [m, 3] vertices counter-clockwise, ``neighbour`` [m, 3]: the triangle opposite each.
     """
     size = x.size
@@ -149,7 +150,7 @@ def _insert_all(x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps) 
     n = 2
     t = 0
     stack = np.empty(1024, np.int32)
-    for p in order:
+    for p in range(size - 4):
         while True:  # walk
             edge = -1
             moved = False
@@ -253,21 +254,31 @@ def _circumradius(x: Ints, y: Ints, a: int, b: int, c: int) -> float:
 
 @kernel
 def _tidy(
-    x: Ints, y: Ints, corner: Steps, neighbour: Steps, vertices: int, limit: float
+    x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps, limit: float
 ) -> tuple[Steps, Steps, Floats]:
-    """Triangles of circumradius up to ``limit`` without the square's corners, in order."""
-    size = len(corner)
+    """Triangles of circumradius up to ``limit`` without the square's corners, in order.
+
+    ``order``: what number each vertex gets.
+    """
+    size, vertices = len(corner), order.size
     radius = np.empty(size)
     start = np.zeros(vertices + 1, np.int32)
     for t in range(size):
-        while corner[t, 1] < corner[t, 0] or corner[t, 2] < corner[t, 0]:
-            for array in (corner, neighbour):
-                array[t, 0], array[t, 1], array[t, 2] = array[t, 1], array[t, 2], array[t, 0]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         radius[t] = np.inf
-        if max(corner[t, 1], corner[t, 2]) < vertices:
-            radius[t] = _circumradius(x, y, corner[t, 0], corner[t, 1], corner[t, 2])
+        if max(a, b, c) >= vertices:
+            continue
+        a, b, c = order[a], order[b], order[c]
+        n0, n1, n2 = neighbour[t, 0], neighbour[t, 1], neighbour[t, 2]
+        p, q, r = corner[t, 0], corner[t, 1], corner[t, 2]
+        while b < a or c < a:
+            a, b, c = b, c, a
+            p, q, r = q, r, p
+            n0, n1, n2 = n1, n2, n0
+        radius[t] = _circumradius(x, y, p, q, r)
+        _set(corner, neighbour, t, (a, b, c), (n0, n1, n2))
         if radius[t] <= limit:
-            start[corner[t, 0] + 1] += 1
+            start[a + 1] += 1
     for v in range(vertices):
         start[v + 1] += start[v]
     kept = start[vertices]
@@ -312,12 +323,13 @@ def triangulate(x: Ints, y: Ints, max_radius: float) -> Triangles:
     end = int(max(x.max(initial=0), y.max(initial=0))) + spare
     if end + spare >= MAX_PARTS:
         raise ValueError(f"places {end} parts of a cell apart, at most {MAX_PARTS} are exact")
-    every_x = np.concatenate([x, [-spare, end, end, -spare]]).astype(np.int64)
-    every_y = np.concatenate([y, [-spare, -spare, end, end]]).astype(np.int64)
     keys = np.empty(n, np.int64)
     _keys(x, y, max(end.bit_length(), 1), keys)
+    order = np.argsort(keys, kind="stable")
+    every_x = np.concatenate([x[order], [-spare, end, end, -spare]]).astype(np.int64)
+    every_y = np.concatenate([y[order], [-spare, -spare, end, end]]).astype(np.int64)
     corner, neighbour = (np.empty((2 * n + 2, 3), np.int32) for _ in range(2))
-    count = _insert_all(every_x, every_y, np.argsort(keys, kind="stable"), corner, neighbour)
+    count = _insert_all(every_x, every_y, corner, neighbour)
     return Triangles(
-        *_tidy(every_x, every_y, corner[:count], neighbour[:count], n, float(max_radius))
+        *_tidy(every_x, every_y, order, corner[:count], neighbour[:count], float(max_radius))
     )

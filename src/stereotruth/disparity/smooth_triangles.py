@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..kernels import inner, kernel
 from ..lidar.lattice import CELL_BITS, LATTICE_M
 from .even_squares import REACH as EVEN_REACH
+from .ground_in_view import GroundInView
 from .outlines import REACH, Pieces, cut_at_outlines
 from .pixel_labels import FEW_NOISE_M, HEIGHT_NOISE_M
 from .point_triangles import triangulate
@@ -72,6 +73,11 @@ class Scale:
     smooth: float
     swept: float
     halo: int
+
+    @property
+    def width(self) -> float:
+        """Parts of a cell between a place of a triangle and any point that tells heights there."""
+        return max(REACH * self.distance + 2.0 * self.smooth, 2.0 * self.swept)
 
     @property
     def distance_px(self) -> float:
@@ -253,6 +259,19 @@ def _domed(
 
 
 @kernel
+def _supported(smooth: Bools, neighbour: Steps) -> Bools:
+    """The smooth triangles of which SUPPORT neighbours are smooth, too."""
+    out = np.zeros(len(smooth), np.bool_)
+    for t in range(len(smooth)):
+        number = 0
+        for i in range(3):
+            u = neighbour[t, i]
+            number += u >= 0 and smooth[u]
+        out[t] = smooth[t] and number >= SUPPORT
+    return out
+
+
+@kernel
 def _squares(
     x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
@@ -323,10 +342,16 @@ class GroundSurface:
 
 
 def ground_surface(
-    vertices: Vertices, scale: Scale, px_per_m: float, cell: tuple[int, int]
+    vertices: Vertices,
+    scale: Scale,
+    px_per_m: float,
+    cell: tuple[int, int],
+    view: GroundInView | None = None,
 ) -> GroundSurface:
     """Triangles of ``vertices``, told apart by STEP_PX; ``px_per_m``: disparity per m of height;
-    ``cell``: (lon, lat) size in lattice steps."""
+    ``cell``: (lon, lat) size in lattice steps. With a ``view``, those in it alone."""
+    if view is not None:
+        vertices = view.with_halo(vertices, scale.halo)
     x, y, h = vertices.x, vertices.y, vertices.h_q
     triangles = triangulate(x, y, scale.swept)
     corner, radius = triangles.corner, triangles.radius
@@ -337,17 +362,20 @@ def ground_surface(
     start, around = _incident(corner, x.size)
     smooth = _joined(x, y, h, corner, radius, firm, start, around, scale.smooth, step)
     beside = triangles.neighbour
-    smooth &= np.where(beside >= 0, smooth[beside], False).sum(axis=1) >= SUPPORT
+    smooth = _supported(smooth, beside)
     height = scale.trust * DOME_PX / STEP_PX * step
     smooth |= _domed(x, y, h, corner, beside, radius, slopes, scale.smooth, step, height)
     total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
     plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)
+    seen = np.ones(len(corner), np.bool_)
+    if view is not None:
+        seen = view.touching(vertices, corner)
     cut, pieces = cut_at_outlines(
-        x, y, h, corner, radius, smooth, plane, scale.distance, scale.smooth, step, *floors
+        x, y, h, corner, radius, smooth, seen, plane, scale.distance, scale.smooth, step, *floors
     )
-    whole = corner[~smooth & ~cut]
+    whole, smooth = corner[~smooth & ~cut & seen], smooth & seen
     span = np.stack([h[whole].min(axis=1), h[whole].max(axis=1)], axis=1)
     vertices, faces, strips = _with_pieces(vertices, corner, pieces, cell)
     return GroundSurface(
@@ -360,33 +388,42 @@ def ground_surface(
     )
 
 
+@kernel
+def _placed(
+    pieces: Floats, of: Steps, corner: Steps, size: int, cell: tuple[int, int], lon_q: Ints,
+    lat_q: Ints, x: Ints, y: Ints,
+) -> None:  # fmt: skip
+    """Places of the corners of ``pieces`` [n, 3, :] (x, y from the first vertex of the triangle
+    ``of`` [n]), to the elements from ``size`` on."""
+    for n in range(len(of)):
+        first = corner[of[n], 0]
+        for i in range(3):
+            k = size + 3 * n + i
+            across, along = pieces[n, i, 0], pieces[n, i, 1]
+            lon_q[k] = lon_q[first] + np.int64(np.rint(across * (cell[0] / PART)))
+            lat_q[k] = lat_q[first] + np.int64(np.rint(along * (cell[1] / PART)))
+            x[k], y[k] = x[first] + np.int64(np.rint(across)), y[first] + np.int64(np.rint(along))
+
+
 def _with_pieces(
     vertices: Vertices, corner: Steps, pieces: Pieces, cell: tuple[int, int]
 ) -> tuple[Vertices, Steps, Steps]:
     """The vertices and the corners of pieces; these [n, 3] of faces and [k, 3] of strips."""
     size = vertices.x.size
-    places = np.concatenate([pieces.faces[..., :2].reshape(-1, 2), pieces.strips.reshape(-1, 2)])
-    first = corner[np.concatenate([np.repeat(pieces.face_of, 3), np.repeat(pieces.strip_of, 3)]), 0]
-    faces = pieces.faces.shape[0] * 3
-    height = np.concatenate([pieces.faces[..., 2].reshape(-1), np.repeat(pieces.heights[:, 0], 3)])
-    height = np.rint(height).astype(np.int64)
-    anchor = np.concatenate([np.repeat(pieces.anchor, 3), first[faces:]])
-    moved = (np.rint(places[:, k] * (cell[k] / PART)).astype(np.int64) for k in (0, 1))
-    added = Vertices(
-        *(q[first] + move for q, move in zip((vertices.lon_q, vertices.lat_q), moved)),
-        height,
-        *(
-            q[first] + np.rint(places[:, k]).astype(np.int64)
-            for k, q in enumerate((vertices.x, vertices.y))
-        ),
-        vertices.surface_class[anchor],
-        np.ones(len(places), np.int32),
-    )
-    joined = Vertices(
-        *(
-            np.concatenate([getattr(vertices, f.name), getattr(added, f.name)])
-            for f in fields(Vertices)
-        )
-    )
-    index = np.arange(size, size + len(places), dtype=np.int32)
-    return joined, index[:faces].reshape(-1, 3), index[faces:].reshape(-1, 3)
+    faces, strips = 3 * len(pieces.face_of), 3 * len(pieces.strip_of)
+    joined = {}
+    for f in fields(Vertices):
+        own = getattr(vertices, f.name)
+        joined[f.name] = np.empty(size + faces + strips, own.dtype)
+        joined[f.name][:size] = own
+    places = [joined[name] for name in ("lon_q", "lat_q", "x", "y")]
+    _placed(pieces.faces, pieces.face_of, corner, size, cell, *places)
+    _placed(pieces.strips, pieces.strip_of, corner, size + faces, cell, *places)
+    height, classes = joined["h_q"][size:], joined["surface_class"][size:]
+    np.rint(pieces.faces[..., 2].reshape(-1), out=height[:faces], casting="unsafe")
+    height[faces:] = np.repeat(np.rint(pieces.heights[:, 0]), 3)
+    classes[:faces] = np.repeat(vertices.surface_class[pieces.anchor], 3)
+    classes[faces:] = np.repeat(vertices.surface_class[corner[pieces.strip_of, 0]], 3)
+    joined["count"][size:] = 1
+    index = np.arange(size, size + faces + strips, dtype=np.int32).reshape(-1, 3)
+    return Vertices(**joined), index[: faces // 3], index[faces // 3 :]

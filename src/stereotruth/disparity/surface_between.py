@@ -99,11 +99,15 @@ def _face_in_left(
     Of faces of equal disparity the first one stays.
     """
     rows, cols = nearest.shape
+    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
+    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
+    left = max(int(np.ceil(min(x[0], x[1], x[2]))), first[1])
+    right = min(int(np.floor(max(x[0], x[1], x[2]))), first[1] + cols - 1)
+    if top > bottom or left > right:  # most triangles lie between the centres of pixels
+        return
     gx, gy = _plane(x, y, d)
     if not np.isfinite(gx + gy):
         return
-    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
-    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
     lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
     for row in range(top, bottom + 1):
         low, high = _span(x, y, float(row))
@@ -147,13 +151,14 @@ def _face_in_right(
     of each.
     """
     rows = (start.size - 1) // width
-    highest = max(d[0], d[1], d[2])
+    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
+    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
+    if top > bottom:
+        return
     gx, gy = _plane(x, y, d)
     if not np.isfinite(gx + gy):
         return
-    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
-    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
-    lowest = min(d[0], d[1], d[2])
+    lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
     for row in range(top, bottom + 1):
         low, high = _span(x, y, float(row))
         if not low <= high:

@@ -64,28 +64,34 @@ def _raise_tops(
     cell: tuple[int, int],
     top: Steps,
     top_class: NDArray[np.uint8],
+    returns: NDArray[np.uint8],
     index: Steps,
     place: Steps,
-) -> None:
-    """Takes points into the greatest height of each cell, of equals the greater class.
+) -> int:
+    """Takes first returns into the greatest height of each cell, of equals the greater class.
 
-    Fills ``index`` (cell) and ``place`` [n, 3] (steps from the cell's corner, height).
+    Fills ``index`` (cell) and ``place`` [n, 3] (steps from the cell's corner, height); how many.
     """
+    n = 0
     cols = top.shape[1]
     west, south = first[0] * cell[0], first[1] * cell[1]
     wide, tall = 1.0 / cell[0], 1.0 / cell[1]
     for k in range(lon_q.size):
+        if returns[k] > 1:
+            continue
         east, north = lon_q[k] - west, lat_q[k] - south
         i, j = _whole(east, wide), _whole(north, tall)
-        index[k] = j * cols + i
-        place[k, 0] = east - i * cell[0]
-        place[k, 1] = north - j * cell[1]
-        place[k, 2] = h = np.int32(h_q[k])
+        index[n] = j * cols + i
+        place[n, 0] = east - i * cell[0]
+        place[n, 1] = north - j * cell[1]
+        place[n, 2] = h = np.int32(h_q[k])
+        n += 1
         if h > top[j, i]:
             top[j, i] = h
             top_class[j, i] = classes[k]
         elif h == top[j, i]:
             top_class[j, i] = max(top_class[j, i], classes[k])
+    return n
 
 
 @kernel
@@ -201,10 +207,18 @@ class VertexBuilder:
         self.top = np.full(shape, _LOWEST, dtype=np.int32)
         self.top_class = np.zeros(shape, dtype=np.uint8)
 
-    def add(self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8]) -> None:
-        """Points by lattice coordinates and class."""
+    def add(
+        self,
+        lon_q: Ints,
+        lat_q: Ints,
+        h_q: Ints,
+        surface_class: NDArray[np.uint8],
+        return_number: NDArray[np.uint8],
+    ) -> None:
+        """Points by lattice coordinates and class; later returns of a pulse lie below what the
+        cameras see."""
         index, place = np.empty(lon_q.size, np.int32), np.empty((lon_q.size, 3), np.int32)
-        _raise_tops(
+        taken = _raise_tops(
             lon_q,
             lat_q,
             h_q,
@@ -213,10 +227,11 @@ class VertexBuilder:
             self.rays.cell,
             self.top,
             self.top_class,
+            return_number,
             index,
             place,
         )
-        self.parts.append((index, place))
+        self.parts.append((index[:taken], place[:taken]))
 
     def built(self) -> Vertices:
         """The vertices of all that was taken, one for each square of even ground."""

@@ -27,7 +27,7 @@ def built(height_at, low=(0, 0), kept=None, noise_m=0.0, kinds=2, order=None) ->
     builder = VertexBuilder(RAYS, low, (SIZE * CELL, SIZE * CELL))
     lon, lat = ((c[use] * CELL).astype(np.int64) for c in (x, y))
     q = np.rint(h[use] / LATTICE_M).astype(np.int64)
-    builder.add(lon, lat, q, classes[use].astype(np.uint8))
+    builder.add(lon, lat, q, classes[use].astype(np.uint8), np.ones(lon.size, np.uint8))
     return builder.built()
 
 
@@ -43,7 +43,7 @@ def test_places_are_those_of_whole_numbers(cell) -> None:
     rays = Rays(np.zeros((2, 2, 3)), cell, 1.0)
     builder = VertexBuilder(rays, tuple(low.tolist()), tuple((low + size).tolist()))
     h = rng.integers(-(10**6), 10**6, lon.size)
-    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8))
+    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
     found = builder.built()
     tolerance = int(SURFACE_PX / LATTICE_M)
     expected = {}
@@ -131,12 +131,13 @@ def test_a_window_has_the_vertices_of_the_whole_in_any_order() -> None:
 
 def test_vertices_are_means_of_the_tops_of_cells() -> None:
     rays = Rays(np.zeros((2, 2, 3)), (3000, 2500), 1.0)
-    lon = np.array([6010, 6030, 6020, 9001])
-    lat = np.array([2600, 2700, 2650, 2510])
-    height = np.array([100_000, 100_200, 60_000, 50_000])  # the third lies 4 m below
-    classes = np.array([6, 5, 2, 2], np.uint8)
+    lon = np.array([6010, 6030, 6020, 9001, 9005])
+    lat = np.array([2600, 2700, 2650, 2510, 2515])
+    height = np.array([100_000, 100_200, 60_000, 50_000, 50_010])  # the third lies 4 m below
+    classes = np.array([6, 5, 2, 2, 5], np.uint8)
+    returns = np.array([1, 0, 1, 1, 2], np.uint8)  # what is not told counts, the last does not
     whole = VertexBuilder(rays, (0, 0), (20_000, 20_000))
-    whole.add(lon, lat, height, classes)
+    whole.add(lon, lat, height, classes, returns)
     found = whole.built()
     assert found.lon_q.tolist() == [6020, 9001]
     assert found.lat_q.tolist() == [2650, 2510]
@@ -144,8 +145,8 @@ def test_vertices_are_means_of_the_tops_of_cells() -> None:
     assert found.count.tolist() == [2, 1]
     assert found.surface_class.tolist() == [5, 2]  # that of the highest
     other = VertexBuilder(rays, (3000, 2500), (20_000, 20_000))
-    for k in (3, 1, 2, 0):
-        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes)))
+    for k in (3, 1, 4, 2, 0):
+        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes, returns)))
     again = other.built()
     for name in ("lon_q", "lat_q", "h_q", "surface_class", "count"):
         assert getattr(again, name).tolist() == getattr(found, name).tolist()
