@@ -48,15 +48,15 @@ class Representative:
     fill: Literal["none", "surface", "surface_and_images"] = "surface"
     """where labels are, with `occlusion.method` both or geometric and the representative top. The
     points are triangles over the ground: those that go on the plane of their neighbours, or bulge
-    as crowns do, give labels; those between two surfaces are cut at the outline that the points on both sides of it
-    tell; all others are swept vertically as what may hide a pixel in either view. `surface`: all
-    pixels on it have a label, those with points on it the status `labelled` (1), those between
-    points `labelled_between` (9) and an `uncertainty` of their own. Where a step lies between
-    points, pixels are `edge_in_pixel`. `none`: pixels with points alone. `surface_and_images`: of
-    the pixels that the surface leaves open, those that only one of the surfaces around explains in
-    both images are on that surface, `labelled_by_images` (10): more labels in crowns and behind
-    roofs, and more of the hidden pixels (with the method both alone). A value is always the
-    LiDAR's"""
+    as crowns do, give labels; those between two surfaces are cut at the outline that the points on
+    both sides of it tell; all others are swept vertically as what may hide a pixel in either view.
+    `surface`: all pixels on it have a label, those with points on it the status `labelled` (1),
+    those between points `labelled_between` (9) and an `uncertainty` of their own. Where a step lies
+    between points, pixels are `edge_in_pixel`. `none`: pixels with points alone.
+    `surface_and_images`: of the pixels that the surface leaves open, those that only one of the
+    surfaces around explains in both images are on that surface, `labelled_by_images` (10): more
+    labels in crowns and behind roofs, and more of the hidden pixels (with the method both alone). A
+    value is always the LiDAR's"""
 
 
 @settings

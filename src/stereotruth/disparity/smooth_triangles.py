@@ -54,6 +54,11 @@ NOTICED_PX = 1.5
 # Crowns bulge: all around lies below their planes, however steeply it falls, while at the foot of a
 # step it rises. A triangle of a dome is no higher than this, less where points are sparse (trust).
 DOME_PX = 3.0
+# The surface bulges out of a triangle whose vertices lie below each other's slopes by this or more
+# on the average (px; noise of points stays below). The slopes are those of the gentlest triangles,
+# on the inner side of a dome, and show a part of its curvature alone.
+BULGE_PX = 0.1
+CURVATURE_SHOWN = 0.6
 
 
 @dataclass(frozen=True)
@@ -272,6 +277,27 @@ def _supported(smooth: Bools, neighbour: Steps) -> Bools:
 
 
 @kernel
+def _bulges(
+    x: Ints, y: Ints, h: Ints, corner: Steps, chosen: Bools, slopes: Floats, least: float
+) -> Floats:  # fmt: skip
+    """By how much the vertices of each chosen triangle lie below each other's slopes on the
+    average, height steps; 0 for less than ``least``."""
+    out = np.zeros(len(corner))
+    for t in range(len(corner)):
+        if not chosen[t]:
+            continue
+        below = 0.0
+        for i in range(3):
+            v = corner[t, i]
+            for k in range(1, 3):
+                w = corner[t, (i + k) % 3]
+                below -= _misfit(x, y, h, v, w, slopes[v, 0], slopes[v, 1]) / 6.0
+        if below >= least:
+            out[t] = below
+    return out
+
+
+@kernel
 def _squares(
     x: Ints, y: Ints, h: Ints, count: Steps, corner: Steps, neighbour: Steps, smooth: Bools
 ) -> tuple[Floats, Floats]:
@@ -328,14 +354,17 @@ class GroundSurface:
     """The surface of a window's points, and where it steps.
 
     ``vertices``, and triangles of them: ``smooth`` [m, 3] on the surface, with the variance
-    ``noise`` [m] of their points' heights (lattice steps²); ``steps`` [k, 3] that may hold any
-    surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
+    ``noise`` [m] of their points' heights (lattice steps²), and above which the surface bulges by
+    ``bulge`` [m] (lattice steps) times the sum of the products of two barycentric coordinates, the
+    form of a quadratic function between its values at the vertices; ``steps`` [k, 3] that may hold
+    any surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
     nobody knows which surfaces they hold, the others lie between two known ones.
     """
 
     vertices: Vertices
     smooth: Steps
     noise: Floats
+    bulge: Floats
     steps: Steps
     span: Ints
     rough: int
@@ -368,6 +397,7 @@ def ground_surface(
     total, number = _squares(x, y, h, vertices.count, corner, triangles.neighbour, smooth)
     floors = (FEW_NOISE_M / LATTICE_M) ** 2, (HEIGHT_NOISE_M / LATTICE_M) ** 2
     noise = _variances(triangles.neighbour, smooth, total, number, *floors)
+    bulge = _bulges(x, y, h, corner, smooth, slopes, BULGE_PX / STEP_PX * step) / CURVATURE_SHOWN
     plane = _gentlest(x, y, h, corner, np.where(smooth, radius, np.inf), scale.smooth, least)
     seen = np.ones(len(corner), np.bool_)
     if view is not None:
@@ -382,6 +412,7 @@ def ground_surface(
         vertices,
         np.concatenate([corner[smooth], faces]),
         np.concatenate([noise[smooth], pieces.noise]),
+        np.concatenate([bulge[smooth], np.zeros(pieces.noise.size)]),
         np.concatenate([whole, strips]),
         np.concatenate([span, np.rint(pieces.heights).astype(np.int64)]),
         len(whole),

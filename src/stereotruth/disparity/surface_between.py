@@ -4,8 +4,8 @@ The points of a window are triangles over the ground (:mod:`.point_triangles`). 
 between points is known where its triangle goes on the plane of its neighbours; where heights step
 between points, nobody knows where in the triangle (:mod:`.smooth_triangles`). So
 
-1. a pixel's centre sees the nearest of the smooth triangles. Its disparity is linear in them: the
-   value is the LiDAR's, never that of a match;
+1. a pixel's centre sees the nearest of the smooth triangles. Its disparity is linear in them, or
+   quadratic where they bulge: the value is the LiDAR's, never that of a match;
 2. a triangle that spans a step may hold any surface between its lowest and highest vertex: the
    prism over it is drawn into both views. A pixel whose ray may meet a prism before its smooth
    triangle has no label, from either camera. Without this, 6 to 10 % of the hidden pixels
@@ -220,10 +220,11 @@ def _prisms_in_right(
 @kernel
 def _at_pixels(
     xy: Floats, h: Ints, classes: NDArray[np.uint8], count: Steps, corner: Steps, noise: Floats,
-    shown: Steps, first: tuple[int, int], slope: Floats, variance: Floats, height: Floats,
-    surface_class: NDArray[np.uint8],
+    bulge: Floats, shown: Steps, first: tuple[int, int], slope: Floats, variance: Floats,
+    height: Floats, rise: Floats, surface_class: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """What the triangle that each pixel shows has at its centre; ``variance`` in height steps²."""
+    """What the triangle that each pixel shows has at its centre, and the ``rise`` of the surface
+    above it; ``variance`` in height steps², ``height`` and ``rise`` in steps."""
     rows, cols = shown.shape
     for j in range(rows):
         for i in range(cols):
@@ -244,6 +245,7 @@ def _at_pixels(
             variance[j, i] = noise[t] * (
                 a * a / count[v[0]] + b * b / count[v[1]] + c * c / count[v[2]]
             )
+            rise[j, i] = bulge[t] * (a * b + b * c + c * a)
             height[j, i] = h[v[0]] + b * float(h[v[1]] - h[v[0]]) + c * float(h[v[2]] - h[v[0]])
             surface_class[j, i] = classes[v[0] if a >= b and a >= c else v[1] if b >= c else v[2]]
 
@@ -302,7 +304,8 @@ class Between:
     [2, h, w] and ``variance`` px² (of the points alone), ``height`` m and ``surface_class`` (ASPRS,
     of the nearest vertex) of the smooth triangle that is nearest, NaN (0) where there is none.
     ``highest``: disparity that a pixel has at most; ``rough``: whether a step of unknown surfaces
-    may be nearer. ``places``: the smooth triangles in both images.
+    may be nearer; ``bulging``: whether the surface bulges out of its triangle. ``places``: the
+    smooth triangles in both images.
     """
 
     outcome: NDArray[np.uint8]
@@ -313,6 +316,7 @@ class Between:
     surface_class: NDArray[np.uint8]
     highest: Floats
     rough: Bools
+    bulging: Bools
     places: Places
 
 
@@ -353,21 +357,23 @@ def surface_between(
 
     known = shown >= 0
     slope, variance, height = np.zeros((2, *shape)), np.zeros(shape), np.full(shape, np.nan)
+    rise = np.zeros(shape)
     classes = np.zeros(shape, np.uint8)
     _at_pixels(
-        xy, vertices.h_q, vertices.surface_class, vertices.count, corner, surface.noise, shown,
-        first, slope, variance, height, classes,
+        xy, vertices.h_q, vertices.surface_class, vertices.count, corner, surface.noise,
+        surface.bulge, shown, first, slope, variance, height, rise, classes,
     )  # fmt: skip
     outcome[(outcome == SHOWN) & (1.0 - slope[0] < LEAST_WIDTH)] = BEHIND_IN_RIGHT
     return Between(
         outcome=outcome,
-        disparity=np.where(known, nearest, np.nan),
+        disparity=np.where(known, nearest + rise * LATTICE_M * px_per_m, np.nan),
         slope=slope,
         variance=variance * (LATTICE_M * px_per_m) ** 2,
-        height=height * LATTICE_M,
+        height=(height + rise) * LATTICE_M,
         surface_class=classes,
         highest=np.maximum(before, nearest),
         rough=rough,
+        bulging=rise > 0.0,
         places=places,
     )
 
@@ -396,10 +402,11 @@ def between_labels(
     """Labels of a window whose first pixel is (row, col) ``first``, and the status of its pixels.
 
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
-    keep the label that these give if it is the surer one (one point is less than three around it),
-    or if ``keep_own``. Points of another surface tell of an edge in the pixel. Only where points
-    are so sparse that others show through between them (``porous``) those behind are hidden, as
-    the ground is that a tower leans over. ``left``, ``right``: patches that tell the frames.
+    keep the label that these give if it is the surer one (one point is less than three around it,
+    and no plane bulges), or if ``keep_own``. Points of another surface tell of an edge in the
+    pixel. Only where points are so sparse that others show through between them (``porous``) those
+    behind are hidden, as the ground is that a tower leans over. ``left``, ``right``: patches that
+    tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN
@@ -417,7 +424,7 @@ def between_labels(
         other = lift > STEP_PX if porous else np.abs(lift) > STEP_PX
         status[between_points & other] = Status.EDGE_IN_PIXEL
     status[measured] = Status.LABELLED
-    surer = measured & (keep_own | (own.variance <= between.variance))
+    surer = measured & (keep_own | ((own.variance <= between.variance) & ~between.bulging))
     return Labels(
         np.where(surer, own.disparity, np.where(is_labelled(status), between.disparity, np.nan)),
         np.where(surer, own.slope, between.slope),

@@ -28,6 +28,7 @@ def smooth_share(found) -> float:
 def test_slopes_are_smooth_and_noise_is_told(slope) -> None:
     found = surface_of(lambda x, y: slope * x)
     assert smooth_share(found) > 0.99
+    assert (found.bulge[inner(parts(found, found.smooth))] == 0.0).mean() > 0.97
     noise = found.noise[inner(parts(found, found.smooth))]
     assert np.sqrt(np.median(noise)) * LATTICE_M == pytest.approx(NOISE_M, rel=0.35)
 
@@ -60,6 +61,10 @@ def test_crowns_are_smooth_but_for_their_rims() -> None:
     top = in_crowns(smooth)
     off = smooth.h.mean(axis=1) - forest(smooth.x.mean(axis=1), smooth.y.mean(axis=1))
     assert np.abs(off[top]).max() < 1.0
+    # at its centre a triangle bulges by a third of the form's factor
+    bulging = off[top] + found.bulge[top] * LATTICE_M / 3.0
+    assert off[top].mean() < -0.08 and np.abs(bulging.mean()) < 0.03
+    assert np.abs(bulging).mean() < 0.6 * np.abs(off[top]).mean()
     assert np.ptp(smooth.h, axis=1).max() < 3.5
 
 
