@@ -14,7 +14,8 @@ HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pyproj", "ras
 }  # fmt: skip
 # What the job of each script uses in every run; a new one costs each of its jobs its import.
 STARTS = {
-    "simulate_image": {"numba", "rasterio", "scipy.spatial", "scipy.special"},
+    "simulate_image": {"numba", "rasterio"},
+    "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
     "align": {"cv2", "matplotlib", "numba", "rasterio"},
     "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special"},

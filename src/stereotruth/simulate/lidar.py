@@ -15,13 +15,13 @@ import pyproj
 from ..errors import InputError
 from ..kernels import kernel
 from ..products.files import replacing
+from .built_city import surfaces_of
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
 from .settings import Settings
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
-from .world import build_surfaces
 
 log = logging.getLogger("stereotruth")
 
@@ -208,11 +208,13 @@ def simulate_lidar_tile(
     *,
     spacing_m: float = Settings.lidar_spacing_m,
     seed: int,
+    built: str | Path | None = None,
 ) -> dict[str, int]:
     """Fly one LiDAR tile and write it as the city's LAS format says.
 
     ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together. ``seed``
-    draws noise, jitter and which pulses pass a crown. Returns the number of points by class.
+    draws noise, jitter and which pulses pass a crown. ``built``: the city's surfaces in a file, see
+    :func:`.built_city.surfaces_of`. Returns the number of points by class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
     """
     if tile_name not in lidar_files(city, scene):
@@ -222,7 +224,7 @@ def simulate_lidar_tile(
         )
     if not 0.1 <= spacing_m <= 5:
         raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
-    s: Surfaces = build_surfaces(city)
+    s: Surfaces = surfaces_of(city, built)
     frame = frame_of(city)
     cover = coverage(city, scene)
     box = tile_box(city, scene, tile_index(scene, tile_name))
