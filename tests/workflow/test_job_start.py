@@ -22,7 +22,7 @@ STARTS = {
     "rectify": {"dask", "numba", "rasterio", "zarr"},
     "project": {"dask", "numba", "zarr"},
     "project_strip": {"dask", "numba", "zarr"},
-    "grid_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "grid_truth": {"numba", "rasterio", "zarr"},
     "match": {"cv2", "rasterio"},
 }
 
