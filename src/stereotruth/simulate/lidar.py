@@ -200,6 +200,29 @@ def _header(city: CitySpec, offset: np.ndarray) -> laspy.LasHeader:
     return header
 
 
+def _record(
+    header: laspy.LasHeader, at: np.ndarray, info: np.ndarray
+) -> laspy.ScaleAwarePointRecord:
+    """Points in the LAS format of a header: coordinates [n, 3] and what :func:`_fly` tells [n, 6].
+
+    The fields are filled as they lie in the file. Nothing can overflow, so that laspy need not
+    look for what would, nor take flags apart and put them together.
+    """
+    record = laspy.ScaleAwarePointRecord.zeros(len(at), header=header)
+    fields = record.array
+    for axis, name in enumerate("XYZ"):
+        fields[name] = np.rint((at[:, axis] - header.offsets[axis]) / header.scales[axis])
+    label, number, returns, echo, angle, line = info.T
+    if header.point_format.id >= 6:
+        fields["classification"], fields["scan_angle"] = label, angle
+        fields["bit_fields"] = number | returns << 4
+    else:
+        fields["raw_classification"], fields["scan_angle_rank"] = label, angle // 167
+        fields["bit_fields"] = number | returns << 3
+    fields["intensity"], fields["point_source_id"] = echo, line
+    return record
+
+
 def simulate_lidar_tile(
     city: CitySpec,
     scene: SceneSpec,
@@ -245,7 +268,6 @@ def simulate_lidar_tile(
     info = np.empty((len(xyz), 6), np.int32)
     header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
     counts = np.zeros(32, np.int64)
-    modern = header.point_format.id >= 6
     with replacing(out_laz) as scratch, laspy.open(
         scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
     ) as writer:  # fmt: skip
@@ -253,19 +275,7 @@ def simulate_lidar_tile(
             n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
             if not n:
                 continue
-            record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-            east, north, height = grid(xyz[:n]).T
-            record.x, record.y, record.z = east, north, height
-            record.classification = info[:n, 0].astype(np.uint8)
-            record.return_number = info[:n, 1].astype(np.uint8)
-            record.number_of_returns = info[:n, 2].astype(np.uint8)
-            record.intensity = info[:n, 3].astype(np.uint16)
-            record.point_source_id = info[:n, 5].astype(np.uint16)
-            if modern:
-                record.scan_angle = info[:n, 4].astype(np.int16)
-            else:
-                record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
-            writer.write_points(record)
+            writer.write_points(_record(header, grid(xyz[:n]), info[:n]))
             counts += np.bincount(info[:n, 0], minlength=32)
     if not counts.sum():
         raise RuntimeError(
