@@ -17,6 +17,7 @@ STARTS = {
     "simulate_image": {"numba", "rasterio"},
     "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "ingest": {"laspy", "numba", "pyproj"},
     "align": {"cv2", "matplotlib", "numba", "rasterio"},
     "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special"},
     "rectify": {"dask", "numba", "rasterio", "zarr"},
