@@ -21,7 +21,7 @@ from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
 from .settings import Settings
-from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
+from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
 
 log = logging.getLogger("stereotruth")
 
@@ -74,7 +74,8 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             slant = ((line + 0.5 - 0.5 * strip) * LINE_SPACING_M - across) / FLYING_HEIGHT_M
             bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
             ax, ay = x - bx * ground, y - by * ground
-            z, kind, _, _, _, _, _ = cast(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
+            # the pulse meets the ground where it is aimed
+            z, kind, _, _ = above_ground(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
             if kind == 0:
                 continue
             chance = rng.random()
@@ -83,7 +84,7 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
             for k in range(returns):
                 if k == 1:
-                    z, kind, _, _, _, _, _ = cast(
+                    z, kind, _, _ = above_ground(
                         s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, False, ground
                     )
                     if kind == 0:

@@ -30,10 +30,10 @@ class Surfaces(NamedTuple):
     coefficients, ``step`` m apart. ``boxes`` float64[n, 8]: centre x, y, long axis ux, uy, half
     length, half width, z of the eaves, rise of the ridge. ``box_view`` uint8[n]: IN_IMAGES |
     IN_LIDAR. ``box_style`` float64[n, 4]: albedo of roof, of walls, kind of roof cover, phase.
-    ``trees`` float64[n, 5]: x, y, z of the centre, radius, half height. ``*_first``/``*_list``:
-    objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object in the cell. ``sun_top``
-    and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses. ``zones``,
-    ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`.
+    ``trees`` float64[n, 6]: x, y, z of the centre, radius, half height, square of their ratio.
+    ``*_first``/``*_list``: objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object
+    in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
+    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`.
     """
 
     x0: float
@@ -159,7 +159,7 @@ def box_span(boxes, n, ax, ay, bx, by):
 def tree_top(trees, n, ax, ay, bx, by):
     """Highest z of a ray inside a crown, or −1e30."""
     r2 = trees[n, 3] * trees[n, 3]
-    q = r2 / (trees[n, 4] * trees[n, 4])
+    q = trees[n, 5]
     x, y = ax + bx * trees[n, 2] - trees[n, 0], ay + by * trees[n, 2] - trees[n, 1]
     a = bx * bx + by * by + q
     b = x * bx + y * by

@@ -80,7 +80,7 @@ def build_surfaces(city: CitySpec) -> Surfaces:
     s = Surfaces(
         x0=box[0], y0=box[1], step=TERRAIN_STEP_M, terrain=terrain, water=water,
         boxes=np.zeros((0, 8)), box_view=np.zeros(0, np.uint8), box_style=np.zeros((0, 4)),
-        trees=np.zeros((0, 5)), box_first=none[0], box_list=none[1], tree_first=none[0],
+        trees=np.zeros((0, 6)), box_first=none[0], box_list=none[1], tree_first=none[0],
         tree_list=none[1], cell_top=np.full((ny, nx), -1e9, np.float32),
         sun_top=np.zeros((ny, nx), np.float32), lidar_top=np.zeros((ny, nx), np.float32),
         zones=np.zeros((0, 9)),
@@ -96,7 +96,7 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         boxes = np.array([[x, y, 1.0, 0.0, length / 2, width / 2, z, 0.0]])
         view = np.array([IN_IMAGES | IN_LIDAR], np.uint8)
         style = np.array([[0.4, 0.35, FLAT, 1.0]])
-        trees = np.zeros((0, 5))
+        trees = np.zeros((0, 6))
     else:
         build = place_buildings(city, rng, s, sites)
         boxes = np.array(build.boxes, dtype=np.float64).reshape(-1, 8)
