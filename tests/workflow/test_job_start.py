@@ -14,14 +14,16 @@ HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pyproj", "ras
 }  # fmt: skip
 # What the job of each script uses in every run; a new one costs each of its jobs its import.
 STARTS = {
-    "simulate_image": {"numba", "rasterio", "scipy.spatial", "scipy.special"},
+    "simulate_image": {"numba", "rasterio"},
+    "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "ingest": {"laspy", "numba", "pyproj"},
     "align": {"cv2", "matplotlib", "numba", "rasterio"},
     "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special"},
     "rectify": {"dask", "numba", "rasterio", "zarr"},
     "project": {"dask", "numba", "zarr"},
     "project_strip": {"dask", "numba", "zarr"},
-    "grid_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
+    "grid_truth": {"numba", "rasterio", "zarr"},
     "match": {"cv2", "rasterio"},
 }
 

@@ -17,7 +17,7 @@ def test_a_city_is_planned_from_nothing(project):
     jobs = project.plan("tiles/Qichun")
     assert jobs["export"] == 1
     assert jobs["align"] == jobs["refine"] == jobs["rectify"] == jobs["project"] == 2
-    assert jobs["simulate_image"] == 4
+    assert jobs["simulate_city"] == 1 and jobs["simulate_image"] == 4
     assert jobs["ingest"] == jobs["simulate_lidar"] >= 4
 
 

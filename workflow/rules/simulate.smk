@@ -1,4 +1,29 @@
+rule simulate_city:
+    output:
+        surfaces="data/synthetic/{city}/surfaces.npz",
+    log:
+        "logs/simulate_city/{city}.log",
+    benchmark:
+        "logs/simulate_city/{city}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=30,
+    params:
+        made=lambda w: making_of(rules.simulate_city, w),
+        script=content_of("../scripts/simulate_city.py"),
+        code=source_digest("simulate.built_city"),
+    message:
+        "Building synthetic city {wildcards.city}"
+    script:
+        "../scripts/simulate_city.py"
+
+
 rule simulate_image:
+    input:
+        surfaces=rules.simulate_city.output.surfaces,
     output:
         image="data/synthetic/{city}/{scene}/{view}.tif",
     log:
@@ -23,6 +48,8 @@ rule simulate_image:
 
 
 rule simulate_lidar:
+    input:
+        surfaces=rules.simulate_city.output.surfaces,
     output:
         lidar="data/synthetic/{city}/{scene}/lidar/{tile}",
     log:

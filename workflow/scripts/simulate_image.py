@@ -13,4 +13,11 @@ if __name__ == "__main__":
         job(snakemake.log[0], f"simulate {scene.name} {view}"),
         publication(snakemake.input, snakemake.output, snakemake.params.made),
     ):
-        simulate_image(city, scene, view, snakemake.output.image, seed=snakemake.params.seed)
+        simulate_image(
+            city,
+            scene,
+            view,
+            snakemake.output.image,
+            seed=snakemake.params.seed,
+            built=snakemake.input.surfaces,
+        )

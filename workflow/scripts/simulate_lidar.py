@@ -20,4 +20,5 @@ if __name__ == "__main__":
             snakemake.output.lidar,
             spacing_m=snakemake.params.spacing_m,
             seed=snakemake.params.seed,
+            built=snakemake.input.surfaces,
         )

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import re
-import struct
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pyproj
-import rasterio
 from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
-from rasterio.io import MemoryFile
 
 from ..errors import InputError
 from .lattice import DEGREE_M
@@ -139,27 +135,6 @@ def parse_crs(text: str) -> LidarCRS:
         ) from error
 
 
-def _geokeys_tiff(shorts: np.ndarray, doubles: bytes, text: bytes) -> bytes:
-    """A TIFF of one pixel that carries the GeoKeys of a LAS file, for GDAL to interpret."""
-    blobs = {
-        33550: (12, 3, struct.pack("<3d", 1, 1, 0)),
-        33922: (12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),
-        34735: (3, shorts.size, shorts.astype("<u2").tobytes()),
-        34736: (12, len(doubles) // 8, doubles[: len(doubles) // 8 * 8]),
-        34737: (2, len(text), text),
-    }
-    blobs = {tag: blob for tag, blob in blobs.items() if blob[1]}
-    plain = {256: 1, 257: 1, 258: 8, 259: 1, 262: 1, 277: 1, 278: 1, 279: 1}
-    end = 8 + 2 + 12 * (len(plain) + 1 + len(blobs)) + 4
-    entries = [(tag, 4, 1, value) for tag, value in plain.items()] + [(273, 4, 1, end)]
-    data = bytes(8)
-    for tag, (kind, count, blob) in blobs.items():
-        entries.append((tag, kind, count, end + len(data)))
-        data += blob + bytes(8 - len(blob) % 8)
-    directory = b"".join(struct.pack("<HHII", *entry) for entry in sorted(entries))
-    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
-
-
 def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS | None:
     """The system of GeoKeys, user-defined projections and vertical keys included.
 
@@ -167,18 +142,13 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
     key is honoured here.
     """
+    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
+
     keys = shorts[4:].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
     keys = keys[np.argsort(keys[:, 0], kind="stable")]
     shorts = np.concatenate([[1, 1, 0, len(keys)], keys.ravel()])
-    with (
-        rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
-        MemoryFile(_geokeys_tiff(shorts, doubles, text)) as memory,
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")  # "not georeferenced"
-        with memory.open() as tiff:
-            wkt = tiff.crs.to_wkt() if tiff.crs else ""
+    wkt = wkt_of_geokeys(shorts, doubles, text)
     if not wkt:
         return None
     meaning = interpret(CRS.from_wkt(wkt))
@@ -233,7 +203,7 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def attempt(what: str, read) -> None:
         try:
             meaning = read()
-        except (ProjError, ValueError, rasterio.errors.RasterioError) as error:
+        except (ProjError, ValueError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
             if meaning is not None:

@@ -28,6 +28,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import laspy
 import numpy as np
@@ -39,8 +40,10 @@ from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
-from .geoid import GeoidGrid
 from .projection_polynomials import PatchedTransform
+
+if TYPE_CHECKING:
+    from .geoid import GeoidGrid
 
 WGS84_3D = "EPSG:4979"
 
@@ -216,7 +219,11 @@ def to_wgs84(
     transform = transformer.transform
     if system.horizontal.is_projected:
         transform = PatchedTransform(transform, system.horizontal_unit_m)
-    grid = GeoidGrid(Path(geoid)) if geoid else None
+    grid = None
+    if geoid:
+        from .geoid import GeoidGrid  # GDAL, which few scenes need
+
+        grid = GeoidGrid(Path(geoid))
     ellipsoid = system.horizontal.ellipsoid
     modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
     if geoid:

@@ -46,8 +46,11 @@ def zone_at(s, x, y):
     zone = s.zone_cells[min(max(j, 0), ny - 1), min(max(i, 0), nx - 1)]
     if zone >= 0:
         return zone
-    best = 1e30
-    for n in range(s.zones.shape[0]):
+    row, best = -1 - zone, 1e30
+    for k in range(s.zone_near.shape[1]):
+        n = s.zone_near[row, k]
+        if n < 0:
+            break
         dx, dy = x - s.zones[n, 0], y - s.zones[n, 1]
         d = dx * dx + dy * dy
         if d < best:

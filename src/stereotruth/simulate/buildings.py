@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .cities import CitySpec
-from .layout import BUILT, ZONE_KINDS, half_size, image_axes, scene_coordinates
+from .layout import half_size, image_axes, scene_coordinates
 from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, terrain_heights
+from .zones import BUILT, ZONE_KINDS
 
 FLAT, GRAVEL, TILES, SHEET = range(4)
 

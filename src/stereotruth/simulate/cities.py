@@ -40,7 +40,7 @@ class Character:
     ``relief_m``: height range aimed at over the world; ``valley``: share of it that is plain;
     ``wavelength_m``: that of the largest relief; ``max_slope_deg``: nothing is steeper.
     ``river_m``: width of the river, 0 for none; ``lakes``: depth of depressions below the water
-    level, 0 for none. ``zones``: weight of each land use, see ``world.ZONE_KINDS``. ``towers_m``:
+    level, 0 for none. ``zones``: weight of each land use, see ``zones.ZONE_KINDS``. ``towers_m``:
     range of heights of high buildings. ``trees``: factor on the number of trees. ``zone_m``: mean
     distance between the centres of zones.
     """

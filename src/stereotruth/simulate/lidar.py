@@ -15,13 +15,13 @@ import pyproj
 from ..errors import InputError
 from ..kernels import kernel
 from ..products.files import replacing
+from .built_city import surfaces_of
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
 from .settings import Settings
-from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, cast, terrain_at
-from .world import build_surfaces
+from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
 
 log = logging.getLogger("stereotruth")
 
@@ -74,7 +74,8 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             slant = ((line + 0.5 - 0.5 * strip) * LINE_SPACING_M - across) / FLYING_HEIGHT_M
             bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
             ax, ay = x - bx * ground, y - by * ground
-            z, kind, _, _, _, _, _ = cast(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
+            # the pulse meets the ground where it is aimed
+            z, kind, _, _ = above_ground(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
             if kind == 0:
                 continue
             chance = rng.random()
@@ -83,7 +84,7 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
             for k in range(returns):
                 if k == 1:
-                    z, kind, _, _, _, _, _ = cast(
+                    z, kind, _, _ = above_ground(
                         s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, False, ground
                     )
                     if kind == 0:
@@ -200,6 +201,29 @@ def _header(city: CitySpec, offset: np.ndarray) -> laspy.LasHeader:
     return header
 
 
+def _record(
+    header: laspy.LasHeader, at: np.ndarray, info: np.ndarray
+) -> laspy.ScaleAwarePointRecord:
+    """Points in the LAS format of a header: coordinates [n, 3] and what :func:`_fly` tells [n, 6].
+
+    The fields are filled as they lie in the file. Nothing can overflow, so that laspy need not
+    look for what would, nor take flags apart and put them together.
+    """
+    record = laspy.ScaleAwarePointRecord.zeros(len(at), header=header)
+    fields = record.array
+    for axis, name in enumerate("XYZ"):
+        fields[name] = np.rint((at[:, axis] - header.offsets[axis]) / header.scales[axis])
+    label, number, returns, echo, angle, line = info.T
+    if header.point_format.id >= 6:
+        fields["classification"], fields["scan_angle"] = label, angle
+        fields["bit_fields"] = number | returns << 4
+    else:
+        fields["raw_classification"], fields["scan_angle_rank"] = label, angle // 167
+        fields["bit_fields"] = number | returns << 3
+    fields["intensity"], fields["point_source_id"] = echo, line
+    return record
+
+
 def simulate_lidar_tile(
     city: CitySpec,
     scene: SceneSpec,
@@ -208,11 +232,13 @@ def simulate_lidar_tile(
     *,
     spacing_m: float = Settings.lidar_spacing_m,
     seed: int,
+    built: str | Path | None = None,
 ) -> dict[str, int]:
     """Fly one LiDAR tile and write it as the city's LAS format says.
 
     ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together. ``seed``
-    draws noise, jitter and which pulses pass a crown. Returns the number of points by class.
+    draws noise, jitter and which pulses pass a crown. ``built``: the city's surfaces in a file, see
+    :func:`.built_city.surfaces_of`. Returns the number of points by class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
     """
     if tile_name not in lidar_files(city, scene):
@@ -222,7 +248,7 @@ def simulate_lidar_tile(
         )
     if not 0.1 <= spacing_m <= 5:
         raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
-    s: Surfaces = build_surfaces(city)
+    s: Surfaces = surfaces_of(city, built)
     frame = frame_of(city)
     cover = coverage(city, scene)
     box = tile_box(city, scene, tile_index(scene, tile_name))
@@ -243,7 +269,6 @@ def simulate_lidar_tile(
     info = np.empty((len(xyz), 6), np.int32)
     header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
     counts = np.zeros(32, np.int64)
-    modern = header.point_format.id >= 6
     with replacing(out_laz) as scratch, laspy.open(
         scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
     ) as writer:  # fmt: skip
@@ -251,19 +276,7 @@ def simulate_lidar_tile(
             n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
             if not n:
                 continue
-            record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-            east, north, height = grid(xyz[:n]).T
-            record.x, record.y, record.z = east, north, height
-            record.classification = info[:n, 0].astype(np.uint8)
-            record.return_number = info[:n, 1].astype(np.uint8)
-            record.number_of_returns = info[:n, 2].astype(np.uint8)
-            record.intensity = info[:n, 3].astype(np.uint16)
-            record.point_source_id = info[:n, 5].astype(np.uint16)
-            if modern:
-                record.scan_angle = info[:n, 4].astype(np.int16)
-            else:
-                record.scan_angle_rank = (info[:n, 4] // 167).astype(np.int8)
-            writer.write_points(record)
+            writer.write_points(_record(header, grid(xyz[:n]), info[:n]))
             counts += np.bincount(info[:n, 0], minlength=32)
     if not counts.sum():
         raise RuntimeError(

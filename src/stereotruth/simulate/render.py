@@ -17,19 +17,28 @@ from ..job import progress
 from ..kernels import inlined, kernel
 from ..products.files import replacing
 from .appearance import reflectance
+from .built_city import surfaces_of
 from .camera import aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
-from .surfaces import IN_IMAGES, Surfaces, cast, horizon, terrain_heights
-from .world import build_surfaces
+from .surfaces import (
+    IN_IMAGES,
+    NONE,
+    Surfaces,
+    above_ground,
+    ground_hit,
+    horizon,
+    terrain_heights,
+)
 
 log = logging.getLogger("stereotruth")
 
 
 FULL_SCALE = 2047  # 11 bits
 STRIP_ROWS = 128
+LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a time
 PSF_SIGMA_PX = 0.42
 RPC_MARGIN_M = 130.0
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
@@ -57,14 +66,17 @@ class ImagedScene(NamedTuple):
     right: Camera
 
 
-def prepare(city: CitySpec, scene: SceneSpec) -> ImagedScene:
-    """World and cameras of a scene; kept for further calls of the same process."""
-    return _prepare(city, scene)
+def prepare(city: CitySpec, scene: SceneSpec, built: str | Path | None = None) -> ImagedScene:
+    """World and cameras of a scene; kept for further calls of the same process.
+
+    ``built``: the city's surfaces in a file, see :func:`.built_city.surfaces_of`.
+    """
+    return _prepare(city, scene, None if built is None else Path(built))
 
 
 @lru_cache(maxsize=4)
-def _prepare(city: CitySpec, scene: SceneSpec) -> ImagedScene:
-    surfaces = build_surfaces(city)
+def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScene:
+    surfaces = surfaces_of(city, built)
     frame = frame_of(city)
     # heights of the ground that the left image can show
     ny, nx = surfaces.cell_top.shape
@@ -123,29 +135,54 @@ def in_collar(left, col, row, cols, rows):
     return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
 
 
+@inlined
+def _ray(cam, line, col):
+    """(ax, ay, bx, by) of the ray of a column of a line."""
+    dx, dy, dz = direction(cam, line, col)
+    bx, by = dx / dz, dy / dz
+    return line[0] - bx * line[2], line[1] - by * line[2], bx, by
+
+
 @kernel
 def _shade_rows(s, above, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
 
-    ``first_row`` is the image row of out's row 0; out's column 0 is image column −2.
+    ``first_row`` is the image row of out's row 0; out's column 0 is image column −2. Where the
+    ground is follows from where it was a column before. Several rows go side by side, so that the
+    processor need not wait for one to end before it begins with another.
     """
-    line = np.empty(12)
-    guess = before = 0.0
-    for r in range(out.shape[0]):
-        pose(cam, first_row - 0.25 + 0.5 * r, line)
-        for c in range(out.shape[1]):
-            dx, dy, dz = direction(cam, line, -2.25 + 0.5 * c)
-            bx, by = dx / dz, dy / dz
-            ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-            z, kind, index, face, ground, zx, zy = cast(
-                s, above, ax, ay, bx, by, IN_IMAGES, True, guess
-            )
-            guess = ground + (ground - before) if c else ground  # the ground goes on as it did
-            before = ground
-            if kind == 0:
-                out[r, c] = 0.1
-            else:
-                out[r, c] = reflectance(s, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy)
+    lines = np.empty((LANES, 12))
+    ground, before = np.zeros(LANES), np.zeros(LANES)
+    hits = np.empty((LANES, BLOCK, 3))
+    for r0 in range(0, out.shape[0], LANES):
+        lanes = min(LANES, out.shape[0] - r0)
+        for k in range(lanes):
+            pose(cam, first_row - 0.25 + 0.5 * (r0 + k), lines[k])
+        for c0 in range(0, out.shape[1], BLOCK):
+            columns = min(BLOCK, out.shape[1] - c0)
+            for n in range(columns):
+                for k in range(lanes):
+                    ax, ay, bx, by = _ray(cam, lines[k], -2.25 + 0.5 * (c0 + n))
+                    guess = ground[k]
+                    if c0 + n:  # the ground goes on as it did
+                        guess += ground[k] - before[k]
+                    before[k] = ground[k]
+                    z, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
+                    ground[k] = z
+                    hits[k, n, 0], hits[k, n, 1], hits[k, n, 2] = z, zx, zy
+            for k in range(lanes):
+                for n in range(columns):
+                    ax, ay, bx, by = _ray(cam, lines[k], -2.25 + 0.5 * (c0 + n))
+                    z, kind, index, face = above_ground(
+                        s, above, ax, ay, bx, by, IN_IMAGES, True, hits[k, n, 0]
+                    )
+                    value = 0.1
+                    if kind != NONE:
+                        value = reflectance(
+                            s, ax + bx * z, ay + by * z, z, kind, index, face,
+                            hits[k, n, 1], hits[k, n, 2],
+                        )  # fmt: skip
+                    out[r0 + k, c0 + n] = value
 
 
 def _decimate(half: np.ndarray) -> np.ndarray:
@@ -175,17 +212,23 @@ def _rpc_metadata(rpc: FittedRPC) -> RPCMetadata:
 
 
 def simulate_image(
-    city: CitySpec, scene: SceneSpec, view: str, out_tif: str | Path, *, seed: int
+    city: CitySpec,
+    scene: SceneSpec,
+    view: str,
+    out_tif: str | Path,
+    *,
+    seed: int,
+    built: str | Path | None = None,
 ) -> dict[str, float]:
     """Render the ``"left"`` (backward) or ``"right"`` (forward) image of a scene.
 
     Writes uint16 [rows, cols] of 11 bits with nodata 0 and the RPCs as TIFF metadata. ``seed``
-    draws the sensor noise only. Returns the image size and how well the RPCs follow the camera
-    (their bias apart). Raises InputError for another view.
+    draws the sensor noise only; ``built`` is that of :func:`prepare`. Returns the image size and
+    how well the RPCs follow the camera (their bias apart). Raises InputError for another view.
     """
     if view not in ("left", "right"):
         raise InputError(f"no view {view!r}", remedy="ask for left or right")
-    ready = prepare(city, scene)
+    ready = prepare(city, scene, built)
     camera: Camera = getattr(ready, view)
     log.info(
         "%s %s: %d x %d px; RPCs follow the camera within %.1e px rms (bias apart)",

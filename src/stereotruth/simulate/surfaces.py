@@ -30,9 +30,10 @@ class Surfaces(NamedTuple):
     coefficients, ``step`` m apart. ``boxes`` float64[n, 8]: centre x, y, long axis ux, uy, half
     length, half width, z of the eaves, rise of the ridge. ``box_view`` uint8[n]: IN_IMAGES |
     IN_LIDAR. ``box_style`` float64[n, 4]: albedo of roof, of walls, kind of roof cover, phase.
-    ``trees`` float64[n, 5]: x, y, z of the centre, radius, half height. ``*_first``/``*_list``:
-    objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object in the cell. ``sun_top``
-    and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses. ``zones``: see ``world``.
+    ``trees`` float64[n, 6]: x, y, z of the centre, radius, half height, square of their ratio.
+    ``*_first``/``*_list``: objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object
+    in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
+    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`.
     """
 
     x0: float
@@ -53,6 +54,7 @@ class Surfaces(NamedTuple):
     lidar_top: np.ndarray
     zones: np.ndarray
     zone_cells: np.ndarray
+    zone_near: np.ndarray
     fine: np.ndarray
     broad: np.ndarray
     sun: np.ndarray
@@ -157,7 +159,7 @@ def box_span(boxes, n, ax, ay, bx, by):
 def tree_top(trees, n, ax, ay, bx, by):
     """Highest z of a ray inside a crown, or −1e30."""
     r2 = trees[n, 3] * trees[n, 3]
-    q = r2 / (trees[n, 4] * trees[n, 4])
+    q = trees[n, 5]
     x, y = ax + bx * trees[n, 2] - trees[n, 0], ay + by * trees[n, 2] - trees[n, 1]
     a = bx * bx + by * by + q
     b = x * bx + y * by
@@ -179,6 +181,13 @@ def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
     sought.
     """
     ground, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
+    best, kind, index, face = above_ground(s, horizon, ax, ay, bx, by, view, trees, ground)
+    return best, kind, index, face, ground, zx, zy
+
+
+@inlined
+def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
+    """z, kind, object, face of the first surface on a ray that meets the ground at z ``ground``."""
     best, kind, index, face = ground, GROUND, -1, 0
     if best < s.water:
         best, kind = s.water, WATER
@@ -186,10 +195,10 @@ def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
     ny, nx = s.cell_top.shape
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
-        return best, NONE, index, face, ground, zx, zy
+        return best, NONE, index, face
     z = best
     if z >= horizon[j, i]:
-        return best, kind, index, face, ground, zx, zy
+        return best, kind, index, face
     # cells upward along the ray; the next border is crossed at next_x or next_y
     forward_x, forward_y = bx > 0, by > 0
     step_x, step_y = 1 if forward_x else -1, 1 if forward_y else -1
@@ -228,20 +237,20 @@ def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
             j += step_y
         if i < 0 or j < 0 or i >= nx or j >= ny:
             break
-    return best, kind, index, face, ground, zx, zy
+    return best, kind, index, face
 
 
 @inlined
 def in_shadow(s, x, y, z):
     """Whether a building or tree stands between a surface point and the sun."""
-    bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
-    ax, ay = x - bx * z, y - by * z
     ny, nx = s.cell_top.shape
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
         return False
     if z >= s.sun_top[j, i]:
         return False
+    bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
+    ax, ay = x - bx * z, y - by * z
     clear = z + 0.02
     step_x = 1 if bx > 0 else -1
     step_y = 1 if by > 0 else -1

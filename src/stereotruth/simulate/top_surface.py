@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..kernels import kernel
+from .built_city import surfaces_of
 from .cities import CitySpec
 from .layout import frame_of
 from .surfaces import IN_IMAGES, cast
-from .world import build_surfaces
 
 PASSES = 2  # up is the ellipsoid's normal at the city's centre: the place follows from the height
 
@@ -29,7 +29,7 @@ def top_surface(
     Of any one shape. ``view``: the world that the images see, or that of the LiDAR (IN_LIDAR).
     Kinds are those of :mod:`.surfaces`; outside the city NONE, and heights NaN.
     """
-    surfaces, frame = build_surfaces(city), frame_of(city)
+    surfaces, frame = surfaces_of(city), frame_of(city)
     lon, lat = (np.asarray(v, dtype=np.float64) for v in (lon, lat))
     at = [lon.ravel(), lat.ravel()]
     height = np.full(lon.size, city.base_height_m)

@@ -14,7 +14,7 @@ from .terrain import TEXTURE_SIZE
 def place_trees(
     city: CitySpec, rng: np.random.Generator, s: Surfaces, sites: cKDTree, boxes: np.ndarray
 ) -> np.ndarray:
-    """Crowns float64[n, 5] on a jittered grid, as dense as the land use has them."""
+    """Crowns float64[n, 6] on a jittered grid, as dense as the land use has them."""
     ny, nx = s.cell_top.shape
     pitch = 6.4
     columns, rows = int(nx * CELL_M / pitch), int(ny * CELL_M / pitch)
@@ -52,7 +52,9 @@ def place_trees(
     radius = np.where(wood, rng.uniform(2.6, 4.4, len(xy)), rng.uniform(1.5, 3.1, len(xy)))
     half = radius * rng.uniform(0.75, 1.1, len(xy))
     trunk = rng.uniform(0.2, 2.2, len(xy)) + np.where(wood, 2.0, 0.0)
-    trees = np.column_stack([xy, ground + trunk + half, radius, half])
+    trees = np.column_stack(
+        [xy, ground + trunk + half, radius, half, radius * radius / (half * half)]
+    )
     if len(boxes) and len(trees):  # no crown through a wall
         near = cKDTree(boxes[:, :2])
         biggest = np.hypot(boxes[:, 4], boxes[:, 5])

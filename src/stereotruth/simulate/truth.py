@@ -18,7 +18,7 @@ from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
 from .lidar_coverage import coverage, covered
 from .render import in_collar, prepare
-from .surfaces import IN_IMAGES, IN_LIDAR, NONE, cast
+from .surfaces import IN_IMAGES, IN_LIDAR, NONE, above_ground, cast
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -118,7 +118,7 @@ def _truth_points(
             and right_row <= size[3] - 1
             and not in_collar(not is_left, col, right_row, size[2], size[3])
         )
-        scanned, _, _, _, _, _, _ = cast(s, above_left, ax, ay, bx, by, IN_LIDAR, True, guess)
+        scanned, _, _, _ = above_ground(s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground)
         changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
         real[0, k], real[1, k], real[2, k] = lon, lat, height
         real[3, k], real[4, k] = col, right_row

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import logging
 import math
-from functools import lru_cache
 
 import numpy as np
 
 from ..kernels import kernel
 from .buildings import FLAT, choose_changed, place_buildings
 from .cities import CitySpec
-from .layout import draw_zones, extent
+from .layout import extent
 from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, horizon, lidar_horizon, terrain_heights
 from .terrain import (
     BROAD_STEP_M,
@@ -26,6 +25,7 @@ from .terrain import (
     spectral_noise,
 )
 from .trees import place_trees
+from .zones import draw_zones
 
 log = logging.getLogger("stereotruth")
 
@@ -62,12 +62,7 @@ def _cells(half: np.ndarray, xy: np.ndarray, s: Surfaces) -> tuple[np.ndarray, n
 
 
 def build_surfaces(city: CitySpec) -> Surfaces:
-    """Everything that stands in a city, ready for casting rays. About a second."""
-    return _build(city)
-
-
-@lru_cache(maxsize=2)
-def _build(city: CitySpec) -> Surfaces:
+    """Everything that stands in a city, ready for casting rays. Some seconds."""
     rng = np.random.default_rng([city.world_seed, 0])
     box = extent(city)
     nx, ny = round((box[2] - box[0]) / CELL_M), round((box[3] - box[1]) / CELL_M)
@@ -85,22 +80,23 @@ def _build(city: CitySpec) -> Surfaces:
     s = Surfaces(
         x0=box[0], y0=box[1], step=TERRAIN_STEP_M, terrain=terrain, water=water,
         boxes=np.zeros((0, 8)), box_view=np.zeros(0, np.uint8), box_style=np.zeros((0, 4)),
-        trees=np.zeros((0, 5)), box_first=none[0], box_list=none[1], tree_first=none[0],
+        trees=np.zeros((0, 6)), box_first=none[0], box_list=none[1], tree_first=none[0],
         tree_list=none[1], cell_top=np.full((ny, nx), -1e9, np.float32),
         sun_top=np.zeros((ny, nx), np.float32), lidar_top=np.zeros((ny, nx), np.float32),
         zones=np.zeros((0, 9)),
-        zone_cells=np.zeros((0, 0), np.int32), fine=fine.astype(np.float32),
+        zone_cells=np.zeros((0, 0), np.int32),
+        zone_near=np.zeros((0, 0), np.int32), fine=fine.astype(np.float32),
         broad=broad.astype(np.float32), sun=sun,
     )  # fmt: skip
-    zones, zone_cells, sites = draw_zones(city, rng, s)
-    s = s._replace(zones=zones, zone_cells=zone_cells)
+    zones, zone_cells, zone_near, sites = draw_zones(city, rng, s)
+    s = s._replace(zones=zones, zone_cells=zone_cells, zone_near=zone_near)
     if city.single_box is not None:
         x, y, length, width, height = city.single_box
         z = terrain_heights(s, np.array([[x, y]]))[0, 0] + height
         boxes = np.array([[x, y, 1.0, 0.0, length / 2, width / 2, z, 0.0]])
         view = np.array([IN_IMAGES | IN_LIDAR], np.uint8)
         style = np.array([[0.4, 0.35, FLAT, 1.0]])
-        trees = np.zeros((0, 5))
+        trees = np.zeros((0, 6))
     else:
         build = place_buildings(city, rng, s, sites)
         boxes = np.array(build.boxes, dtype=np.float64).reshape(-1, 8)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stereotruth.simulate import layout, world
+from stereotruth.simulate import layout
+from stereotruth.simulate.built_city import surfaces_of
 from stereotruth.simulate.cities import (
     CITIES,
     CitySpec,
@@ -21,7 +22,7 @@ from ...synthetic.small_cities import ROOT, read_points
 
 @pytest.mark.parametrize("city", CITIES.values(), ids=list(CITIES))
 def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
-    surfaces = world.build_surfaces(city)
+    surfaces = surfaces_of(city)
     slope = np.hypot(*np.gradient(surfaces.terrain, surfaces.step))
     assert math.degrees(math.atan(slope.max())) < 51
     relief = np.ptp(surfaces.terrain)

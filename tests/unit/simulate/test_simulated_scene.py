@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import rasterio
 
 from stereotruth.products.provenance import source_modules
-from stereotruth.simulate import world
+from stereotruth.simulate import built_city
 from stereotruth.simulate.cities import (
     lidar_files,
 )
@@ -18,7 +19,7 @@ from ...synthetic.small_cities import TOWN
 
 
 def test_same_spec_gives_the_same_files(town: Path, tmp_path: Path) -> None:
-    world._build.cache_clear()
+    built_city.surfaces_of.__globals__["_surfaces_of"].cache_clear()
     prepare.__globals__["_prepare"].cache_clear()
     scene = TOWN.scenes[0]
     name = lidar_files(TOWN, scene)[1]
@@ -30,6 +31,24 @@ def test_same_spec_gives_the_same_files(town: Path, tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "other.tif") as a, rasterio.open(town / "right.tif") as b:
         difference = a.read(1).astype(float) - b.read(1)
     assert 2 < difference.std() < 12  # only the sensor's noise is drawn again
+
+
+def test_a_built_city_in_a_file_gives_the_same_files(town: Path, tmp_path: Path) -> None:
+    scene = TOWN.scenes[0]
+    name = lidar_files(TOWN, scene)[1]
+    built = tmp_path / "surfaces.npz"
+    built_city.write_surfaces(TOWN, built)
+    simulate_image(TOWN, scene, "left", tmp_path / "left.tif", seed=1, built=built)
+    simulate_lidar_tile(TOWN, scene, name, tmp_path / name, seed=1, built=built)
+    assert (tmp_path / "left.tif").read_bytes() == (town / "left.tif").read_bytes()
+    assert (tmp_path / name).read_bytes() == (town / "lidar" / name).read_bytes()
+    built_city.write_surfaces(TOWN, tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == built.read_bytes()
+    flooded = tmp_path / "flooded.npz"  # the file is what is looked at
+    with flooded.open("wb") as stream:
+        np.savez(stream, **built_city.surfaces_of(TOWN)._replace(water=1e4)._asdict())
+    simulate_image(TOWN, scene, "left", tmp_path / "sea.tif", seed=1, built=flooded)
+    assert (tmp_path / "sea.tif").read_bytes() != (town / "left.tif").read_bytes()
 
 
 def test_shares_no_code_with_the_pipeline() -> None:

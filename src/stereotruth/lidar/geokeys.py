@@ -1,0 +1,51 @@
+"""GeoTIFF keys of a LAS file as WKT: GDAL knows what they mean."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+
+import numpy as np
+import rasterio
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+
+
+def _geokeys_tiff(shorts: np.ndarray, doubles: bytes, text: bytes) -> bytes:
+    """A TIFF of one pixel that carries the GeoKeys of a LAS file, for GDAL to interpret."""
+    blobs = {
+        33550: (12, 3, struct.pack("<3d", 1, 1, 0)),
+        33922: (12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),
+        34735: (3, shorts.size, shorts.astype("<u2").tobytes()),
+        34736: (12, len(doubles) // 8, doubles[: len(doubles) // 8 * 8]),
+        34737: (2, len(text), text),
+    }
+    blobs = {tag: blob for tag, blob in blobs.items() if blob[1]}
+    plain = {256: 1, 257: 1, 258: 8, 259: 1, 262: 1, 277: 1, 278: 1, 279: 1}
+    end = 8 + 2 + 12 * (len(plain) + 1 + len(blobs)) + 4
+    entries = [(tag, 4, 1, value) for tag, value in plain.items()] + [(273, 4, 1, end)]
+    data = bytes(8)
+    for tag, (kind, count, blob) in blobs.items():
+        entries.append((tag, kind, count, end + len(data)))
+        data += blob + bytes(8 - len(blob) % 8)
+    directory = b"".join(struct.pack("<HHII", *entry) for entry in sorted(entries))
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
+
+
+def wkt_of_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> str:
+    """The system of GeoKeys, "" if they name none.
+
+    ``shorts`` uint16[n], ``doubles``, ``text``: the records 34735, 34736 and 34737. Raises
+    ValueError if GDAL cannot read them.
+    """
+    try:
+        with (
+            rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
+            MemoryFile(_geokeys_tiff(shorts, doubles, text)) as memory,
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")  # "not georeferenced"
+            with memory.open() as tiff:
+                return tiff.crs.to_wkt() if tiff.crs else ""
+    except RasterioError as error:
+        raise ValueError(str(error)) from error
