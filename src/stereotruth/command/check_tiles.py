@@ -18,9 +18,9 @@ NODES = 128  # along the longer side of the grid
 # Measured with bench/density.py: share of visible pixels with a label by points a pixel.
 POINTS_PER_PX = (0.0, 0.105, 0.21, 0.42, 0.85, 1.7, 2.6)
 LABELLED = {
-    "none": (0.0, 0.099, 0.188, 0.347, 0.598, 0.871, 0.95),
-    "surface": (0.0, 0.799, 0.852, 0.895, 0.927, 0.947, 0.956),
-    "surface_and_images": (0.0, 0.860, 0.884, 0.909, 0.932, 0.949, 0.957),
+    "none": (0.0, 0.084, 0.172, 0.332, 0.586, 0.873, 0.965),
+    "surface": (0.0, 0.811, 0.869, 0.909, 0.936, 0.956, 0.965),
+    "surface_and_images": (0.0, 0.862, 0.894, 0.920, 0.940, 0.957, 0.966),
 }
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
