@@ -146,17 +146,17 @@ def outvoted(
     return surface_mean(against, disparity, slope) > 0.5
 
 
-def usual_correlation(
+def _usual(
     correlation: NDArray[np.floating],
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     threshold: float,
     trust: float,
 ) -> Singles:
-    """What pixels [h, w] correlate by if they are as usual on their surface around them.
+    """What pixels [h, w] correlate by at least if they are as usual on their surface around them.
 
     That is ``threshold``, or more: the share USUAL of the mean up to VOTE_PX off, since noise
-    lowers both. ``trust`` (0 to 1): how far the points miss nothing; with less, more is asked for.
+    lowers both. With less ``trust`` more is asked for.
     """
     usual = 1.0 - (1.0 - USUAL) * trust
     return np.fmax(usual * surface_mean(correlation, disparity, slope), threshold)
@@ -166,28 +166,41 @@ def outvoted_nearby(
     correlation: NDArray[np.floating],
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
-    usual: Singles,
+    threshold: float,
     trust: float,
 ) -> Bools:
-    """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is ``usual`` there.
+    """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
 
-    Small things are found that :func:`outvoted` lets their surroundings outvote. With less
-    ``trust`` (:func:`usual_correlation`) fewer failures are enough.
+    That is less than ``threshold``, or than the share USUAL of the mean over their surface up to
+    VOTE_PX off. Small things are found that :func:`outvoted` lets their surroundings outvote.
+    ``trust`` (0 to 1): how far the points miss nothing; with less, more of the usual correlation
+    is asked for, and fewer failures are enough.
     """
-    against = np.where(np.isfinite(correlation), correlation < usual, np.nan)
+    least = _usual(correlation, disparity, slope, threshold, trust)
+    against = np.where(np.isfinite(correlation), correlation < least, np.nan)
     share = NEARBY_SHARE * float(np.sqrt(trust))
     return surface_mean(against, disparity, slope, NEARBY_PX, 1) > share
 
 
-def beside_changes(changed: Bools, correlation: NDArray[np.floating], usual: Singles) -> Bools:
-    """Pixels [h, w] that correlate less than is ``usual``, no more than NEARBY_PX from ``changed``
-    ones.
+def beside_changes(
+    changed: Bools,
+    correlation: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    threshold: float,
+    trust: float,
+) -> Bools:
+    """Pixels [h, w] no more than NEARBY_PX from ``changed`` ones that correlate less than is usual
+    (:func:`outvoted_nearby`) among those that are not.
 
-    Of the ground that a building hides which only the images have, half of what had a label lay so
-    (4 points/m²), for 0.05 to 0.1 % of the visible pixels.
+    Of the hidden pixels that had labels at 4 points/m² in a city two thirds lay so, on ground that
+    a building hides which only the images have.
     """
+    if not changed.any():
+        return changed.copy()
     size = 2 * NEARBY_PX + 1
     sums = np.pad(changed.astype(np.int32), ((NEARBY_PX + 1, NEARBY_PX),) * 2)
     sums = sums.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     near = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
-    return (near > 0) & (correlation < usual)
+    unchanged = np.where(changed, np.nan, correlation)
+    return (near > 0) & (correlation < _usual(unchanged, disparity, slope, threshold, trust))

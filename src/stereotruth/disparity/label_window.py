@@ -29,7 +29,6 @@ from .image_agreement import (
     beside_changes,
     outvoted,
     outvoted_nearby,
-    usual_correlation,
     warp_to_left,
 )
 from .image_patches import Patch, read_patch
@@ -309,14 +308,13 @@ def _test_agreement(
     surface = labels.disparity, labels.slope
     clear = apart_from_steps(labels.disparity)
     found = surface_correlation(shown, warped, *surface, settings.window, clear)
+    limits = settings.correlation_threshold, scene.scale.trust
     changed = outvoted(found, *surface, settings.correlation_threshold)
-    trust = scene.scale.trust
-    unchanged = np.where(changed, np.nan, found)
-    usual = usual_correlation(unchanged, *surface, settings.correlation_threshold, trust)
+    rim = beside_changes(changed, found, *surface, *limits)
     if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
-        changed |= is_labelled(status) & outvoted_nearby(found, *surface, usual, trust)
-    changed |= is_labelled(status) & beside_changes(changed, found, usual)
+        changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
+    changed |= is_labelled(status) & rim
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
     return found

@@ -121,6 +121,7 @@ class Settings(Representative, Occlusion):
         reach = EDGE + 3
         if self.method != "both":
             return reach
-        # steps beside pixels, windows, votes about them, what is asked of the votes nearby, its rim
-        reach += VOTE_PX + 2 * NEARBY_PX + self.window // 2 + 1
+        # steps beside pixels, windows, votes about them, and what is asked of the votes nearby; in
+        # the rim of a change, by the mean of what is not voted against
+        reach += VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
         return reach + (MARGIN if self.asks_images else 0)
