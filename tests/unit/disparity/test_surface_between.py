@@ -166,10 +166,11 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(poro
         surface_class=zeros.astype(np.uint8),
         highest=level,
         rough=zeros.astype(bool),
+        bulging=np.arange(8) + zeros == 5,
         places=None,
     )
     points = np.full(shape, np.nan)
-    points[2, 2:5] = 10.2, 4.0, 16.0  # on the surface, behind, before it
+    points[2, 2:6] = 10.2, 4.0, 16.0, 10.2  # on the surface, behind, before it; where it bulges
     own = Labels(points, np.zeros((2, *shape)), zeros)
     left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
     right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
@@ -180,4 +181,5 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(poro
         Status.EDGE_IN_PIXEL,
     ]
     assert labels.disparity[2, 2] == pytest.approx(10.2)
+    assert status[2, 5] == Status.LABELLED and labels.disparity[2, 5] == 10.0  # no plane bulges
     assert np.isfinite(labels.disparity[2, 2:5]).tolist() == [True, porous, False]
