@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -31,6 +32,31 @@ def test_panics_of_libraries_are_logged(tmp_path) -> None:
     text = (tmp_path / "a.log").read_text("utf-8")
     assert "unexpected failure" in text
     assert "index out of bounds" in text
+
+
+def test_freed_memory_is_used_again(tmp_path) -> None:
+    """What follows a block of 64 MiB (16384 pages) costs no page of the system's within a job."""
+    if not hasattr(ctypes.CDLL(None), "mallopt"):
+        pytest.skip("another C library than glibc")
+    lines = (
+        "import ctypes, resource, sys",
+        "from stereotruth.job import job",
+        "c, size = ctypes.CDLL(None), ctypes.c_size_t(64 << 20)",
+        "c.malloc.restype = ctypes.c_void_p",
+        "def faults():",
+        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt",
+        "    block = ctypes.c_void_p(c.malloc(size))",
+        "    c.memset(block, 1, size)",
+        "    c.free(block)",
+        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before",
+        "usual = [faults() for _ in range(3)]",
+        "with job(sys.argv[1], 'a'):",
+        "    faults()",
+        "    print(*usual, faults())",
+    )
+    call = [sys.executable, "-c", "\n".join(lines), str(tmp_path / "a.log")]
+    *usual, kept = map(int, subprocess.run(call, capture_output=True, check=True).stdout.split())
+    assert kept < min(usual) / 10
 
 
 def test_an_interrupt_is_no_failure(tmp_path) -> None:
