@@ -32,7 +32,7 @@ NOISE_M = 0.03
 NOISE_SHARE = 1.5e-4
 WATER_RETURNS = 0.15
 SECOND_RETURNS = 0.45
-PULSES_A_CHUNK = 1_000_000
+PULSES_A_CHUNK = 50_000  # so many stay in the cache
 
 
 def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[float, ...]:

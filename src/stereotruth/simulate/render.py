@@ -139,7 +139,8 @@ def in_collar(left, col, row, cols, rows):
 def _ray(cam, line, col):
     """(ax, ay, bx, by) of the ray of a column of a line."""
     dx, dy, dz = direction(cam, line, col)
-    bx, by = dx / dz, dy / dz
+    per_z = 1 / dz
+    bx, by = dx * per_z, dy * per_z
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
 
 
@@ -153,7 +154,8 @@ def _shade_rows(s, above, cam, first_row, out):
     """
     lines = np.empty((LANES, 12))
     ground, before = np.zeros(LANES), np.zeros(LANES)
-    hits = np.empty((LANES, BLOCK, 3))
+    hits = np.empty((LANES, BLOCK, 7))
+    sun = s.sun[0], s.sun[1], s.sun[2]
     for r0 in range(0, out.shape[0], LANES):
         lanes = min(LANES, out.shape[0] - r0)
         for k in range(lanes):
@@ -169,19 +171,20 @@ def _shade_rows(s, above, cam, first_row, out):
                     before[k] = ground[k]
                     z, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
                     ground[k] = z
-                    hits[k, n, 0], hits[k, n, 1], hits[k, n, 2] = z, zx, zy
+                    hit = hits[k, n]
+                    hit[0], hit[1], hit[2], hit[3] = ax, ay, bx, by
+                    hit[4], hit[5], hit[6] = z, zx, zy
             for k in range(lanes):
                 for n in range(columns):
-                    ax, ay, bx, by = _ray(cam, lines[k], -2.25 + 0.5 * (c0 + n))
+                    ax, ay, bx, by, ground_z, zx, zy = hits[k, n]
                     z, kind, index, face = above_ground(
-                        s, above, ax, ay, bx, by, IN_IMAGES, True, hits[k, n, 0]
+                        s, above, ax, ay, bx, by, IN_IMAGES, True, ground_z
                     )
                     value = 0.1
                     if kind != NONE:
                         value = reflectance(
-                            s, ax + bx * z, ay + by * z, z, kind, index, face,
-                            hits[k, n, 1], hits[k, n, 2],
-                        )  # fmt: skip
+                            s, sun, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy
+                        )
                     out[r0 + k, c0 + n] = value
 
 

@@ -64,20 +64,22 @@ class Surfaces(NamedTuple):
 def terrain_at(s, x, y):
     """Terrain z and its derivatives along x and y."""
     c = s.terrain
-    u = (x - s.x0) / s.step
-    v = (y - s.y0) / s.step
+    per_step = 1 / s.step
+    u = (x - s.x0) * per_step
+    v = (y - s.y0) * per_step
     i = min(max(int(np.floor(u)), 1), c.shape[1] - 3)
     j = min(max(int(np.floor(v)), 1), c.shape[0] - 3)
     f, g = u - i, v - j
     f1, g1 = 1 - f, 1 - g
-    a0, a1 = f1 * f1 * f1 / 6, (4 - 6 * f * f + 3 * f * f * f) / 6
-    a2, a3 = (4 - 6 * f1 * f1 + 3 * f1 * f1 * f1) / 6, f * f * f / 6
-    d0, d1 = -f1 * f1 / 2, (-12 * f + 9 * f * f) / 6
-    d2, d3 = (12 * f1 - 9 * f1 * f1) / 6, f * f / 2
-    b0, b1 = g1 * g1 * g1 / 6, (4 - 6 * g * g + 3 * g * g * g) / 6
-    b2, b3 = (4 - 6 * g1 * g1 + 3 * g1 * g1 * g1) / 6, g * g * g / 6
-    e0, e1 = -g1 * g1 / 2, (-12 * g + 9 * g * g) / 6
-    e2, e3 = (12 * g1 - 9 * g1 * g1) / 6, g * g / 2
+    # six times the spline's weights, twice their derivatives: a division each is half of the time
+    a0, a1 = f1 * f1 * f1, 4 + f * f * (3 * f - 6)
+    a2, a3 = 4 + f1 * f1 * (3 * f1 - 6), f * f * f
+    d0, d1 = -f1 * f1, f * (3 * f - 4)
+    d2, d3 = f1 * (4 - 3 * f1), f * f
+    b0, b1 = g1 * g1 * g1, 4 + g * g * (3 * g - 6)
+    b2, b3 = 4 + g1 * g1 * (3 * g1 - 6), g * g * g
+    e0, e1 = -g1 * g1, g * (3 * g - 4)
+    e2, e3 = g1 * (4 - 3 * g1), g * g
     # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
     j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
     i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
@@ -92,7 +94,7 @@ def terrain_at(s, x, y):
     z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
     zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
     zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
-    return z, zx / s.step, zy / s.step
+    return z * (1 / 36), zx * (per_step / 12), zy * (per_step / 12)
 
 
 @inlined
@@ -123,7 +125,8 @@ def box_span(boxes, n, ax, ay, bx, by):
     v0, vb = y * ux - x * uy, by * ux - bx * uy
     low, high, face = -1e30, 1e30, 0
     if ub > 1e-12 or ub < -1e-12:
-        z1, z2 = (-a - u0) / ub, (a - u0) / ub
+        per_u = 1 / ub
+        z1, z2 = (-a - u0) * per_u, (a - u0) * per_u
         if z1 < z2:
             low, high, face = z1, z2, 2
         else:
@@ -131,7 +134,8 @@ def box_span(boxes, n, ax, ay, bx, by):
     elif abs(u0) > a:
         return 1.0, 0.0, 0
     if vb > 1e-12 or vb < -1e-12:
-        z1, z2 = (-b - v0) / vb, (b - v0) / vb
+        per_v = 1 / vb
+        z1, z2 = (-b - v0) * per_v, (b - v0) * per_v
         f = 4
         if z1 > z2:
             z1, z2, f = z2, z1, 5
@@ -241,23 +245,26 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
 
 
 @inlined
-def in_shadow(s, x, y, z):
-    """Whether a building or tree stands between a surface point and the sun."""
+def in_shadow(s, sun, x, y, z):
+    """Whether a building or tree stands between a surface point and the sun.
+
+    ``sun``: the three values of ``s.sun``, which as a tuple are divided once for all points.
+    """
     ny, nx = s.cell_top.shape
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
         return False
     if z >= s.sun_top[j, i]:
         return False
-    bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
+    bx, by = sun[0] / sun[2], sun[1] / sun[2]
     ax, ay = x - bx * z, y - by * z
     clear = z + 0.02
     step_x = 1 if bx > 0 else -1
     step_y = 1 if by > 0 else -1
     per_x = CELL_M / max(abs(bx), 1e-9)
     per_y = CELL_M / max(abs(by), 1e-9)
-    next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
-    next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
+    next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) * (1 / bx)
+    next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) * (1 / by)
     while z < s.sun_top[j, i]:
         if s.cell_top[j, i] > z:
             cell = j * nx + i
