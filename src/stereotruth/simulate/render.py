@@ -139,8 +139,7 @@ def in_collar(left, col, row, cols, rows):
 def _ray(cam, line, col):
     """(ax, ay, bx, by) of the ray of a column of a line."""
     dx, dy, dz = direction(cam, line, col)
-    per_z = 1 / dz
-    bx, by = dx * per_z, dy * per_z
+    bx, by = dx / dz, dy / dz
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
 
 

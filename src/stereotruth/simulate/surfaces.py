@@ -125,8 +125,7 @@ def box_span(boxes, n, ax, ay, bx, by):
     v0, vb = y * ux - x * uy, by * ux - bx * uy
     low, high, face = -1e30, 1e30, 0
     if ub > 1e-12 or ub < -1e-12:
-        per_u = 1 / ub
-        z1, z2 = (-a - u0) * per_u, (a - u0) * per_u
+        z1, z2 = (-a - u0) / ub, (a - u0) / ub
         if z1 < z2:
             low, high, face = z1, z2, 2
         else:
@@ -134,8 +133,7 @@ def box_span(boxes, n, ax, ay, bx, by):
     elif abs(u0) > a:
         return 1.0, 0.0, 0
     if vb > 1e-12 or vb < -1e-12:
-        per_v = 1 / vb
-        z1, z2 = (-b - v0) * per_v, (b - v0) * per_v
+        z1, z2 = (-b - v0) / vb, (b - v0) / vb
         f = 4
         if z1 > z2:
             z1, z2, f = z2, z1, 5
