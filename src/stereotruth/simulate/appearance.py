@@ -29,7 +29,7 @@ def _hash(i, j, k):
 def _sample(texture, u, v):
     """Bilinear value of a periodic texture at (u, v) in its pixels; the size is a power of two."""
     mask = texture.shape[0] - 1
-    fu, fv = math.floor(u), math.floor(v)
+    fu, fv = np.floor(u), np.floor(v)
     f, g = u - fu, v - fv
     iu, iv = int(fu), int(fv)
     i, j = np.uint64(iu & mask), np.uint64(iv & mask)
@@ -71,7 +71,7 @@ def _ground(s, x, y, slope2):
         kind = 7
     p = x * s.zones[n, 2] + y * s.zones[n, 3]
     q = y * s.zones[n, 2] - x * s.zones[n, 3]
-    i, j = math.floor(p / s.zones[n, 4]), math.floor(q / s.zones[n, 5])
+    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
     pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
     pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
     edge = min(pe, qe)
