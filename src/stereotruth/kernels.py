@@ -3,14 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from numba import njit
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 from numba.extending import register_jitable
 
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
-kernel: Callable = njit(cache=True, nogil=True, **_OPTIONS)
-"""A compiled loop over points or pixels, which Python calls."""
+
+class _Compiled(FunctionCache):
+    """Compiled kernels on disk, loaded without all that compiling would need.
+
+    Numba's own cache first imports all it could compile, a third of a second in each of a run's
+    jobs. What is compiled needs the runtime only; the compiler imports the rest where it starts.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel for a signature, or None."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
+
+def kernel(function: Callable) -> Callable:
+    """A compiled loop over points or pixels, which Python calls."""
+    dispatcher = njit(nogil=True, **_OPTIONS)(function)
+    dispatcher._cache = _Compiled(function)
+    return dispatcher
+
 
 inner: Callable = register_jitable(**_OPTIONS)
 """A function that kernels call; plain Python where Python calls it.

@@ -9,8 +9,8 @@ import pytest
 
 from ..synthetic.rules import FOLDER
 
-HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pyproj", "rasterio"} | {
-    "scipy.spatial", "scipy.special", "scipy.stats", "torch", "xarray", "zarr"
+HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pydantic", "pyproj"} | {
+    "rasterio", "scipy.spatial", "scipy.special", "scipy.stats", "torch", "xarray", "zarr"
 }  # fmt: skip
 # What the job of each script uses in every run; a new one costs each of its jobs its import.
 STARTS = {
@@ -18,13 +18,13 @@ STARTS = {
     "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
     "ingest": {"laspy", "numba", "pyproj"},
-    "align": {"cv2", "matplotlib", "numba", "rasterio"},
-    "refine": {"cv2", "matplotlib", "numba", "rasterio", "scipy.special"},
-    "rectify": {"dask", "numba", "rasterio", "zarr"},
-    "project": {"dask", "numba", "zarr"},
-    "project_strip": {"dask", "numba", "zarr"},
+    "align": {"cv2", "matplotlib", "numba", "pydantic", "rasterio"},
+    "refine": {"cv2", "matplotlib", "numba", "pydantic", "rasterio", "scipy.special"},
+    "rectify": {"dask", "numba", "pydantic", "rasterio", "zarr"},
+    "project": {"dask", "numba", "pydantic", "zarr"},
+    "project_strip": {"dask", "numba", "pydantic", "zarr"},
     "grid_truth": {"numba", "rasterio", "zarr"},
-    "match": {"cv2", "rasterio"},
+    "match": {"cv2", "pydantic", "rasterio"},
 }
 
 

@@ -188,11 +188,21 @@ def export_city(
         def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
             return write_tile(scratch, *chosen[k], k, cut)
 
+        def draw(rows: Sequence[dict[str, Any]]) -> None:
+            # one figure at a time: Matplotlib is not made for threads
+            if coverage is not None:
+                draw_coverage(coverage, city, rows, scans)
+            if contact_sheet is not None:
+                draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
+
         written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in sources}
         with ThreadPoolExecutor(workers) as pool:
             numbers = range(len(chosen))
-            done = progress(pool.map(write, numbers), len(chosen), f"{city}: tiles")
-            for row, ring, checks in done:
+            tiles = pool.map(write, numbers)
+            drawn = []  # while the last tiles are written
+            if looks is not None:
+                drawn = [pool.submit(write_ground_looks, looks, source) for source in sources]
+            for row, ring, checks in progress(tiles, len(chosen), f"{city}: tiles"):
                 written.append((row, ring))
                 if checks is None:
                     continue
@@ -200,26 +210,25 @@ def export_city(
                 if table is not None:
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
                     table.writerows(match_rows(head, checks.matches))
-        rows = [row for row, _ in written]
-        splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
-        gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
-        half = disparity_dtype == "float16"
-        summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
-        summary["quality"] = gates
-        write_table(scratch / "manifest.csv", rows)
-        write_footprints(scratch, [feature(row, ring) for row, ring in written])
-        for source in sources if looks is not None else ():
-            write_ground_looks(looks, source)
+            rows = [row for row, _ in written]
+            splits = _split(
+                written, parameters["split_counts"], settings.seed, settings.strict, city
+            )
+            drawn.append(pool.submit(draw, rows))
+            gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+            half = disparity_dtype == "float16"
+            summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
+            summary["quality"] = gates
+            write_table(scratch / "manifest.csv", rows)
+            write_footprints(scratch, [feature(row, ring) for row, ring in written])
+            for picture in drawn:
+                picture.result()
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
             "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
             "provenance": provenance,
         }
         save(scratch / "export.json", record)
-        if coverage is not None:
-            draw_coverage(coverage, city, rows, scans)
-        if contact_sheet is not None:
-            draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
         _forget_others(cut, rows)
     return summary
 

@@ -32,7 +32,6 @@ from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 from .point_store import ARRAYS, ATTRIBUTES, FORMAT, WORDS
-from .settings import Settings
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
 log = logging.getLogger("stereotruth")
@@ -111,7 +110,7 @@ def ingest(
     *,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
-    drop_classes: Sequence[int] = Settings.drop_classes,
+    drop_classes: Sequence[int] | None = None,
     scene: str = "",
     provenance: Mapping[str, Any] | None = None,
     chunk_points: int = 100_000,
@@ -123,9 +122,10 @@ def ingest(
     where it has more points, the others pass through a scratch file without a name, 12 bytes each,
     on the disk of the store.
 
-    Withheld points are dropped, and those of ``drop_classes``: by default noise, 7 (low) and 18
-    (high). Synthetic points, overlap points and producers' own classes (65 and 67 mark artefacts in
-    IGN's files) are kept unless listed. Coordinates: see :mod:`stereotruth.lidar.to_wgs84`.
+    Withheld points are dropped, and those of ``drop_classes``: by default (None) those of the
+    settings, noise, 7 (low) and 18 (high). Synthetic points, overlap points and producers' own
+    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed. Coordinates: see
+    :mod:`stereotruth.lidar.to_wgs84`.
     ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
     not needed. With ``workers`` > 1 a thread decodes ahead (the result is the same).
 
@@ -137,6 +137,10 @@ def ingest(
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
     area of the coordinate system; coordinates quantised too coarsely; no point left.
     """
+    if drop_classes is None:
+        from .settings import Settings  # a sixth of the start of a job, which knows the classes
+
+        drop_classes = Settings.drop_classes
     file = Path(lidar_file)
     header = read_header(file)
 

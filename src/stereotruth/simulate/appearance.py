@@ -29,7 +29,7 @@ def _hash(i, j, k):
 def _sample(texture, u, v):
     """Bilinear value of a periodic texture at (u, v) in its pixels; the size is a power of two."""
     mask = texture.shape[0] - 1
-    fu, fv = math.floor(u), math.floor(v)
+    fu, fv = np.floor(u), np.floor(v)
     f, g = u - fu, v - fv
     iu, iv = int(fu), int(fv)
     i, j = np.uint64(iu & mask), np.uint64(iv & mask)
@@ -59,19 +59,19 @@ def zone_at(s, x, y):
 
 
 @inlined
-def _ground(s, x, y, slope):
-    """Reflectance of the ground."""
+def _ground(s, x, y, slope2):
+    """Reflectance of the ground; ``slope2``: its slope squared."""
     fine = _sample(s.fine, 4.0 * x, 4.0 * y)
     # the same texture turned and enlarged: no pattern repeats within a scene
     mid = _sample(s.fine, 1.13 * x + 0.83 * y, 1.13 * y - 0.83 * x)
     broad = _sample(s.broad, 0.5 * x, 0.5 * y)
     n = zone_at(s, x, y)
     kind = int(s.zones[n, 7])
-    if slope > 0.24 and kind != 8:
+    if slope2 > 0.24 * 0.24 and kind != 8:
         kind = 7
     p = x * s.zones[n, 2] + y * s.zones[n, 3]
     q = y * s.zones[n, 2] - x * s.zones[n, 3]
-    i, j = math.floor(p / s.zones[n, 4]), math.floor(q / s.zones[n, 5])
+    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
     pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
     pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
     edge = min(pe, qe)
@@ -135,12 +135,14 @@ def _ground(s, x, y, slope):
 
 
 @inlined
-def reflectance(s, x, y, z, kind, index, face, zx, zy):
-    """Light that comes back from a surface point, about 0 to 1; ``zx``, ``zy``: slope of ground."""
-    sun = s.sun
+def reflectance(s, sun, x, y, z, kind, index, face, zx, zy):
+    """Light that comes back from a surface point, about 0 to 1; ``zx``, ``zy``: slope of ground.
+
+    ``sun``: the three values of ``s.sun``.
+    """
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == GROUND:
-        value = _ground(s, x, y, math.sqrt(zx * zx + zy * zy))
+        value = _ground(s, x, y, zx * zx + zy * zy)
         n = 1 / math.sqrt(1 + zx * zx + zy * zy)
         nx, ny, nz = -zx * n, -zy * n, n
     elif kind == WATER:
@@ -204,7 +206,7 @@ def reflectance(s, x, y, z, kind, index, face, zx, zy):
                 glass = _hash(int(np.floor(along / 3.4)), int(np.floor(z / 3.0)), index + face)
                 value = 0.07 + 0.16 * glass * glass
     light = nx * sun[0] + ny * sun[1] + nz * sun[2]
-    if light > 0 and in_shadow(s, x, y, z):
+    if light > 0 and in_shadow(s, sun, x, y, z):
         light = 0.0
     sky = SKY * (0.55 + 0.45 * nz)
-    return max(value, 0.02) * (sky + (1 - SKY) * max(light, 0.0) / sun[2])
+    return max(value, 0.02) * (sky + max(light, 0.0) * ((1 - SKY) / sun[2]))

@@ -70,10 +70,10 @@ class _Builder:
             return False
         rng = self.rng
         eaves = z.max() + height
-        roof = float(np.clip(rng.lognormal(math.log(0.33), 0.42), 0.12, 0.85))
-        walls = float(rng.uniform(0.22, 0.55))
+        roof = min(max(rng.lognormal(math.log(0.33), 0.42), 0.12), 0.85)
+        walls = rng.uniform(0.22, 0.55)
         if cover is None:
-            cover = TILES if rise > 1.2 else int(rng.choice([FLAT, GRAVEL, FLAT, SHEET]))
+            cover = TILES if rise > 1.2 else (FLAT, GRAVEL, FLAT, SHEET)[rng.integers(4)]
         for part in parts:
             self._put(part, eaves, rise if wing is None else 0.0, roof, walls, cover)
         if top and rise == 0 and min(length, width) > 9.5 and height > 9:

@@ -20,7 +20,6 @@ from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
-from .settings import Settings
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
 
 log = logging.getLogger("stereotruth")
@@ -32,7 +31,7 @@ NOISE_M = 0.03
 NOISE_SHARE = 1.5e-4
 WATER_RETURNS = 0.15
 SECOND_RETURNS = 0.45
-PULSES_A_CHUNK = 1_000_000
+PULSES_A_CHUNK = 50_000  # so many stay in the cache
 
 
 def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[float, ...]:
@@ -230,15 +229,16 @@ def simulate_lidar_tile(
     tile_name: str,
     out_laz: str | Path,
     *,
-    spacing_m: float = Settings.lidar_spacing_m,
+    spacing_m: float | None = None,
     seed: int,
     built: str | Path | None = None,
 ) -> dict[str, int]:
     """Fly one LiDAR tile and write it as the city's LAS format says.
 
-    ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together. ``seed``
-    draws noise, jitter and which pulses pass a crown. ``built``: the city's surfaces in a file, see
-    :func:`.built_city.surfaces_of`. Returns the number of points by class.
+    ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together; None is that
+    of the settings. ``seed`` draws noise, jitter and which pulses pass a crown. ``built``: the
+    city's surfaces in a file, see :func:`.built_city.surfaces_of`. Returns the number of points by
+    class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
     """
     if tile_name not in lidar_files(city, scene):
@@ -246,6 +246,10 @@ def simulate_lidar_tile(
             f"scene {scene.name} has no LiDAR file {tile_name}",
             remedy="use one of " + ", ".join(lidar_files(city, scene)),
         )
+    if spacing_m is None:
+        from .settings import Settings  # a sixth of the start of a job, which knows the spacing
+
+        spacing_m = Settings.lidar_spacing_m
     if not 0.1 <= spacing_m <= 5:
         raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
     s: Surfaces = surfaces_of(city, built)

@@ -24,12 +24,15 @@ from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import (
+    CLOSE_M,
     IN_IMAGES,
     NONE,
     Surfaces,
     above_ground,
     ground_hit,
     horizon,
+    spline,
+    spline_cell,
     terrain_heights,
 )
 
@@ -39,6 +42,8 @@ log = logging.getLogger("stereotruth")
 FULL_SCALE = 2047  # 11 bits
 STRIP_ROWS = 128
 LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a time
+# Of each lane: its ray, the ground, the last step, where in a cell of the spline, coefficients
+AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
 PSF_SIGMA_PX = 0.42
 RPC_MARGIN_M = 130.0
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
@@ -143,6 +148,49 @@ def _ray(cam, line, col):
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
 
 
+@inlined
+def _ground_below(s, cam, lines, col, first, ground, before, work):
+    """Rays of a column of all lanes and the ground that they meet, in ``work``.
+
+    ``ground``, ``before`` [LANES]: z of the ground a column and two before, moved on by one; there
+    is none before the ``first`` column. The loop in the middle neither branches nor looks anything
+    up, so that the processor takes all lanes at a time.
+    """
+    c = s.terrain
+    for k in range(LANES):
+        ax, ay, bx, by = _ray(cam, lines[k], col)
+        z = ground[k]
+        if not first:  # the ground goes on as it did
+            z += ground[k] - before[k]
+        before[k] = ground[k]
+        i, j, f, g = spline_cell(s, ax + bx * z, ay + by * z)
+        work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k] = ax, ay, bx, by, z
+        work[F + k], work[G + k] = f, g
+        for m in range(4):
+            for n in range(4):
+                at = SPLINE + (4 * m + n) * LANES + k
+                work[at] = c[np.uint64(j - 1 + m), np.uint64(i - 1 + n)]
+    for k in range(LANES):
+        at = SPLINE + k
+        z, zx, zy = spline(
+            s, work[F + k], work[G + k],
+            work[at], work[at + LANES], work[at + 2 * LANES], work[at + 3 * LANES],
+            work[at + 4 * LANES], work[at + 5 * LANES], work[at + 6 * LANES], work[at + 7 * LANES],
+            work[at + 8 * LANES], work[at + 9 * LANES], work[at + 10 * LANES],
+            work[at + 11 * LANES], work[at + 12 * LANES], work[at + 13 * LANES],
+            work[at + 14 * LANES], work[at + 15 * LANES],
+        )  # fmt: skip
+        step = (z - work[Z + k]) / (1 - zx * work[BX + k] - zy * work[BY + k])
+        work[ZX + k], work[ZY + k], work[STEP + k] = zx, zy, step
+        work[Z + k] += step
+    for k in range(LANES):
+        if abs(work[STEP + k]) >= CLOSE_M:  # rarely
+            work[Z + k], work[ZX + k], work[ZY + k] = ground_hit(
+                s, work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k]
+            )
+        ground[k] = work[Z + k]
+
+
 @kernel
 def _shade_rows(s, above, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
@@ -153,35 +201,32 @@ def _shade_rows(s, above, cam, first_row, out):
     """
     lines = np.empty((LANES, 12))
     ground, before = np.zeros(LANES), np.zeros(LANES)
-    hits = np.empty((LANES, BLOCK, 3))
+    work = np.empty(SPLINE + 16 * LANES)
+    hits = np.empty((LANES, BLOCK, 7))
+    sun = s.sun[0], s.sun[1], s.sun[2]
     for r0 in range(0, out.shape[0], LANES):
         lanes = min(LANES, out.shape[0] - r0)
-        for k in range(lanes):
+        for k in range(LANES):
             pose(cam, first_row - 0.25 + 0.5 * (r0 + k), lines[k])
         for c0 in range(0, out.shape[1], BLOCK):
             columns = min(BLOCK, out.shape[1] - c0)
             for n in range(columns):
-                for k in range(lanes):
-                    ax, ay, bx, by = _ray(cam, lines[k], -2.25 + 0.5 * (c0 + n))
-                    guess = ground[k]
-                    if c0 + n:  # the ground goes on as it did
-                        guess += ground[k] - before[k]
-                    before[k] = ground[k]
-                    z, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
-                    ground[k] = z
-                    hits[k, n, 0], hits[k, n, 1], hits[k, n, 2] = z, zx, zy
+                col = -2.25 + 0.5 * (c0 + n)
+                _ground_below(s, cam, lines, col, c0 + n == 0, ground, before, work)
+                for k in range(LANES):
+                    for m in range(7):
+                        hits[k, n, m] = work[m * LANES + k]
             for k in range(lanes):
                 for n in range(columns):
-                    ax, ay, bx, by = _ray(cam, lines[k], -2.25 + 0.5 * (c0 + n))
+                    ax, ay, bx, by, ground_z, zx, zy = hits[k, n]
                     z, kind, index, face = above_ground(
-                        s, above, ax, ay, bx, by, IN_IMAGES, True, hits[k, n, 0]
+                        s, above, ax, ay, bx, by, IN_IMAGES, True, ground_z
                     )
                     value = 0.1
                     if kind != NONE:
                         value = reflectance(
-                            s, ax + bx * z, ay + by * z, z, kind, index, face,
-                            hits[k, n, 1], hits[k, n, 2],
-                        )  # fmt: skip
+                            s, sun, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy
+                        )
                     out[r0 + k, c0 + n] = value
 
 

@@ -20,6 +20,7 @@ NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR = 1, 2
 CELL_M = 8.0
 REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
 LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
 
 
@@ -61,38 +62,55 @@ class Surfaces(NamedTuple):
 
 
 @inlined
-def terrain_at(s, x, y):
-    """Terrain z and its derivatives along x and y."""
-    c = s.terrain
-    u = (x - s.x0) / s.step
-    v = (y - s.y0) / s.step
-    i = min(max(int(np.floor(u)), 1), c.shape[1] - 3)
-    j = min(max(int(np.floor(v)), 1), c.shape[0] - 3)
-    f, g = u - i, v - j
+def spline_cell(s, x, y):
+    """Column and row of the spline's cell over a plan position, and where in it that lies."""
+    per_step = 1 / s.step
+    u, v = (x - s.x0) * per_step, (y - s.y0) * per_step
+    i = min(max(int(np.floor(u)), 1), s.terrain.shape[1] - 3)
+    j = min(max(int(np.floor(v)), 1), s.terrain.shape[0] - 3)
+    return i, j, u - i, v - j
+
+
+@inlined
+def spline(s, f, g, c00, c01, c02, c03, c10, c11, c12, c13, c20, c21, c22, c23, c30, c31, c32, c33):
+    """Terrain z and its derivatives at (f, g) of a cell, by the coefficients (row, column) around.
+
+    From six times the spline's weights and twice their derivatives: a division each would be half
+    of the time.
+    """
     f1, g1 = 1 - f, 1 - g
-    a0, a1 = f1 * f1 * f1 / 6, (4 - 6 * f * f + 3 * f * f * f) / 6
-    a2, a3 = (4 - 6 * f1 * f1 + 3 * f1 * f1 * f1) / 6, f * f * f / 6
-    d0, d1 = -f1 * f1 / 2, (-12 * f + 9 * f * f) / 6
-    d2, d3 = (12 * f1 - 9 * f1 * f1) / 6, f * f / 2
-    b0, b1 = g1 * g1 * g1 / 6, (4 - 6 * g * g + 3 * g * g * g) / 6
-    b2, b3 = (4 - 6 * g1 * g1 + 3 * g1 * g1 * g1) / 6, g * g * g / 6
-    e0, e1 = -g1 * g1 / 2, (-12 * g + 9 * g * g) / 6
-    e2, e3 = (12 * g1 - 9 * g1 * g1) / 6, g * g / 2
-    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
-    j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
-    i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
-    c0, c1, c2, c3 = c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3]
-    r0, q0 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
-    c0, c1, c2, c3 = c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3]
-    r1, q1 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
-    c0, c1, c2, c3 = c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3]
-    r2, q2 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
-    c0, c1, c2, c3 = c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3]
-    r3, q3 = a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3, d0 * c0 + d1 * c1 + d2 * c2 + d3 * c3
+    a0, a1 = f1 * f1 * f1, 4 + f * f * (3 * f - 6)
+    a2, a3 = 4 + f1 * f1 * (3 * f1 - 6), f * f * f
+    d0, d1 = -f1 * f1, f * (3 * f - 4)
+    d2, d3 = f1 * (4 - 3 * f1), f * f
+    b0, b1 = g1 * g1 * g1, 4 + g * g * (3 * g - 6)
+    b2, b3 = 4 + g1 * g1 * (3 * g1 - 6), g * g * g
+    e0, e1 = -g1 * g1, g * (3 * g - 4)
+    e2, e3 = g1 * (4 - 3 * g1), g * g
+    r0, q0 = a0 * c00 + a1 * c01 + a2 * c02 + a3 * c03, d0 * c00 + d1 * c01 + d2 * c02 + d3 * c03
+    r1, q1 = a0 * c10 + a1 * c11 + a2 * c12 + a3 * c13, d0 * c10 + d1 * c11 + d2 * c12 + d3 * c13
+    r2, q2 = a0 * c20 + a1 * c21 + a2 * c22 + a3 * c23, d0 * c20 + d1 * c21 + d2 * c22 + d3 * c23
+    r3, q3 = a0 * c30 + a1 * c31 + a2 * c32 + a3 * c33, d0 * c30 + d1 * c31 + d2 * c32 + d3 * c33
     z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
     zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
     zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
-    return z, zx / s.step, zy / s.step
+    per_step = 1 / s.step
+    return z * (1 / 36), zx * (per_step / 12), zy * (per_step / 12)
+
+
+@inlined
+def terrain_at(s, x, y):
+    """Terrain z and its derivatives along x and y."""
+    i, j, f, g = spline_cell(s, x, y)
+    c = s.terrain
+    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
+    j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
+    i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
+    return spline(
+        s, f, g,
+        c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3], c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3],
+        c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3], c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3],
+    )  # fmt: skip
 
 
 @inlined
@@ -106,7 +124,7 @@ def ground_hit(s, ax, ay, bx, by, guess):
         t, zx, zy = terrain_at(s, ax + bx * z, ay + by * z)
         step = (t - z) / (1 - zx * bx - zy * by)
         z += step
-        if abs(step) < 1e-3:  # the next step would be its square
+        if abs(step) < CLOSE_M:
             break
     return z, zx, zy
 
@@ -241,23 +259,26 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
 
 
 @inlined
-def in_shadow(s, x, y, z):
-    """Whether a building or tree stands between a surface point and the sun."""
+def in_shadow(s, sun, x, y, z):
+    """Whether a building or tree stands between a surface point and the sun.
+
+    ``sun``: the three values of ``s.sun``, which as a tuple are divided once for all points.
+    """
     ny, nx = s.cell_top.shape
     i, j = int((x - s.x0) / CELL_M), int((y - s.y0) / CELL_M)
     if i < 0 or j < 0 or i >= nx or j >= ny:
         return False
     if z >= s.sun_top[j, i]:
         return False
-    bx, by = s.sun[0] / s.sun[2], s.sun[1] / s.sun[2]
+    bx, by = sun[0] / sun[2], sun[1] / sun[2]
     ax, ay = x - bx * z, y - by * z
     clear = z + 0.02
     step_x = 1 if bx > 0 else -1
     step_y = 1 if by > 0 else -1
     per_x = CELL_M / max(abs(bx), 1e-9)
     per_y = CELL_M / max(abs(by), 1e-9)
-    next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) / bx
-    next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) / by
+    next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) * (1 / bx)
+    next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) * (1 / by)
     while z < s.sun_top[j, i]:
         if s.cell_top[j, i] > z:
             cell = j * nx + i

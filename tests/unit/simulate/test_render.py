@@ -8,9 +8,10 @@ import numpy as np
 import rasterio
 from scipy.ndimage import map_coordinates, uniform_filter
 
+from stereotruth.simulate.render import LANES, _shade_rows, prepare
 from stereotruth.simulate.truth import open_truth
 
-from ...synthetic.small_cities import GROUND, ROOF
+from ...synthetic.small_cities import GROUND, ROOF, TOWN
 
 
 def test_views_look_alike_where_both_see_the_surface(town: Path) -> None:
@@ -41,3 +42,14 @@ def test_views_look_alike_where_both_see_the_surface(town: Path) -> None:
     hidden = (surface > 0) & ~seen
     assert 0.005 < hidden.mean() < 0.3
     assert np.median(correlation[hidden]) < 0.6
+
+
+def test_a_row_is_the_same_whatever_rows_are_beside_it() -> None:
+    """LANES rows go side by side, and none has a say in another."""
+    ready = prepare(TOWN, TOWN.scenes[0])
+    camera = ready.left
+    shown = [np.empty((rows, 2 * camera.cols), np.float32) for rows in (3 * LANES, LANES + 3)]
+    for half, first in zip(shown, (100.0, 102.5)):
+        _shade_rows(ready.surfaces, camera.horizon, camera.cam, first, half)
+    np.testing.assert_array_equal(shown[1], shown[0][5 : 5 + len(shown[1])])
+    assert shown[0].std() > 0.01
