@@ -10,17 +10,19 @@ one surface only:
 - :func:`apart_from_steps`: of these, only those that no pixel of another surface touches. The
   optics blur a bright roof into the ground beside it, in one view into other ground than in the
   other, which made two thirds of what was taken for a change at 1 point/m²;
-- :func:`outvoted`: whether most pixels of the same surface around a pixel fail the threshold. A
-  building that only the LiDAR or only the images have fails as a whole; single failures among
-  agreeing pixels, by noise or in shadow, do not;
-- :func:`outvoted_nearby`: the same for what is smaller, by what is usual around it;
-- :func:`beside_changes`: the rim of such things, which most of its surroundings outvote.
+- :meth:`Agreement.outvoted`: whether most pixels of the same surface around a pixel fail the
+  threshold. A building that only the LiDAR or only the images have fails as a whole; single
+  failures among agreeing pixels, by noise or in shadow, do not;
+- :meth:`Agreement.outvoted_nearby`: the same for what is smaller, by what is usual around it;
+- :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
 depend on blocks.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,75 +134,61 @@ def surface_mean(
     return out
 
 
-def outvoted(
-    correlation: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    threshold: float,
-) -> Bools:
-    """Pixels [h, w] around which most of their surface correlates by less than ``threshold``.
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How well left and right image agree over each pixel's surface; arrays of a window.
 
-    ``disparity`` (px) and its ``slope`` [2, h, w] tell what belongs to a surface.
+    ``correlation`` [h, w]: their coefficient around each pixel, NaN for none; ``disparity`` (px)
+    [h, w] and its ``slope`` [2, h, w] tell what belongs to a surface. With less than ``threshold``
+    a pixel fails. ``trust`` (0 to 1): how far the points miss nothing.
     """
-    against = np.where(np.isfinite(correlation), correlation < threshold, np.nan)
-    return surface_mean(against, disparity, slope) > 0.5
 
+    correlation: NDArray[np.floating]
+    disparity: NDArray[np.floating]
+    slope: NDArray[np.floating]
+    threshold: float
+    trust: float = 1.0
 
-def _usual(
-    correlation: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    threshold: float,
-    trust: float,
-) -> Singles:
-    """What pixels [h, w] correlate by at least if they are as usual on their surface around them.
+    def outvoted(self) -> Bools:
+        """Pixels [h, w] around which most of their surface fails."""
+        known = np.isfinite(self.correlation)
+        against = np.where(known, self.correlation < self.threshold, np.nan)
+        return surface_mean(against, self.disparity, self.slope) > 0.5
 
-    That is ``threshold``, or more: the share USUAL of the mean up to VOTE_PX off, since noise
-    lowers both. With less ``trust`` more is asked for.
-    """
-    usual = 1.0 - (1.0 - USUAL) * trust
-    return np.fmax(usual * surface_mean(correlation, disparity, slope), threshold)
+    def _usual(self, correlation: NDArray[np.floating]) -> Singles:
+        """What pixels [h, w] correlate by at least if they are as usual on their surface around
+        them, by the ``correlation`` [h, w] there.
 
+        That is the threshold, or more: the share USUAL of the mean up to VOTE_PX off, since noise
+        lowers both. With less trust more is asked for.
+        """
+        usual = 1.0 - (1.0 - USUAL) * self.trust
+        mean = surface_mean(correlation, self.disparity, self.slope)
+        return np.fmax(usual * mean, self.threshold)
 
-def outvoted_nearby(
-    correlation: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    threshold: float,
-    trust: float,
-) -> Bools:
-    """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
+    def outvoted_nearby(self) -> Bools:
+        """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
 
-    That is less than ``threshold``, or than the share USUAL of the mean over their surface up to
-    VOTE_PX off. Small things are found that :func:`outvoted` lets their surroundings outvote.
-    ``trust`` (0 to 1): how far the points miss nothing; with less, more of the usual correlation
-    is asked for, and fewer failures are enough.
-    """
-    least = _usual(correlation, disparity, slope, threshold, trust)
-    against = np.where(np.isfinite(correlation), correlation < least, np.nan)
-    share = NEARBY_SHARE * float(np.sqrt(trust))
-    return surface_mean(against, disparity, slope, NEARBY_PX, 1) > share
+        Small things are found that :meth:`outvoted` lets their surroundings outvote. With less
+        trust fewer failures are enough.
+        """
+        least = self._usual(self.correlation)
+        against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
+        share = NEARBY_SHARE * float(np.sqrt(self.trust))
+        return surface_mean(against, self.disparity, self.slope, NEARBY_PX, 1) > share
 
+    def beside(self, changed: Bools) -> Bools:
+        """Pixels [h, w] no more than NEARBY_PX from ``changed`` ones that correlate less than is
+        usual among those that are not.
 
-def beside_changes(
-    changed: Bools,
-    correlation: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    threshold: float,
-    trust: float,
-) -> Bools:
-    """Pixels [h, w] no more than NEARBY_PX from ``changed`` ones that correlate less than is usual
-    (:func:`outvoted_nearby`) among those that are not.
-
-    Of the hidden pixels that had labels at 4 points/m² in a city two thirds lay so, on ground that
-    a building hides which only the images have.
-    """
-    if not changed.any():
-        return changed.copy()
-    size = 2 * NEARBY_PX + 1
-    sums = np.pad(changed.astype(np.int32), ((NEARBY_PX + 1, NEARBY_PX),) * 2)
-    sums = sums.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    near = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
-    unchanged = np.where(changed, np.nan, correlation)
-    return (near > 0) & (correlation < _usual(unchanged, disparity, slope, threshold, trust))
+        Of the hidden pixels that had labels at 4 points/m² in a city two thirds lay so, on ground
+        that a building hides which only the images have.
+        """
+        if not changed.any():
+            return changed.copy()
+        size = 2 * NEARBY_PX + 1
+        sums = np.pad(changed.astype(np.int32), ((NEARBY_PX + 1, NEARBY_PX),) * 2)
+        sums = sums.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+        near = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
+        unchanged = np.where(changed, np.nan, self.correlation)
+        return (near > 0) & (self.correlation < self._usual(unchanged))

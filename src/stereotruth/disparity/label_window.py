@@ -4,7 +4,7 @@ With the methods ``both`` and ``geometric``, the surface of the points tells wha
 centre shows and what hides it in either view (:mod:`.surface_between`); a pixel whose own points on
 the surface that its centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured,
 others are between points (``fill``). Then (``both``): do the images agree with what the LiDAR has
-there, and is it no water (:func:`.image_agreement.outvoted`)? The images may tell the surface of
+there, and is it no water (:class:`.image_agreement.Agreement`)? The images may tell the surface of
 pixels that stay open (:mod:`.open_pixels`).
 
 With ``correlation`` (the paper's filter, :func:`.paper_correlation.correlate`) and ``none`` a pixel
@@ -24,13 +24,7 @@ from numpy.typing import NDArray
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from .ground_in_view import GroundInView
-from .image_agreement import (
-    apart_from_steps,
-    beside_changes,
-    outvoted,
-    outvoted_nearby,
-    warp_to_left,
-)
+from .image_agreement import Agreement, apart_from_steps, warp_to_left
 from .image_patches import Patch, read_patch
 from .local_projection import LocalProjection
 from .open_pixels import surfaces_by_images
@@ -308,12 +302,12 @@ def _test_agreement(
     surface = labels.disparity, labels.slope
     clear = apart_from_steps(labels.disparity)
     found = surface_correlation(shown, warped, *surface, settings.window, clear)
-    limits = settings.correlation_threshold, scene.scale.trust
-    changed = outvoted(found, *surface, settings.correlation_threshold)
-    rim = beside_changes(changed, found, *surface, *limits)
+    agreement = Agreement(found, *surface, settings.correlation_threshold, scene.scale.trust)
+    changed = agreement.outvoted()
+    rim = agreement.beside(changed)
     if scene.scale.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window are asked again.
-        changed |= is_labelled(status) & outvoted_nearby(found, *surface, *limits)
+        changed |= is_labelled(status) & agreement.outvoted_nearby()
     changed |= is_labelled(status) & rim
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED

@@ -128,6 +128,13 @@ def _gradient(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float,
     return float(p * t - q * v) / area, float(q * u - p * s) / area, area
 
 
+@inner
+def _far(corner: Steps, t: int, i: int, u: int) -> int:
+    """The vertex of triangle u, opposite vertex i of triangle t, that t has not."""
+    shared = corner[t, 0] + corner[t, 1] + corner[t, 2] - corner[t, i]
+    return corner[u, 0] + corner[u, 1] + corner[u, 2] - shared
+
+
 @kernel
 def _gentlest(
     x: Ints, y: Ints, h: Ints, corner: Steps, radius: Floats, smooth: float, least: float
@@ -256,7 +263,7 @@ def _domed(
             if u < 0:
                 good = False
                 break
-            far = corner[u, 0] + corner[u, 1] + corner[u, 2] - a - b - c + corner[t, i]
+            far = _far(corner, t, i, u)
             if _misfit(x, y, h, a, far, gx, gy) > step:
                 good = False
         out[t] = good
@@ -315,7 +322,7 @@ def _squares(
             u = neighbour[t, i]
             if u < 0 or not smooth[u]:
                 continue
-            far = corner[u, 0] + corner[u, 1] + corner[u, 2] - a - b - c + corner[t, i]
+            far = _far(corner, t, i, u)
             # Barycentric coordinates of the far vertex.
             wa = ((x[b] - x[far]) * (y[c] - y[far]) - (y[b] - y[far]) * (x[c] - x[far])) / area
             wb = ((x[c] - x[far]) * (y[a] - y[far]) - (y[c] - y[far]) * (x[a] - x[far])) / area

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.image_agreement import (
+    Agreement,
     apart_from_steps,
-    beside_changes,
-    outvoted,
-    outvoted_nearby,
     surface_mean,
     warp_to_left,
 )
@@ -75,14 +73,14 @@ def test_single_failures_are_not_change_but_a_region_is() -> None:
     rng = np.random.default_rng(2)
     correlation[rng.random((80, 80)) < 0.2] = 0.1
     disparity = np.zeros((80, 80))
-    assert not outvoted(correlation, disparity, LEVEL, 0.5).any()
+    assert not Agreement(correlation, disparity, LEVEL, 0.5).outvoted().any()
     disparity[30:50, 30:50] = 15.0
     correlation[30:50, 30:50] = np.where(rng.random((20, 20)) < 0.2, 0.9, 0.1)
-    changed = outvoted(correlation, disparity, LEVEL, 0.5)
+    changed = Agreement(correlation, disparity, LEVEL, 0.5).outvoted()
     assert changed[30:50, 30:50].all()
     assert changed.sum() == 400
     disparity[40, 40] = np.nan
-    assert not outvoted(correlation, disparity, LEVEL, 0.5)[40, 40]
+    assert not Agreement(correlation, disparity, LEVEL, 0.5).outvoted()[40, 40]
 
 
 def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
@@ -92,11 +90,11 @@ def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
     slope[0] = 0.8
     correlation = np.full((60, 60), 0.9)
     correlation[30, 30] = 0.1
-    assert not outvoted(correlation, 0.8 * x, slope, 0.5).any()
+    assert not Agreement(correlation, 0.8 * x, slope, 0.5).outvoted().any()
     roof = np.s_[22:38, 22:38]
     disparity, correlation = np.zeros((60, 60)), np.full((60, 60), 0.9)
     disparity[roof], correlation[roof] = 3.5, 0.2
-    changed = outvoted(correlation, disparity, np.zeros((2, 60, 60)), 0.5)
+    changed = Agreement(correlation, disparity, np.zeros((2, 60, 60)), 0.5).outvoted()
     assert changed[roof].all()
     assert changed.sum() == 256
 
@@ -125,8 +123,8 @@ def test_what_is_small_is_told_by_what_is_usual_around_it(noise, size, trust) ->
     warped[36 : 36 + size, 36 : 36 + size] = texture((size, size), seed=2)
     level = np.zeros((80, 80))
     correlation = surface_correlation(left, warped, level, LEVEL, 9)
-    assert not outvoted(correlation, level, LEVEL, 0.5).any()
-    found = outvoted_nearby(correlation, level, LEVEL, 0.5, trust)
+    assert not Agreement(correlation, level, LEVEL, 0.5).outvoted().any()
+    found = Agreement(correlation, level, LEVEL, 0.5, trust).outvoted_nearby()
     assert found[38:42, 38:42].all()
     assert not found[:24].any() and not found[:, 58:].any()
 
@@ -143,10 +141,10 @@ def test_a_roof_that_is_blurred_into_the_ground_is_no_change() -> None:
     assert not clear[:, 38:42].any() and clear[1:-1, 1:38].all() and clear[1:-1, 42:-1].all()
     warped[:, 39:41] = np.nan
     mixed = surface_correlation(left, warped, disparity, LEVEL, 9)
-    assert outvoted_nearby(mixed, disparity, LEVEL, 0.5, 1.0)[20:60, 41:44].all()
+    assert Agreement(mixed, disparity, LEVEL, 0.5, 1.0).outvoted_nearby()[20:60, 41:44].all()
     found = surface_correlation(left, warped, disparity, LEVEL, 9, clear)
     assert found[20:60, 41:46] == pytest.approx(1.0, abs=1e-4)
-    assert not outvoted_nearby(found, disparity, LEVEL, 0.5, 1.0).any()
+    assert not Agreement(found, disparity, LEVEL, 0.5, 1.0).outvoted_nearby().any()
 
 
 @pytest.mark.parametrize("noise", [20.0, 100.0])
@@ -158,11 +156,11 @@ def test_the_rim_of_a_change_belongs_to_it(noise) -> None:
     warped[30:70, 30:70] = texture((40, 40), seed=2)
     level, slope = np.zeros((100, 100)), np.zeros((2, 100, 100))
     correlation = surface_correlation(left, warped, level, slope, 9)
-    changed = outvoted(correlation, level, slope, 0.5)
+    changed = Agreement(correlation, level, slope, 0.5).outvoted()
     inside = np.zeros((100, 100), np.bool_)
     inside[30:70, 30:70] = True
     assert changed[45:55, 45:55].all() and not changed[30:34, 30:34].any()
-    found = changed | beside_changes(changed, correlation, level, slope, 0.5, 1.0)
+    found = changed | Agreement(correlation, level, slope, 0.5).beside(changed)
     assert (found & inside).sum() > 0.97 * inside.sum()
     touched = np.zeros((100, 100), np.bool_)
     touched[26:74, 26:74] = True
