@@ -13,6 +13,7 @@ from ..alignment.gcp_checks import open_view
 from ..epipolar.rpc import SensorModel
 from ..epipolar.rpc_files import rpc_file
 from ..errors import InputError
+from ..products.folders import files_below
 from ..products.ungeoreferenced import open_raster
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
@@ -81,7 +82,7 @@ def _open(file: Path) -> Image:
 
 def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """The files of the pair below folders, and remarks on those that were passed over."""
-    every = sorted(file for folder in folders for file in folder.rglob("*") if file.is_file())
+    every = sorted(file for folder in folders for file in files_below(folder) if file.is_file())
     files = [file for file in every if file.suffix.lower() in SUFFIXES]
     mosaics = [file for file in every if file.suffix.lower() == ".til"]
     for mosaic in mosaics:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..products.files import read_table
+from ..products.folders import files_below
 from ..products.rasters import read_disparity
 from .split_names import NO_TRUTH, NONE, SPLITS
 from .stereo_dataset_settings import Settings
@@ -223,7 +224,9 @@ def _us3d(root: Path) -> Iterator[Pair]:
 
 
 def _kitti(root: Path) -> Iterator[Pair]:
-    for left in sorted(root.rglob("image_2/*_10.png")):
+    for left in sorted(files_below(root)):
+        if left.parent.name != "image_2" or not left.name.endswith("_10.png"):
+            continue
         beside = left.parent.parent
         right = beside / "image_3" / left.name
         if not right.is_file():
@@ -236,7 +239,7 @@ def _kitti(root: Path) -> Iterator[Pair]:
 
 
 def _tiffs(root: Path) -> list[Path]:
-    return sorted(path for path in root.rglob("*.[tT][iI][fF]*") if _TIFF.search(path.name))
+    return sorted(path for path in files_below(root) if _TIFF.search(path.name))
 
 
 def _beside(left: Path, stem: str, folder: str | None) -> Path | None:

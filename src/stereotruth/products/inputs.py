@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from . import remote_files
+from .folders import files_below
 from .provenance import file_sha256
 
 TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
@@ -46,22 +47,13 @@ def _files(path: Path) -> Iterator[tuple[str, Path]]:
     here = Path.cwd()
     around = here.is_relative_to(path.absolute())
     written = {here / name for name in WRITTEN_BY_RUNS} if around else set()
-    seen = set()
-    for folder, folders, names in os.walk(path, followlinks=True):
-        state = Path(folder).stat()
-        if (state.st_dev, state.st_ino) in seen:  # a link to a folder above
-            folders.clear()
-            continue
-        seen.add((state.st_dev, state.st_ino))
-        folders[:] = sorted(
-            name
-            for name in folders
-            if not name.startswith(".") and Path(folder, name).absolute() not in written
-        )
-        for name in sorted(names):
-            if name != NOT_CONTENT:
-                file = Path(folder, name)
-                yield str(file.relative_to(path)), file
+
+    def enter(folder: Path) -> bool:
+        return not folder.name.startswith(".") and folder.absolute() not in written
+
+    for file in files_below(path, enter):
+        if file.name != NOT_CONTENT:
+            yield str(file.relative_to(path)), file
 
 
 def _fresh(file: Path) -> os.stat_result:

@@ -57,6 +57,19 @@ def test_loose_files_are_of_split_test_and_in_the_order_of_their_numbers(tmp_pat
     assert {p.split for p in pairs} == {"test"} and pairs[0].disparity is None
 
 
+def test_splits_may_be_links_to_another_disk(tmp_path):
+    for split in ("train", "test"):
+        whu_pair(tmp_path / "disk" / split, "KM_1")
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    for split in ("train", "test"):
+        (whole / split).symlink_to(tmp_path / "disk" / split)
+    (tmp_path / "disk" / "test" / "back").symlink_to(whole)  # leads in a circle
+    pairs = find_pairs(whole, "whu")
+    assert sorted(p.split for p in pairs) == ["test", "train"]
+    assert all(file.is_file() for p in pairs for file in (p.left, p.right, p.disparity))
+
+
 def test_the_own_layout_follows_its_manifest(tmp_path):
     whu_pair(tmp_path / "x", "ZZ_1")
     rows = [

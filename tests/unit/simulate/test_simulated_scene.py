@@ -63,6 +63,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "kernels",
         "products",
         "products.files",
+        "products.folders",
         "products.grids",
         "products.inputs",
         "products.locks",
