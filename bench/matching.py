@@ -131,6 +131,8 @@ def networks(
     print(f"{'network':<22}{'method':>18}{'bare':>18}{'ratio':>8}{'paper':>8}")
     for kind in kinds:
         for precision in precisions:
+            if inference.precision_of(precision, device) != precision:
+                continue
             model = weights.SavedNetwork(kind, RANGE, 3 if left.ndim == 3 else 1)
             method = inference.NetworkMethod(model, model.build(), device, precision)
             ready = [

@@ -61,8 +61,22 @@ PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.floa
 
 
 def precision_of(wanted: str | None, device: torch.device) -> str:
-    """The name of a precision; None: float32 on a CPU, mixed with bfloat16 on a GPU."""
-    return wanted or ("bfloat16" if device.type == "cuda" else "float32")
+    """The name of a precision; None: float32 on a CPU, mixed with bfloat16 on a GPU.
+
+    float32 on a CPU that does not have what is wanted: there it would take 40 times as long.
+    """
+    if device.type != "cpu":
+        return wanted or ("bfloat16" if device.type == "cuda" else "float32")
+    if wanted and not _is_computed(wanted):
+        log.warning("this processor computes no %s: float32 is taken, which is faster", wanted)
+        return "float32"
+    return wanted or "float32"
+
+
+def _is_computed(precision: str) -> bool:
+    """Whether this processor has the numbers of a precision, as far as PyTorch's build can tell."""
+    asked = {"bfloat16": "_is_mkldnn_bf16_supported", "float16": "_is_mkldnn_fp16_supported"}
+    return precision not in asked or getattr(torch.ops.mkldnn, asked[precision], lambda: True)()
 
 
 def mixed(precision: str, device: torch.device) -> Any:

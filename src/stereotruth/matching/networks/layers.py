@@ -13,7 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .convolution_gradient import convolve
+
 EPSILON, MOMENTUM = 1e-3, 0.01  # of batch normalisation
+SMALL = 20480  # channels x planes x rows; see _is_slow
 
 
 class Conv2d(nn.Conv2d):
@@ -39,7 +42,9 @@ class Conv2d(nn.Conv2d):
         """[N, C, H, W] -> [N, C', ceil(H / stride), ceil(W / stride)]."""
         if self._extent:
             x = F.pad(x, _same(x.shape[2:], self._extent, self.stride))
-        return super().forward(x)
+        if self.stride != (1, 1):
+            return super().forward(x)
+        return convolve(x, self.weight, self.bias, self.dilation[0])
 
 
 class Conv3d(nn.Conv3d):
@@ -61,7 +66,20 @@ class Conv3d(nn.Conv3d):
         """[N, C, D, H, W] -> [N, C', ceil(D / stride), ceil(H / stride), ceil(W / stride)]."""
         if self._extent:
             x = F.pad(x, _same(x.shape[2:], self._extent, self.stride))
+        if _is_slow(x):
+            return super().forward(x.expand(2, -1, -1, -1, -1))[:1]
         return super().forward(x)
+
+
+def _is_slow(x: Tensor) -> bool:
+    """Whether PyTorch convolves a volume without oneDNN, which takes two of them in an eighth of
+    the time: a single one on a CPU, in float32, small but for its last axis."""
+    return (
+        x.device.type == "cpu"
+        and x.shape[0] == 1
+        and x.shape[1:4].numel() <= SMALL
+        and not torch.is_autocast_enabled("cpu")
+    )
 
 
 def _same(shape: Sequence[int], extent: int, stride: Sequence[int]) -> list[int]:

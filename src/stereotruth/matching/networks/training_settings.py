@@ -93,7 +93,7 @@ class Training:
 
     precision: Literal["float32", "bfloat16", "float16"] | None = None
     """null: mixed with bfloat16 on a GPU, float32 on a CPU; processors with matrix units (AMX) are
-    three times as fast with `bfloat16`"""
+    three times as fast with `bfloat16`, those that have no such numbers take float32"""
 
     processes: Count | None = None
     """that share each step; null: one for each GPU"""

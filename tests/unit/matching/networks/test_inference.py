@@ -143,3 +143,13 @@ def test_published_stereonet_matches_a_real_tile_from_its_raw_pixels() -> None:
         reference["raw_left"], reference["raw_right"], (-128, 64)
     )
     assert np.abs(found - reference["d3"]).max() < 1e-3
+
+
+def test_a_processor_takes_float32_for_what_it_does_not_have(monkeypatch, caplog) -> None:
+    for had, precision in ((True, "bfloat16"), (False, "float32")):
+        monkeypatch.setattr(inference, "_is_computed", lambda precision, had=had: had)
+        assert inference.precision_of("bfloat16", CPU) == precision
+        assert ("no bfloat16" in caplog.text) == (not had)
+    monkeypatch.undo()
+    assert inference._is_computed("float32") and inference.precision_of(None, CPU) == "float32"
+    assert inference.precision_of("bfloat16", torch.device("cuda")) == "bfloat16"

@@ -68,3 +68,21 @@ def test_ranges_must_be_multiples_of_the_scale() -> None:
     for bad in ((-96, 64), (-90, 102)):
         with pytest.raises(ValueError, match="disparity range"):
             layers.planes(bad, 16, 4)
+
+
+@pytest.mark.parametrize("planes", [4, 12])  # small, and not
+@pytest.mark.parametrize("stride", [1, 2])
+def test_small_volumes_are_convolved_like_large_ones(planes: int, stride: int) -> None:
+    torch.manual_seed(4)
+    convolution = layers.Conv3d(32, 16, stride=stride)
+    x = torch.randn(1, 32, planes, 64, 4, requires_grad=True)
+    assert layers._is_slow(x) == (planes == 4)
+    both = convolution(torch.cat([x, x]))
+    weights = torch.randn_like(both[:1])
+    inputs = (x, convolution.weight)
+    torch.testing.assert_close(convolution(x), both[:1])
+    for a, b in zip(
+        torch.autograd.grad(convolution(x), inputs, weights),
+        torch.autograd.grad(both[:1], inputs, weights),
+    ):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=1e-4)
