@@ -597,11 +597,15 @@ class InMemory:
 
     def __init__(self, source: Source) -> None:
         self.path, self.size, self.nodata, self.gain = source.path, source.size, 0.0, 1.0
+        self.colour, self.band_count = (), 1
         self.pixels = source.read(0, 0, *source.size)
         self.valid: list[int] = []
 
-    def read(self, col: int, row: int, cols: int, rows: int) -> np.ndarray:
-        return self.pixels[row : row + rows, col : col + cols].copy()
+    def read_layers(
+        self, col: int, row: int, cols: int, rows: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        layers = self.pixels[None, row : row + rows, col : col + cols].copy()
+        return layers, np.zeros((rows, cols), np.bool_)
 
     def missing(self, blocks: Sequence[Any], *_: object) -> list[int]:
         return list(range(len(blocks)))

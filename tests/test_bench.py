@@ -5,10 +5,17 @@ from __future__ import annotations
 import ast
 import importlib
 import runpy
+from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+
+from stereotruth.epipolar.fit import fit_epipolar
+
+from .synthetic.cameras import BACKWARD, FORWARD, HEIGHT, camera
+from .synthetic.images import write_image
 
 PROGRAMS = sorted((Path(__file__).parents[1] / "bench").glob("*.py"))
 
@@ -44,3 +51,17 @@ def test_what_is_taken_from_the_package_exists(program: Path, monkeypatch) -> No
     names = runpy.run_path(str(program), run_name=program.stem)
     taken = f"from {program.stem} import"
     assert callable(names.get("main")) or any(taken in p.read_text() for p in PROGRAMS)
+
+
+def test_the_rates_of_rectification_are_measured(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(PROGRAMS[0].parent)
+    throughput = importlib.import_module("throughput")
+    size = (300, 200)
+    views = [camera(place, angle=90.0, size=size) for place in (BACKWARD, FORWARD)]
+    fit_epipolar(*views, size, size, HEIGHT).save(tmp_path / "epipolar.json")
+    write_image(tmp_path / "left.tif", None, np.full(size[::-1], 500, np.uint16))
+    rows = throughput.rectification(Namespace(folder=tmp_path, repeats=1, workers=1))
+    assert {row["what"] for row in rows} == {
+        "remap, bicubic", "remap, Lanczos", "stereotruth", "stereotruth, file to store"
+    }  # fmt: skip
+    assert all(row["per_s"] > 0 and row["per_cpu_s"] > 0 for row in rows)

@@ -59,9 +59,12 @@ def buildings_by_shape(height: Floats) -> NDArray[np.bool_]:
     low = cv2.erode(np.where(known, z, FAR), square)
     ground = cv2.dilate(np.where(low < FAR, low, -FAR), square)
     ground = np.where(ground > -FAR, ground, 0.0)
+    raised = known & (z - ground > RAISED_M)
+    if not raised.any():
+        return raised
     smooth = cv2.GaussianBlur(ground, (0, 0), GROUND_PX / 4)
     slope = cv2.dilate(np.hypot(*np.gradient(smooth)), square)  # as the opening, from all around
-    raised = known & (z - ground > RAISED_M + slope * GROUND_PX / 2)
+    raised &= z - ground > RAISED_M + slope * GROUND_PX / 2
     flat = raised & (_rough(z, known) < ROUGH_M)
     square = np.ones((PLANE_PX, PLANE_PX), np.uint8)
     return raised & (cv2.dilate(flat.astype(np.uint8), square) > 0)
