@@ -24,6 +24,7 @@ Images in colour are matched as grey. Nodata (0) is masked. Pandora works with o
 from __future__ import annotations
 
 import copy
+import gc
 import json
 import logging
 from collections.abc import Mapping
@@ -107,6 +108,15 @@ class PandoraMethod(UncertainMatcher):
         scaling: Any = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """The disparity, and its standard uncertainty if the pipeline has a step that tells it."""
+        try:
+            return self._matched(left, right, disparity_range)
+        finally:
+            # its machine refers to itself, so that each pair's cost volumes would stay
+            gc.collect()
+
+    def _matched(
+        self, left: NDArray[Any], right: NDArray[Any], disparity_range: DisparityRange
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         low, high = disparity_range
         searched = dataset(_grey(left), (1 - high, -low)), dataset(_grey(right), (low, high - 1))
         machine, steps = self.checked(*searched)

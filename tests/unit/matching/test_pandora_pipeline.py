@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import json
 
 import numpy as np
@@ -111,6 +112,18 @@ def test_colour_is_matched_as_grey():
     eight = [(image >> 2).clip(1, 255).astype(np.uint8) for image in (left, right)]
     colour = (np.repeat(image[..., None], 3, axis=2) for image in eight)
     assert np.array_equal(method()(*colour, RANGE), method()(*eight, RANGE), equal_nan=True)
+
+
+def test_no_cost_volume_of_a_pair_stays_in_memory():
+    _, left, right = images()
+    matcher = method()
+    gc.disable()
+    try:
+        matcher(left, right, RANGE)
+    finally:
+        gc.enable()
+    machine = pandora_pipeline.PandoraMachine
+    assert not any(isinstance(each, machine) for each in gc.get_objects())
 
 
 def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
