@@ -15,7 +15,7 @@ rule match:
         CONDA
     threads: 2
     resources:
-        mem_mb=8000,
+        mem_mb=6000,
         runtime=480,
     params:
         made=lambda w: making_of(rules.match, w),

@@ -15,7 +15,7 @@ rule predict_scene:
         CONDA
     threads: 2
     resources:
-        mem_mb=8000,
+        mem_mb=6000,
         runtime=720,
     params:
         made=lambda w: making_of(rules.predict_scene, w),
