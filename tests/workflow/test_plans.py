@@ -171,6 +171,16 @@ def test_an_edit_behind_a_module_is_seen_and_a_missing_one_refused(project):
         assert word in run.text
 
 
+def test_a_setting_that_a_method_does_not_have_ends_the_plan(project):
+    wrong = "{benchmark: {methods: {mine: {kind: pandora, uncertainty: true}}}}"
+    (project.folder / "wrong.yaml").write_text(wrong)
+    made = "results/match/synthetic/mine"
+    run = project.snakemake("--dry-run", made, "--configfile", "wrong.yaml")
+    assert run.status != 0
+    for word in ("benchmark.methods.mine", "has no setting 'uncertainty'", "pipeline"):
+        assert word in run.text
+
+
 def test_lint_passes():
     lint = subprocess.run(
         [sys.executable, "-m", "snakemake", "--lint"], cwd=ROOT, capture_output=True, text=True

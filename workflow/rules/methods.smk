@@ -5,7 +5,7 @@ from functools import cache
 
 from snakemake.logging import logger
 
-from stereotruth.matching.kinds import KINDS
+from stereotruth.matching.kinds import KINDS, kind_of
 from stereotruth.matching.scenes.settings import Settings as PredictionSettings
 
 
@@ -98,10 +98,13 @@ def method_entry(name, dataset):
 
 
 def method_files(name, dataset):
-    """Files that a method is made of: weights, the user's code, results to be scored."""
-    entry = method_entry(name, dataset)
+    """Files that a method is made of: weights, the user's code, results to be scored.
+
+    Ends the plan if the method has settings that its kind does not know.
+    """
     try:
-        return [str(file) for file in KINDS[entry["kind"]].files(entry)]
+        kind = kind_of(name, method_settings(name))
+        return [str(file) for file in kind.files(method_entry(name, dataset))]
     except InputError as error:
         raise WorkflowError(f"benchmark.methods.{name}: {error}")
 

@@ -21,6 +21,8 @@ from typing import Any
 from ..errors import InputError
 
 FOLDER = "folder"
+TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
+MOVED = ("polarity", "outside")  # of any kind
 ENTRY_POINTS = "stereotruth.methods"
 Files = Callable[[Mapping[str, Any]], list[Path]]
 
@@ -113,14 +115,15 @@ class Kind:
     """A kind of stereo methods.
 
     ``label``: how tables call its methods ("": by their names). ``module``: of this package, makes
-    its methods (None: they cannot run). ``files``: those that a method is made of, from the
-    settings of its entry. ``network``: ``module:class`` of this package; such methods are trained.
+    its methods (None: they cannot run). ``settings``: keys of its entries besides those of any
+    kind. ``files``: those that a method is made of, from the settings of its entry. ``network``: ``module:class`` of this package; such methods are trained.
     ``tiles_at_once``: whether several tiles of a scene are worked on at once, a thread each;
     else the method itself has all threads. ``extra``: that this package is installed with for it.
     """
 
     label: str = ""
     module: str | None = None
+    settings: tuple[str, ...] = ()
     files: Files = _none
     network: str | None = None
     tiles_at_once: bool = False
@@ -139,31 +142,53 @@ class Kind:
 
 
 def _network(label: str, of: str) -> Kind:
-    module = "matching.networks.inference"
-    return Kind(label, module, _weights, f"matching.networks.{of}", extra="networks")
+    return Kind(
+        label,
+        "matching.networks.inference",
+        ("weights", "training", "device", "precision", "uncertainty", "scaling"),
+        _weights,
+        f"matching.networks.{of}",
+        extra="networks",
+    )
 
 
+_SGM = (
+    "mode", "block_size", "p1", "p2", "uniqueness_percent", "left_right_px", "speckle_px",
+    "speckle_range_px", "prefilter_cap", "uncertainty",
+)  # fmt: skip
+_COMMAND = ("command", "pairs", "suffix", "uncertainty", "files", "margin_px")
 KINDS = {
-    "sgm": Kind("SGM", "matching.sgm", tiles_at_once=True),
-    "pandora": Kind("Pandora", "matching.pandora_pipeline", _pipeline, extra="pandora"),
+    "sgm": Kind("SGM", "matching.sgm", _SGM, tiles_at_once=True),
+    "pandora": Kind(
+        "Pandora", "matching.pandora_pipeline", ("pipeline",), _pipeline, extra="pandora"
+    ),
     "stereonet": _network("StereoNet", "stereonet:StereoNet"),
     "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
     "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
-    "function": Kind(module="matching.user_function", files=_code),
-    "command": Kind(module="matching.user_command", files=_program),
-    FOLDER: Kind(files=_results),
+    "function": Kind(
+        "", "matching.user_function", ("function", "options", "margin_px"), files=_code
+    ),
+    "command": Kind("", "matching.user_command", _COMMAND, files=_program),
+    FOLDER: Kind(settings=("folder",), files=_results),
 }
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)
 
 
 def kind_of(name: str, settings: Mapping[str, Any]) -> Kind:
-    """The kind of a method's entry. Raises InputError for an unknown one."""
+    """The kind of a method's entry. Raises InputError for an unknown one, or an unknown setting."""
     kind = settings.get("kind")
     if kind not in KINDS:
         raise InputError(
             f"method {name!r} is of unknown kind {kind!r}",
             remedy=f"take one of {', '.join(KINDS)}",
         )
+    known = (*KINDS[kind].settings, *MOVED, *TOLD)
+    for key in settings:
+        if key != "kind" and key not in known:
+            raise InputError(
+                f"method {name!r} is of kind {kind!r}, which has no setting {key!r}",
+                remedy=f"take it away, or one of {', '.join(known)} (config/README.md)",
+            )
     return KINDS[kind]
 
 

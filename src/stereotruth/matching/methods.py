@@ -11,12 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import InputError
-from .kinds import kind_of
+from .kinds import MOVED, TOLD, kind_of
 from .matcher import Matcher
 from .polarity import with_polarity
-
-TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
-MOVED = ("polarity", "outside")  # of any kind
 
 
 def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Matcher:
@@ -27,7 +24,7 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
     of any kind (:mod:`polarity`).
 
     Raises InputError for an unknown kind, a function that cannot be found, and settings that the
-    method does not take.
+    method does not take or lacks.
     """
     kind = kind_of(name, settings)
     options = {k: v for k, v in settings.items() if k not in ("kind", *TOLD, *MOVED)}

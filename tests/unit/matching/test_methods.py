@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import re
 import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,8 +106,35 @@ def test_a_result_of_another_size_is_refused(here):
 def test_sgm_is_made_with_its_settings():
     method = make_method("sgm", {"kind": "sgm", "mode": "3way", "label": "SGM, three paths"})
     assert isinstance(method, SemiGlobalMatcher)
-    with pytest.raises(InputError, match=r"settings of method 'sgm': .*'windw'"):
+    with pytest.raises(InputError, match=r"kind 'sgm', which has no setting 'windw'.*block_size"):
         make_method("sgm", {"kind": "sgm", "windw": 3})
+
+
+@pytest.mark.parametrize(
+    ("kind", "maker", "told"),
+    [
+        ("sgm", "sgm:SemiGlobalMatcher", {"workers"}),
+        ("pandora", "pandora_pipeline:PandoraMethod", {"name"}),
+        ("function", "user_function:_function_method", {"name"}),
+        ("command", "user_command:CommandMethod", {"name", "workers"}),
+    ],
+)
+def test_the_settings_of_a_kind_are_those_that_its_maker_takes(kind, maker, told):
+    module, _, name = maker.partition(":")
+    module = pytest.importorskip(f"stereotruth.matching.{module}", exc_type=ImportError)
+    taken = set(inspect.signature(getattr(module, name)).parameters) - told
+    assert set(KINDS[kind].settings) == taken
+
+
+def test_the_settings_of_networks_are_those_that_are_read():
+    folder = Path(kinds.__file__).parent / "networks"
+    read = set(re.findall(r'settings\.get\("(\w+)"\)', (folder / "inference.py").read_text()))
+    assert set(KINDS["stereonet"].settings) == read | {"training"}
+
+
+def test_a_network_has_no_other_settings():
+    with pytest.raises(InputError, match=r"no setting 'precison'.*precision"):
+        make_method("stereonet", {"kind": "stereonet", "precison": "bfloat16"})
 
 
 def test_unknown_kinds_and_folders_cannot_run():

@@ -37,9 +37,9 @@ from ...products.finished_pieces import Ledger
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import image_shape, read_image, write_disparity
-from ..kinds import FOLDER
+from ..kinds import FOLDER, MOVED, TOLD
 from ..matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
-from ..methods import MOVED, TOLD, make_method
+from ..methods import make_method
 from ..result_files import SUFFIXES, read_result
 from .identity import identity, machine
 from .prediction_files import RECORD, UNCERTAINTY
