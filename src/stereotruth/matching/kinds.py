@@ -116,9 +116,10 @@ class Kind:
 
     ``label``: how tables call its methods ("": by their names). ``module``: of this package, makes
     its methods (None: they cannot run). ``settings``: keys of its entries besides those of any
-    kind. ``files``: those that a method is made of, from the settings of its entry. ``network``: ``module:class`` of this package; such methods are trained.
-    ``tiles_at_once``: whether several tiles of a scene are worked on at once, a thread each;
-    else the method itself has all threads. ``extra``: that this package is installed with for it.
+    kind. ``files``: those that a method is made of, from the settings of its entry. ``network``:
+    ``module:class`` of this package; such methods are trained. ``tiles_at_once``: whether several
+    tiles of a scene are worked on at once, a thread each; else the method itself has all threads.
+    ``extra``: that this package is installed with for it.
     """
 
     label: str = ""
