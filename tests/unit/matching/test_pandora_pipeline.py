@@ -136,5 +136,5 @@ def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
     file.write_text(json.dumps({"pipeline": {"disparity": {"disparity_method": "wta"}}}))
     with pytest.raises(InputError, match=r"does not take its pipeline: .*check_disparity"):
         method(pipeline=str(file))
-    with pytest.raises(InputError, match="settings of method 'census'"):
+    with pytest.raises(InputError, match="has no setting 'penalty'"):
         method(penalty=3)
