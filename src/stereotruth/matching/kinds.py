@@ -146,32 +146,45 @@ def _network(label: str, of: str) -> Kind:
     return Kind(
         label,
         "matching.networks.inference",
-        ("weights", "training", "device", "precision", "uncertainty", "scaling"),
-        _weights,
-        f"matching.networks.{of}",
+        settings=("weights", "training", "device", "precision", "uncertainty", "scaling"),
+        files=_weights,
+        network=f"matching.networks.{of}",
         extra="networks",
     )
 
 
-_SGM = (
-    "mode", "block_size", "p1", "p2", "uniqueness_percent", "left_right_px", "speckle_px",
-    "speckle_range_px", "prefilter_cap", "uncertainty",
-)  # fmt: skip
-_COMMAND = ("command", "pairs", "suffix", "uncertainty", "files", "margin_px")
 KINDS = {
-    "sgm": Kind("SGM", "matching.sgm", _SGM, tiles_at_once=True),
+    "sgm": Kind(
+        "SGM",
+        "matching.sgm",
+        settings=(
+            "mode", "block_size", "p1", "p2", "uniqueness_percent", "left_right_px", "speckle_px",
+            "speckle_range_px", "prefilter_cap", "uncertainty",
+        ),
+        tiles_at_once=True,
+    ),
     "pandora": Kind(
-        "Pandora", "matching.pandora_pipeline", ("pipeline",), _pipeline, extra="pandora"
+        "Pandora",
+        "matching.pandora_pipeline",
+        settings=("pipeline",),
+        files=_pipeline,
+        extra="pandora",
     ),
     "stereonet": _network("StereoNet", "stereonet:StereoNet"),
     "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
     "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
     "function": Kind(
-        "", "matching.user_function", ("function", "options", "margin_px"), files=_code
+        module="matching.user_function",
+        settings=("function", "options", "margin_px"),
+        files=_code,
     ),
-    "command": Kind("", "matching.user_command", _COMMAND, files=_program),
+    "command": Kind(
+        module="matching.user_command",
+        settings=("command", "pairs", "suffix", "uncertainty", "files", "margin_px"),
+        files=_program,
+    ),
     FOLDER: Kind(settings=("folder",), files=_results),
-}
+}  # fmt: skip
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)
 
 

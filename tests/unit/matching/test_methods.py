@@ -137,6 +137,13 @@ def test_a_network_has_no_other_settings():
         make_method("stereonet", {"kind": "stereonet", "precison": "bfloat16"})
 
 
+def test_a_setting_that_a_method_lacks_is_told():
+    with pytest.raises(InputError, match=r"settings of method 'mine': missing .*'function'"):
+        make_method("mine", {"kind": "function"})
+    with pytest.raises(InputError, match=r"settings of method 'mine': missing .*'command'"):
+        make_method("mine", {"kind": "command"})
+
+
 def test_unknown_kinds_and_folders_cannot_run():
     with pytest.raises(InputError, match="unknown kind 'raft'"):
         make_method("x", {"kind": "raft"})

@@ -65,12 +65,10 @@ def precision_of(wanted: str | None, device: torch.device) -> str:
 
     float32 on a CPU that does not have what is wanted: there it would take 40 times as long.
     """
-    if device.type != "cpu":
-        return wanted or ("bfloat16" if device.type == "cuda" else "float32")
-    if wanted and not _is_computed(wanted):
+    if wanted and device.type == "cpu" and not _is_computed(wanted):
         log.warning("this processor computes no %s: float32 is taken, which is faster", wanted)
         return "float32"
-    return wanted or "float32"
+    return wanted or ("bfloat16" if device.type == "cuda" else "float32")
 
 
 def _is_computed(precision: str) -> bool:
