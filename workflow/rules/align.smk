@@ -28,7 +28,6 @@ rule align:
         mem_mb=1000,
         runtime=10,
     params:
-        made=lambda w: making_of(rules.align, w),
         script=content_of("../scripts/align.py"),
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,

@@ -16,7 +16,6 @@ rule audit:
         mem_mb=4000,
         runtime=240,
     params:
-        made=lambda w: making_of(rules.audit, w),
         script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=asdict(SETTINGS.audit),

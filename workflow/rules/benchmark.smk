@@ -18,7 +18,6 @@ rule match:
         mem_mb=6000,
         runtime=480,
     params:
-        made=lambda w: making_of(rules.match, w),
         script=content_of("../scripts/match.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
@@ -51,7 +50,6 @@ rule score:
         mem_mb=2000,
         runtime=120,
     params:
-        made=lambda w: making_of(rules.score, w),
         script=content_of("../scripts/score.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
@@ -89,7 +87,6 @@ rule submission:
         mem_mb=1000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.submission, w),
         script=content_of("../scripts/submission.py"),
         code=source_digest("matching.benchmark.submission"),
     message:
@@ -143,7 +140,6 @@ rule benchmark_tables:
         mem_mb=2000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.benchmark_tables, w),
         script=content_of("../scripts/benchmark_tables.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,

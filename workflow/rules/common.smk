@@ -8,7 +8,6 @@ from snakemake.exceptions import WorkflowError
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
-from stereotruth.products.publication import made_of
 from stereotruth.project import (
     FILES,
     check_fixed,
@@ -68,11 +67,6 @@ def scenes_of(city):
     if not found:
         raise no_scenes(SETTINGS.scenes, f"scene of city {city!r}", "add a row")
     return found
-
-
-def making_of(rule, wildcards):
-    """What the making of a job's products is called; other than it was if they are stale."""
-    return made_of(str(rule.output[0].apply_wildcards(wildcards)))
 
 
 def templates_of(*parts):

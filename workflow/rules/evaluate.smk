@@ -14,7 +14,6 @@ rule grid_truth:
         mem_mb=3000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.grid_truth, w),
         script=content_of("../scripts/grid_truth.py"),
         code=source_digest("evaluation.epipolar_truth"),
     message:
@@ -47,7 +46,6 @@ rule evaluate_truth:
         mem_mb=3000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.evaluate_truth, w),
         script=content_of("../scripts/evaluate_truth.py"),
         code=source_digest("evaluation.labels_against_truth"),
     message:
@@ -84,7 +82,6 @@ rule evaluate_truth_city:
         mem_mb=3000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.evaluate_truth_city, w),
         script=content_of("../scripts/evaluate_truth_city.py"),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("evaluation.labels_against_truth"),

@@ -41,7 +41,6 @@ rule export:
         mem_mb=4000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.export, w),
         script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         city=lambda w: asdict(CITIES[w.city]),
@@ -77,7 +76,6 @@ rule originals:
         mem_mb=2000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.originals, w),
         script=content_of("../scripts/originals.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         code=source_digest("dataset.originals"),
@@ -105,7 +103,6 @@ rule dataset:
         mem_mb=1000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.dataset, w),
         script=content_of("../scripts/dataset.py"),
         catalogs={
             "catalogs": list(SETTINGS.dataset.catalogs),

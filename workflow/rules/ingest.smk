@@ -15,7 +15,6 @@ rule ingest:
         mem_mb=2000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.ingest, w),
         script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
         drop_classes=list(SETTINGS.ingest.drop_classes),

@@ -18,7 +18,6 @@ rule predict_scene:
         mem_mb=6000,
         runtime=720,
     params:
-        made=lambda w: making_of(rules.predict_scene, w),
         script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
         settings=lambda w: scene_prediction(),
@@ -47,7 +46,6 @@ rule dsm:
         mem_mb=2000,
         runtime=240,
     params:
-        made=lambda w: making_of(rules.dsm, w),
         script=content_of("../scripts/dsm.py"),
         settings=asdict(SETTINGS.predict.dsm),
         code=source_digest("matching.scenes.surface_model"),
@@ -76,7 +74,6 @@ rule score_dsm:
         mem_mb=3000,
         runtime=240,
     params:
-        made=lambda w: making_of(rules.score_dsm, w),
         script=content_of("../scripts/score_dsm.py"),
         code=source_digest("evaluation.surface_models.page"),
         templates=templates_of("evaluation", "surface_models", "page.html.jinja"),

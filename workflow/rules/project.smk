@@ -22,7 +22,6 @@ rule project:
         mem_mb=4000,
         runtime=240,
     params:
-        made=lambda w: making_of(rules.project, w),
         script=content_of("../scripts/project.py"),
         view="left",
         settings=PROJECTION,
@@ -46,7 +45,6 @@ use rule project as project_right with:
     benchmark:
         "logs/project_right/{city}/{scene}.tsv"
     params:
-        made=lambda w: making_of(rules.project_right, w),
         script=content_of("../scripts/project.py"),
         view="right",
         settings=PROJECTION,
@@ -73,7 +71,6 @@ rule project_strip:
         mem_mb=4000,
         runtime=120,
     params:
-        made=lambda w: making_of(rules.project_strip, w),
         script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",

@@ -21,7 +21,6 @@ rule rectify:
         mem_mb=2000,
         runtime=120,
     params:
-        made=lambda w: making_of(rules.rectify, w),
         script=content_of("../scripts/rectify.py"),
         bands=asdict(SETTINGS.rectify),
         code=source_digest(
@@ -56,7 +55,6 @@ rule rectify_strip:
         mem_mb=2000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.rectify_strip, w),
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=asdict(SETTINGS.rectify),

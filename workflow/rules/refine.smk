@@ -31,7 +31,6 @@ rule refine:
         mem_mb=2000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.refine, w),
         script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
         bands=asdict(SETTINGS.rectify),

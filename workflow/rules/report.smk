@@ -33,7 +33,6 @@ rule report_city:
         mem_mb=2000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.report_city, w),
         script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),

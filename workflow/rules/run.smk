@@ -5,7 +5,6 @@ import sys
 
 from stereotruth.products.locks import FileLock
 from stereotruth.products.records import all_records
-from stereotruth.products.reruns import keep_metadata, save_metadata, settle_times
 from stereotruth.products.runs import Run, begin_run, end_older_jobs
 
 LOCKS = []  # held until this process ends
@@ -31,16 +30,12 @@ if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, m
         Run().refuse_older()
     except InputError as error:
         raise WorkflowError(str(error))
-else:
-    keep_metadata(begin=False)
-    settle_times()
-    if STORAGE.default_storage_provider:
-        MIRROR = record_mirror()
+elif STORAGE.default_storage_provider:
+    MIRROR = record_mirror()
 
 
 onstart:
     refuse_second_run()
-    keep_metadata(begin=True)
     if MIRROR:
         keep_mirrored(MIRROR)
     end_older_jobs()
@@ -64,8 +59,8 @@ def made():
     products = [
         product_name(path)
         for job in all_records()
-        if job["run"] == Run().name
-        for path in job["outputs"]
+        if job.run == Run().name
+        for path in job.outputs
     ]
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
@@ -90,12 +85,10 @@ def say(text):
 
 
 onsuccess:
-    save_metadata()
     tidy_copies()
     say(made())
 
 
 onerror:
-    save_metadata()
     list_pages()
     say(complaints(log))

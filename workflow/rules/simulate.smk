@@ -12,7 +12,6 @@ rule simulate_city:
         mem_mb=2000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.simulate_city, w),
         script=content_of("../scripts/simulate_city.py"),
         code=source_digest("simulate.built_city"),
     message:
@@ -37,7 +36,6 @@ rule simulate_image:
         mem_mb=3000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.simulate_image, w),
         script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.render"),
@@ -65,7 +63,6 @@ rule simulate_lidar:
         mem_mb=3000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.simulate_lidar, w),
         script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
@@ -92,7 +89,6 @@ rule simulate_truth:
         mem_mb=3000,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.simulate_truth, w),
         script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.truth", "simulate.control_points"),

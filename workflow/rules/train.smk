@@ -26,7 +26,6 @@ rule train:
         mem_mb=12000,
         runtime=2880,
     params:
-        made=lambda w: making_of(rules.train, w),
         script=content_of("../scripts/train.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         kind=lambda w: method_settings(w.method)["kind"],

@@ -19,7 +19,6 @@ rule training_city:
         mem_mb=3000,
         runtime=60,
     params:
-        made=lambda w: making_of(rules.training_city, w),
         script=content_of("../scripts/training_city.py"),
         size=SETTINGS.tiles.size,
         seed=SETTINGS.seed,
@@ -51,7 +50,6 @@ rule training_cities:
         mem_mb=500,
         runtime=30,
     params:
-        made=lambda w: making_of(rules.training_cities, w),
         script=content_of("../scripts/training_cities.py"),
         code=source_digest("evaluation.exact_tiles"),
     message:

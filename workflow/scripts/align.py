@@ -11,7 +11,7 @@ if __name__ == "__main__":
     model, strict = snakemake.params.model, snakemake.params.strict
     with (
         job(snakemake.log[0], f"align {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)

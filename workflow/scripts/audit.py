@@ -11,7 +11,7 @@ if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params
     with (
         job(snakemake.log[0], f"audit {name}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         audit(
             StereoDataset.of(name, params.dataset),

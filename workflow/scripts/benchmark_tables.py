@@ -12,7 +12,7 @@ if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with (
         job(snakemake.log[0], f"benchmark {of.dataset}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         compare(
             StereoDataset.of(of.dataset, params.dataset),

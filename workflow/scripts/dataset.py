@@ -9,7 +9,7 @@ if __name__ == "__main__":
     dataset, *others = snakemake.output
     with (
         job(snakemake.log[0], "dataset"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):

@@ -9,7 +9,7 @@ if __name__ == "__main__":
     address = scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
         write_dsm(

@@ -9,7 +9,7 @@ if __name__ == "__main__":
     stores = zip(given.left, given.right, given.disparity)
     with (
         job(snakemake.log[0], f"evaluate {city}") as log,
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         table = evaluate_city(
             city,

@@ -11,7 +11,7 @@ if __name__ == "__main__":
     made = (snakemake.input[key] for key in ("disparity", "truth", "tiles"))
     with (
         job(snakemake.log[0], f"evaluate {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         evaluate_truth(
             scene,

@@ -10,7 +10,7 @@ if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"evaluate {city}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         evaluate_truth(
             city,

@@ -16,7 +16,7 @@ if __name__ == "__main__":
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
     with (
         job(snakemake.log[0], f"export {city['city']}") as log,
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         summary = export_city(
             scenes=list(

@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"truth of {scene.name}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         write_grid_truth(
             city,

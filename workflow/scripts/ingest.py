@@ -13,7 +13,7 @@ if __name__ == "__main__":
     }
 
     def ingest_file() -> None:
-        with publication(snakemake.input, snakemake.output, snakemake.params.made):
+        with publication(snakemake.input, snakemake.output, snakemake.params):
             ingest(
                 snakemake.input.lidar,
                 snakemake.output.store,

@@ -12,7 +12,7 @@ if __name__ == "__main__":
     out = Path(snakemake.output[0])
     with (
         job(snakemake.log[0], f"match {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         predict(
             StereoDataset.of(of.dataset, params.dataset),

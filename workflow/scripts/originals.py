@@ -8,7 +8,7 @@ if __name__ == "__main__":
     given, city = snakemake.input, snakemake.wildcards.city
     with (
         job(snakemake.log[0], f"originals {city}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         images = dict(zip(snakemake.params.scenes, zip(given.left, given.right)))
         write_originals(given.tiles, snakemake.output[0], images, workers=snakemake.threads)

@@ -10,7 +10,7 @@ if __name__ == "__main__":
     address = scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
         predict_scene(

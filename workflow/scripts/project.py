@@ -9,7 +9,7 @@ if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, scheduler_address(snakemake.config)
     with (
         job(snakemake.log[0], f"project {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
         project_scene(

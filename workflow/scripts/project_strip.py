@@ -10,7 +10,7 @@ if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
     with (
         job(snakemake.log[0], f"project {scene} {strip}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         project_scene(
             snakemake.input.left,

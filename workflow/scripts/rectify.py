@@ -17,7 +17,7 @@ if __name__ == "__main__":
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with (
         job(snakemake.log[0], f"rectify {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
         bands = Settings(**snakemake.params.bands)

@@ -13,7 +13,7 @@ if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     with (
         job(snakemake.log[0], f"refine {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         given = snakemake.input
         masks = given.left_mask, given.right_mask

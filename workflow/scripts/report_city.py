@@ -16,7 +16,7 @@ if __name__ == "__main__":
 
     with (
         job(snakemake.log[0], f"report {city}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         write_report(
             city,

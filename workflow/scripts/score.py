@@ -13,7 +13,7 @@ if __name__ == "__main__":
     own = (Path("tiles"), Path("results/project"), Path("results/truth"))
     with (
         job(snakemake.log[0], f"score {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         score(
             StereoDataset.of(of.dataset, params.dataset),

@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     with (
         job(snakemake.log[0], f"score_dsm {scene} {method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         verdict = score_surface_model(snakemake.input.dsm, LidarReference(snakemake.input.points))
         write_verdict(verdict, snakemake.output[0], f"{scene} by {method}", index=INDEX)

@@ -9,6 +9,6 @@ if __name__ == "__main__":
     city = CITIES[snakemake.wildcards.city]
     with (
         job(snakemake.log[0], f"simulate {city.name}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         write_surfaces(city, snakemake.output.surfaces)

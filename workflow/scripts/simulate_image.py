@@ -11,7 +11,7 @@ if __name__ == "__main__":
     view = snakemake.wildcards.view
     with (
         job(snakemake.log[0], f"simulate {scene.name} {view}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         simulate_image(
             city,

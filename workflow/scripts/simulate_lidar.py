@@ -11,7 +11,7 @@ if __name__ == "__main__":
     tile = snakemake.wildcards.tile
     with (
         job(snakemake.log[0], f"simulate {tile}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         simulate_lidar_tile(
             city,

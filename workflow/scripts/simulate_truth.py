@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"simulate {scene.name} truth"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         simulate_points(
             city,

@@ -8,6 +8,6 @@ if __name__ == "__main__":
     of = snakemake.wildcards
     with (
         job(snakemake.log[0], f"submission {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])

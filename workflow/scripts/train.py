@@ -11,7 +11,7 @@ if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with (
         job(snakemake.log[0], f"train {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         need_pytorch(of.method, params.kind)
         from stereotruth.matching.networks.training import train

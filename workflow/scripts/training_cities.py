@@ -8,7 +8,7 @@ if __name__ == "__main__":
     count = snakemake.wildcards.tiles
     with (
         job(snakemake.log[0], f"training_cities {count}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         gather(
             snakemake.input.training,

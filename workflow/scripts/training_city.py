@@ -8,7 +8,7 @@ if __name__ == "__main__":
     number = snakemake.wildcards.number
     with (
         job(snakemake.log[0], f"training_city {number}"),
-        publication(snakemake.input, snakemake.output, snakemake.params.made),
+        publication(snakemake.input, snakemake.output, snakemake.params),
     ):
         make_city(
             int(number),

@@ -2,42 +2,50 @@
 
 A job of the workflow says what it reads and what it makes (:func:`publication`). Each product
 takes its place (:func:`publishing`) only if the job's run is still the newest and its inputs are
-what they were when the job began. When all have, a record of the inputs' checksums is kept, and
-each later run holds it against the files (:func:`made_of`). A product without any record was made
-by hand.
+what they were when the job began. When all have, the job's record is kept (:mod:`.records`).
 """
 
 from __future__ import annotations
 
-import logging
-import os
-import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from .inputs import Checksums, Inputs, Marks, marks, refuse_replaced
-from .provenance import digest
-from .records import changed_inputs, read_record, write_record
-from .runs import KEPT, RUN, Run, listed
-
-log = logging.getLogger("stereotruth")
+from .records import (
+    DamagedRecord,
+    Record,
+    contents_of,
+    mark_begun,
+    names_of,
+    plain,
+    read_record,
+    write_record,
+)
+from .runs import KEPT, Run, listed
 
 
 class _Job:
-    def __init__(self, inputs: Iterable[str], outputs: Iterable[str], made: str) -> None:
+    def __init__(
+        self, inputs: Iterable[str], outputs: Iterable[str], settings: Mapping[str, Any]
+    ) -> None:
         self.outputs = {str(Path(path).absolute()): path for path in outputs}
-        self.first = next(iter(self.outputs.values()))
-        self.made = made
+        self.settings = plain(settings)
         self.run = Run()
         self.published: dict[str, Marks] = {}
-        with self.run.standing():
-            write_record(self.first, {"made": made, "run": self.run.name})
-        inputs = list(map(str, inputs))
+        self.begin()
+        inputs = contents_of(inputs)
         self.marks = marks(inputs)
-        self.inputs = Inputs(inputs, Checksums(KEPT / "checksums"))
+        self.checksums = Checksums(KEPT / "checksums")
+        self.inputs = Inputs(inputs, self.checksums)
+        for path, found in self.inputs.checksums.items():
+            _refuse_damaged(path, found)
+
+    def begin(self) -> None:
+        with self.run.standing():
+            mark_begun(next(iter(self.outputs.values())))
 
     @contextmanager
     def standing(self) -> Iterator[None]:
@@ -49,30 +57,41 @@ class _Job:
         missing = sorted(set(self.outputs) - set(self.published))
         if missing:
             raise RuntimeError(f"written past products.publication: {missing}")
+        made = {path: self.checksums.of(path)[1] for path in names_of(self.outputs.values())}
         with self.standing():
             for found in self.published.values():
                 refuse_replaced(found)
-            record = {
-                "made": self.made,
-                "run": self.run.name,
-                "outputs": list(map(str, self.outputs.values())),
-                "inputs": dict(self.inputs.checksums),
-            }
-            write_record(self.first, record)
+            inputs = dict(self.inputs.checksums)
+            write_record(Record(self.run.name, self.settings, inputs, made))
+
+
+def _refuse_damaged(path: str, found: str) -> None:
+    """Raise InputError if a job has made an input, and has made something else of that name."""
+    try:
+        record = read_record(path)
+    except DamagedRecord:  # the next plan has the job that it is of
+        return
+    if record and record.outputs.get(path, found) != found:
+        raise InputError(
+            "not what was made", file=path, remedy="run again, which makes it again first"
+        )
 
 
 _job: _Job | None = None  # what this process makes
 
 
 @contextmanager
-def publication(inputs: Iterable[str], outputs: Iterable[str], made: str) -> Iterator[None]:
-    """Make the files and folders ``outputs`` of ``inputs``; ``made``: see :func:`made_of`.
+def publication(
+    inputs: Iterable[str], outputs: Iterable[str], settings: Mapping[str, Any]
+) -> Iterator[None]:
+    """Make the files and folders ``outputs`` of ``inputs`` and ``settings``.
 
-    Raises InputError if an input changes meanwhile, or another run begins.
+    Raises InputError if an input is not what was made of it, or changes meanwhile, or another run
+    begins.
     """
     global _job
     with listed():
-        job = _Job(inputs, outputs, made)
+        job = _Job(inputs, outputs, settings)
         _job = job
         try:
             with job.run.watched():
@@ -89,37 +108,11 @@ def publishing(path: str | Path) -> Iterator[None]:
     if _job is None or place not in _job.outputs:
         yield
         return
-    placed = False
-    try:
-        with _job.standing():
-            yield
-            placed = True
-            _job.published[place] = marks([path])
-    except InputError:
-        if placed:  # locks do nothing here, and another run has begun in this moment
-            write_record(_job.first, {"made": f"by an older run: {uuid.uuid4().hex}"})
-        raise
+    with _job.standing():
+        yield
+        _job.published[place] = marks([path])
 
 
 def marks_of_inputs() -> Marks:
     """What tells cheaply whether the inputs of this process's job were replaced since it began."""
     return {} if _job is None else _job.marks
-
-
-@cache
-def made_of(product: str) -> str:
-    """What the making of a product is called, as a parameter of its rule.
-
-    The same as when it was made, while its inputs have the checksums that were recorded: an
-    input that changed unseen by Snakemake gives another, and so makes the product again. So does
-    a product of a job that did not end, unless this is its own run, which tries again.
-    """
-    record = read_record(product)
-    if record and Path(product).exists():
-        if "inputs" not in record:
-            mine = record.get("run") == os.environ.get(RUN, "")
-            return record["made"] if mine else digest({"not ended": record})
-        if other := changed_inputs(record):
-            log.warning("%s is made again: %s changed", product, ", ".join(sorted(other)))
-            return digest({"before": record["made"], "inputs": other})
-    return record.get("made", "")
