@@ -2,9 +2,8 @@
 
     python -m tests.synthetic.disturbed_job --rounds 3000 scratch/folder
 
-Hundreds of rounds a minute, so that moments within the publishing are met, too. The planning is
-Snakemake's, without its look at times: a job that did not end well is made again, and one whose
-parameter has changed.
+Hundreds of rounds a minute, so that moments within the publishing are met, too. A plan is that of
+the workflow: a job runs if its records say so, or a product is absent.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from pathlib import Path
 from stereotruth.errors import InputError
 from stereotruth.products import records
 from stereotruth.products.files import replacing, whole_folder
-from stereotruth.products.publication import made_of, publication
+from stereotruth.products.publication import publication
+from stereotruth.products.records import why_due
 from stereotruth.products.runs import begin_run, end_older_jobs
 
 SOURCE, FILE, FOLDER = Path("in.csv"), Path("out/a.json"), Path("out/b")
@@ -32,9 +32,9 @@ KINDS = ("edit", "replace", "revert", "touch back", "setting", "late")
 ENDS = ("none", "orphan", "stop", "stop elsewhere", "kill")
 
 
-def _work(made: str, setting: str, slow: float) -> None:
+def _work(setting: str, slow: float) -> None:
     """Both products say what was read, and a setting of the run."""
-    with publication([str(SOURCE)], [str(FILE), str(FOLDER)], made):
+    with publication([str(SOURCE)], [str(FILE), str(FOLDER)], {"setting": setting}):
         first = SOURCE.read_text()
         time.sleep(slow)
         with replacing(FILE) as scratch:
@@ -45,14 +45,14 @@ def _work(made: str, setting: str, slow: float) -> None:
             time.sleep(slow / 4)
 
 
-def _start(made: str, setting: str, slow: float) -> int:
+def _start(setting: str, slow: float) -> int:
     pid = os.fork()
     if pid:
         return pid
     status = 1
     try:
         with suppress(InputError):
-            _work(made, setting, slow)
+            _work(setting, slow)
             status = 0
     finally:
         os._exit(status)
@@ -67,10 +67,11 @@ def _ended(pid: int) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
-def _plan() -> str:
-    for function in (made_of, records._checksum, records._checksums):
+def _is_due(setting: str) -> bool:
+    for function in (records._checksum, records._checksums):
         function.cache_clear()
-    return made_of(str(FILE))
+    why = why_due([FILE, FOLDER], [SOURCE], {"setting": setting})
+    return bool(why) or not (FILE.exists() and FOLDER.exists())
 
 
 def _write(text: str, way: str) -> None:
@@ -90,19 +91,15 @@ class Rounds:
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
-        self.done: tuple[str, str] | None = None  # parameters of the last job that ended well
         self.number, self.setting = 0, ""
         _write_new()
 
     def run(self) -> bool:
         """A run to its end; whether there was something to do."""
         begin_run()
-        wanted = _plan(), self.setting
-        if self.done == wanted and FILE.exists() and FOLDER.exists():
+        if not _is_due(self.setting):
             return False
-        self.done = None
-        if _ended(_start(*wanted, 0.0)):
-            self.done = wanted
+        _ended(_start(self.setting, 0.0))
         return True
 
     def round(self) -> tuple[str, str, bool]:
@@ -112,8 +109,7 @@ class Rounds:
         slow = rng.choice((0.0, 0.01))
         old, new = SOURCE.read_text(), f"{self.number:06d}"
         begin_run()
-        began = _plan(), self.setting
-        job, self.done = _start(*began, slow), None
+        job = _start(self.setting, slow)
         time.sleep(rng.uniform(0.0, 0.012 + 1.6 * slow))
         if end.startswith("stop"):
             os.kill(job, signal.SIGSTOP)
@@ -127,8 +123,7 @@ class Rounds:
             time.sleep(rng.uniform(0.0, slow))
             _write(old, kind)
         if end == "none":
-            if _ended(job):
-                self.done = began
+            _ended(job)
         else:
             if (
                 end == "stop elsewhere"

@@ -12,6 +12,7 @@ import json
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,6 @@ from .folders import files_below
 from .provenance import file_sha256
 
 TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
-NOT_CONTENT = ".snakemake_timestamp"  # laid into folders by Snakemake when their job has ended
 # What runs write in the working directory, which may lie in the folder of a dataset.
 WRITTEN_BY_RUNS = ("results", "logs", "benchmark", "audit")
 
@@ -52,7 +52,7 @@ def _files(path: Path) -> Iterator[tuple[str, Path]]:
         return not folder.name.startswith(".") and folder.absolute() not in written
 
     for file in files_below(path, enter):
-        if file.name != NOT_CONTENT:
+        if not file.name.startswith("."):
             yield str(file.relative_to(path)), file
 
 
@@ -96,8 +96,17 @@ class Checksums:
         self._known: dict[str, tuple[Stamp, str]] = {}
 
     def of(self, path: str | Path) -> tuple[Stamp, str]:
-        """Stamp and checksum of a file or folder."""
-        path = Path(path)
+        """Stamp and checksum of a file or folder. Raises InputError if it cannot be read."""
+        try:
+            return self._of(Path(path))
+        except OSError as error:
+            raise InputError(
+                f"cannot be read: {error.strerror}",
+                file=error.filename or path,
+                remedy="see that it is there, and that you may read it",
+            ) from None
+
+    def _of(self, path: Path) -> tuple[Stamp, str]:
         now = stamp(path)
         name = hashlib.sha256(str(path.absolute()).encode()).hexdigest()
         before = self._known.get(name) or self._stored(name)
@@ -122,8 +131,9 @@ class Checksums:
             self.folder.mkdir(parents=True, exist_ok=True)
             scratch.write_text(f"{now.place} {now.change} {found}")
             scratch.replace(self.folder / name)
-        except OSError:  # a full disk: it will be computed again
-            scratch.unlink(missing_ok=True)
+        except OSError:  # a full disk, one that is read-only: it will be computed again
+            with suppress(OSError):
+                scratch.unlink()
 
 
 class Inputs:

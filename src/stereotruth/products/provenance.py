@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -112,7 +113,8 @@ class _Sources:
             scratch.write_text(json.dumps(self.known))
             scratch.replace(self.file)
         except OSError:
-            scratch.unlink(missing_ok=True)
+            with suppress(OSError):
+                scratch.unlink()
         self.fresh = False
 
     def of(self, module: str) -> tuple[str, list[str]]:

@@ -1,10 +1,10 @@
 """Records of products in object storage, kept beside them: any machine then plans what is left.
 
 Products that go to a bucket (profiles/s3) leave nothing on the machine that made them, so the
-records of what they were made of (:mod:`.records`), Snakemake's own, and its marks of products in
-the making go to the bucket, too, under ``.records`` of the prefix. A mark is there before the first
-byte of a product is, and goes after its record has come: whenever a run is killed, the next one,
-from anywhere, makes again what was not whole.
+records of what they were made of (:mod:`.records`) and Snakemake's marks of products in the making
+go to the bucket, too, under ``.records`` of the prefix. A mark is there before the first byte of a
+product is, and goes after its record has come: whenever a run is killed, the next one, from
+anywhere, makes again what was not whole.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from __future__ import annotations
 import base64
 import binascii
 import logging
+import shutil
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from .records import RECORDS
+from .records import PLACES
 from .remote_files import bucket
 
 log = logging.getLogger("stereotruth")
@@ -38,9 +39,9 @@ class RecordMirror:
 
     def __init__(self, prefix: str, copies: Path, snakemake: Path = Path(".snakemake")) -> None:
         self.prefix = prefix.rstrip("/")
+        self._copies = copies
         self._folders = {
-            "made": RECORDS / "made" / copies,
-            "metadata": snakemake / "metadata",
+            "made": PLACES[0] / copies,
             "incomplete": snakemake / "incomplete",
         }
         self._storage, root = bucket(f"{self.prefix}/.records")
@@ -61,6 +62,7 @@ class RecordMirror:
 
     def pull(self) -> None:
         """Make the records here those of the bucket."""
+        shutil.rmtree(PLACES[1] / self._copies, ignore_errors=True)  # one place holds them
         found = self._storage.find(str(self._root))
         held = self._storage.cat(found) if found else {}
         self._known = {

@@ -158,10 +158,10 @@ def why_due(
     for path in filter(os.path.lexists, outputs):
         if _checksum(path) != record.outputs.get(path):
             return f"{path} is not what was made: made again"
-    if changed := [p for p in inputs if _checksum(p) not in ("", record.inputs.get(p))]:
+    if other := set(inputs) ^ set(record.inputs):
+        return f"other input: {', '.join(sorted(other))}"
+    if changed := [p for p in inputs if _checksum(p) not in ("", record.inputs[p])]:
         return f"{', '.join(changed)} changed"
-    if set(inputs) != set(record.inputs):
-        return f"other input: {', '.join(sorted(set(inputs) ^ set(record.inputs)))}"
     return _changes(record.settings, plain(settings))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -12,12 +11,14 @@ import pytest
 import zarr
 
 from stereotruth.errors import InputError
-from stereotruth.products import publication as module
 from stereotruth.products import records
 from stereotruth.products.files import replacing, whole_folder
-from stereotruth.products.publication import made_of, publication
+from stereotruth.products.publication import publication, publishing
+from stereotruth.products.records import why_due
 from stereotruth.products.resumable_grids import BlockStore
-from stereotruth.products.runs import RUN, begin_run
+from stereotruth.products.runs import KEPT, RUN, begin_run
+
+SETTINGS = {"code": "1"}
 
 
 @pytest.fixture(autouse=True)
@@ -29,17 +30,16 @@ def here(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def plan():
     """As a new process plans: nothing remembered."""
 
-    def forget():
-        for function in (made_of, records._checksum, records._checksums):
-            function.cache_clear()
-        return made_of("a.json")
+    def why(outputs=("a.json",), settings=SETTINGS) -> str:
+        records._checksums.cache_clear()
+        records._checksum.cache_clear()
+        return why_due(outputs, ["in.csv"], settings)
 
-    forget()
-    return forget
+    return why
 
 
 def write(name: str = "a.json", text: str = "new") -> None:
@@ -47,8 +47,8 @@ def write(name: str = "a.json", text: str = "new") -> None:
         scratch.write_text(text)
 
 
-def make(made: str = "", text: str = "new") -> None:
-    with publication(["in.csv"], ["a.json"], made):
+def make(text: str = "new", settings=SETTINGS) -> None:
+    with publication(["in.csv"], ["a.json"], settings):
         write(text=text)
 
 
@@ -62,7 +62,7 @@ def test_nothing_is_published_of_an_input_that_changes(plan):
     make(text="old")
     with (
         pytest.raises(InputError, match=r"in\.csv: changed"),
-        publication(["in.csv"], ["a.json"], ""),
+        publication(["in.csv"], ["a.json"], SETTINGS),
     ):
         Path("in.csv").write_text("22")
         write()
@@ -73,7 +73,7 @@ def test_nothing_is_published_by_a_job_of_an_earlier_run():
     make(text="old")
     with (
         pytest.raises(InputError, match="another run has begun"),
-        publication(["in.csv"], ["a.json", "b"], ""),
+        publication(["in.csv"], ["a.json", "b"], SETTINGS),
     ):
         begin_run()
         with whole_folder("b") as scratch:
@@ -87,68 +87,53 @@ def test_a_job_of_an_earlier_run_leaves_the_records_alone(monkeypatch):
     make()
     record = records.record_file("a.json").read_text()
     monkeypatch.setenv(RUN, late)
-    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], ""):
+    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], SETTINGS):
         pytest.fail("was let in")
     assert records.record_file("a.json").read_text() == record
 
 
 def test_an_input_that_changes_after_all_is_written_fails_the_job(plan):
-    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], ""):
+    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], SETTINGS):
         write()
         Path("in.csv").write_text("22")
-    assert "inputs" not in json.loads(records.record_file("a.json").read_text())
+    assert plan() == "the job that makes it did not end"
 
 
-def test_a_change_that_snakemake_cannot_see_makes_the_product_again_once(plan):
+def test_a_job_that_failed_is_due_whatever_it_left(plan):
     make()
-    times = Path("in.csv").stat()
-    Path("in.csv").write_text("2")
-    os.utime("in.csv", ns=(times.st_atime_ns, times.st_mtime_ns))
-    other = plan()
-    assert other != ""
-    make(made=other)
-    assert plan() == other  # what Snakemake has recorded, too
-    Path("in.csv").write_text("1")
-    assert plan() not in ("", other)
-
-
-def test_a_product_of_a_job_that_did_not_end_is_made_again(plan):
-    with pytest.raises(ZeroDivisionError), publication(["in.csv"], ["a.json"], "x"):
-        write()
+    with pytest.raises(ZeroDivisionError), publication(["in.csv"], ["a.json"], SETTINGS):
         raise ZeroDivisionError
-    assert plan() == "x"  # by a retry of the same run
-    begin_run()
-    other = plan()
-    assert other != "x"
-    make(made=other)
-    assert plan() == other
-
-
-def test_a_job_that_failed_without_a_product_has_no_say(plan):
-    with pytest.raises(ZeroDivisionError), publication(["in.csv"], ["a.json"], "y"):
-        raise ZeroDivisionError
-    begin_run()
-    assert plan() == "y"
-
-
-@pytest.mark.parametrize("gone", ["in.csv", "a.json"])
-def test_what_is_not_there_has_no_say(plan, gone):
+    assert plan() == "the job that makes it did not end"
+    Path("a.json").unlink()
+    assert plan() == "the job that makes it did not end"
     make()
-    Path("in.csv").write_text("22")
-    Path(gone).unlink()
     assert plan() == ""
 
 
-def test_a_record_that_cannot_be_read_has_no_say(plan):
+def test_nothing_is_made_of_what_a_job_has_not_made():
     make()
-    records.record_file("a.json").write_text("{")
-    assert plan() == ""
+    Path("a.json").write_text("damaged since the run was planned")
+    with (
+        pytest.raises(InputError, match=r"a\.json: not what was made.*run again"),
+        publication(["a.json"], ["b.json"], SETTINGS),
+    ):
+        pytest.fail("was let in")
+
+
+def test_an_input_that_cannot_be_read_is_named():
+    Path("folder").mkdir()
+    Path("folder/gone").symlink_to("nowhere/at/all")
+    with (
+        pytest.raises(InputError, match=r"gone: cannot be read"),
+        publication(["folder"], ["b.json"], SETTINGS),
+    ):
+        pytest.fail("was let in")
 
 
 def test_a_product_that_is_written_past_this_is_a_defect():
     with (
         pytest.raises(RuntimeError, match=r"past products\.publication: .*b\.json"),
-        publication(["in.csv"], ["a.json", "b.json"], ""),
+        publication(["in.csv"], ["a.json", "b.json"], SETTINGS),
     ):
         write()
         Path("b.json").write_text("1")
@@ -156,7 +141,10 @@ def test_a_product_that_is_written_past_this_is_a_defect():
 
 def test_a_product_that_another_writes_meanwhile_fails_the_job():
     """As a job of an earlier run on a file system whose locks do nothing."""
-    with pytest.raises(InputError, match=r"a\.json: changed"), publication([], ["a.json"], ""):
+    with (
+        pytest.raises(InputError, match=r"a\.json: changed"),
+        publication([], ["a.json"], SETTINGS),
+    ):
         write()
         Path("other").write_text("stale")
         Path("other").replace("a.json")
@@ -164,12 +152,13 @@ def test_a_product_that_another_writes_meanwhile_fails_the_job():
 
 def test_what_slips_in_where_locks_do_nothing_is_made_again(plan):
     make()
-    kept = module.KEPT / "run"
+    kept = KEPT / "run"
     with (
         pytest.raises(InputError),
-        publication(["in.csv"], ["a.json"], ""),
-        module.publishing("a.json"),
+        publication(["in.csv"], ["a.json"], SETTINGS),
+        publishing("a.json"),
     ):
+        Path("a.json").write_text("stale")
         kept.write_text("another run")
     assert plan() != ""
 
@@ -177,7 +166,7 @@ def test_what_slips_in_where_locks_do_nothing_is_made_again(plan):
 def test_a_block_of_an_input_that_was_replaced_has_no_record(here):
     """Else it would be taken over when the old input is back."""
     zarr.open_group(here / "work/store", mode="w", zarr_format=3)
-    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], ""):
+    with pytest.raises(InputError), publication(["in.csv"], ["a.json"], SETTINGS):
         store = BlockStore(here / "work", (), 1024)
         Path("in.csv").unlink()
         store.write((slice(0, 1), slice(0, 1)), "key", {}, None)

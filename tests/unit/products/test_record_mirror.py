@@ -49,13 +49,13 @@ def test_marks_and_records_reach_another_checkout_and_go_again(at, prefix):
     long = f"{prefix}/tiles/{'x' * 300}"
     first = at("first")
     mark = write(f".snakemake/incomplete/{key(prefix + '/tiles/A')}", "{}")
-    write(f".snakemake/metadata/{key(long)}", '{"rule": "export"}')
+    write(f".snakemake/incomplete/{key(long)}", '{"external_jobid": "1"}')
     made = write(f"results/.records/made/{COPIES}/bucket/tiles/A.json", '{"made": ""}')
     first.push()
 
     at("second")
     assert mark.read_text() == "{}"
-    assert Path(f".snakemake/metadata/{key(long)}").read_text() == '{"rule": "export"}'
+    assert Path(f".snakemake/incomplete/{key(long)}").read_text() == '{"external_jobid": "1"}'
     assert made.read_text() == '{"made": ""}'
 
     at("first")
@@ -70,8 +70,8 @@ def test_marks_and_records_reach_another_checkout_and_go_again(at, prefix):
 def test_records_of_products_here_and_of_other_prefixes_stay(at, prefix):
     mirror = at("first")
     kept = [
-        write(f".snakemake/metadata/{key('tiles/A')}", "here"),
-        write(f".snakemake/metadata/{key(prefix + 'er/tiles/A')}", "of another prefix"),
+        write(f".snakemake/incomplete/{key('tiles/A')}", "here"),
+        write(f".snakemake/incomplete/{key(prefix + 'er/tiles/A')}", "of another prefix"),
         write("results/.records/made/tiles/A.json", "here"),
     ]
     mirror.push()
