@@ -34,12 +34,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stereotruth.products.inputs import NOT_CONTENT
-
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
 from ..synthetic.project import ROOT, Project
 from .killing import family, kill
 
+NOT_CONTENT = ".snakemake_timestamp"  # of Snakemake, in folders whose job has ended
 KINDS = ("edit", "replace", "revert", "stop")
 KILLS = ("none", "snakemake", "tree")
 LONGEST = 240.0  # s, that a run may wait for a stopped job before that goes on

@@ -1,0 +1,208 @@
+"""Single jobs that fail, alone and twice in a row, with edits before, between and after.
+
+    python -m tests.workflow.failing --rounds 300 scratch/folder
+
+goes over all rules of the workflow without its numerics (:mod:`..synthetic.hollow_workflow`). In a
+round a job of a rule fails in one of WAYS at one of MOMENTS, once or twice; edits of users' files
+and settings, and damage to products and records, come between. The run after a failure must have
+the failed job again. After a run that ends well, each product must be of the inputs and settings
+that are there. A line per round goes to failures.jsonl in the folder, and at the end the table of
+all that stand there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from ..synthetic.hollow_workflow import (
+    FAULT,
+    GIVEN,
+    MOMENTS,
+    STRUCK,
+    TARGETS,
+    WAYS,
+    make_hollow,
+    set_seed,
+    stale,
+)
+from ..synthetic.project import ROOT, Project
+from . import disturbing
+
+NO_RULES = ("all", "predict", "benchmark", "report", "evaluate")  # without a job of their own
+EDITS = (*(f"in/{name}" for name in GIVEN), "mine.py", "helper.py", "geoid.tif")
+EDITS = (*EDITS, "config/gcps/Wuhan-1.csv", "seed")
+
+
+class Failures:
+    """Rounds in a project, one after the other."""
+
+    def __init__(self, project: Project, seed: int) -> None:
+        self.project, self.folder = project, project.folder
+        self.rng = random.Random(seed)
+        self.seed = self.version = 0
+        self.reached: dict[str, list[str]] = {}  # rules by the edit that makes them due
+        disturbing.FORK_JOBS = True
+        sys.path.insert(0, str(ROOT))
+
+    def run(self, *more: str) -> tuple[int, set[str]]:
+        """A run's exit status, and the rules that it planned."""
+        run = disturbing.Run(
+            self.folder, [*TARGETS, "--configfile", "my.yaml", "--cores", "16", *more]
+        )
+        run.wait()
+        return run.returncode, self.planned()
+
+    def said(self) -> str:
+        return (self.folder / "run.log").read_text()
+
+    def planned(self) -> set[str]:
+        tables = self.said().split("Job stats:")
+        found = re.findall(r"^(\w+)\s+\d+$", tables[-1], flags=re.MULTILINE)
+        return {*found} - {"total", *NO_RULES} if len(tables) > 1 else set()
+
+    def prepare(self) -> None:
+        """Make all, and find out which rules an edit reaches."""
+        status, rules = self.run()
+        assert status == 0, self.said()[-4000:]
+        self.rules = sorted(rules)
+        for edit in EDITS:
+            self.edit(edit)
+            status, self.reached[edit] = self.run("--dry-run")
+            assert status == 0 and self.reached[edit], (edit, self.said()[-4000:])
+        assert self.run()[0] == 0, self.said()[-4000:]
+
+    def edit(self, what: str) -> None:
+        self.version += 1
+        if what == "seed":
+            self.seed = self.version
+            set_seed(self.project, self.version)
+            return
+        file = self.folder / what
+        if what.endswith(".py"):
+            file.write_text(f"{file.read_text().partition('#')[0]}# {self.version}\n")
+        else:
+            file.write_text(f"{self.version}\n")
+
+    def damage(self) -> str:
+        """Damage or delete a product or a record; returns which."""
+        tops = self.rng.choice(("results/.records/made", "results", "tiles", "benchmark", "data"))
+        files = [
+            file
+            for file in sorted((self.folder / tops).rglob("*"))
+            if file.is_file() and not file.name.startswith(".") and ".snake" not in file.name
+        ]
+        if tops == "results":
+            files = [file for file in files if ".records" not in file.parts]
+        file = self.rng.choice(files)
+        if self.rng.random() < 0.3:
+            place = file.parent if file.parent.suffix in (".zarr", ".points") else file
+            (shutil.rmtree if place.is_dir() else Path.unlink)(place)
+        else:
+            data = bytearray(file.read_bytes())
+            data[self.rng.randrange(len(data))] ^= 1 << self.rng.randrange(8)
+            file.write_bytes(data)
+        return str(file.relative_to(self.folder))
+
+    def disturb(self, rule: str, chance: float) -> str:
+        """An edit, by preference one that makes a rule due, or damage; or nothing."""
+        if self.rng.random() > chance:
+            return ""
+        if self.rng.random() < 0.2:
+            return self.damage()
+        edit = self.rng.choice([e for e in EDITS if rule in self.reached[e]] or EDITS)
+        self.edit(edit)
+        return edit
+
+    def fail(self, rule: str) -> dict[str, str]:
+        """A run in which a job of the rule fails."""
+        way, moment = self.rng.choice(WAYS), self.rng.choice(MOMENTS)
+        fault = {"rule": rule, "way": way, "moment": moment}
+        (self.folder / FAULT).write_text(json.dumps(fault))
+        (self.folder / STRUCK).unlink(missing_ok=True)
+        for more in ((), ("--forcerun", rule)):
+            status, _ = self.run(*more)
+            if (self.folder / STRUCK).exists():
+                break
+        else:
+            raise AssertionError(f"{rule} did not run: {self.said()[-4000:]}")
+        assert status != 0, self.said()[-4000:]
+        (self.folder / FAULT).unlink()
+        return fault
+
+    def round(self) -> dict:
+        """One round: what was done, and what is wrong."""
+        rule, begin = self.rng.choice(self.rules), time.monotonic()
+        one: dict = {"rules": [], "edits": [], "wrong": []}
+        for number in range(self.rng.choice((1, 1, 2))):
+            if number and self.rng.random() < 0.5:
+                rule = self.rng.choice(self.rules)
+            one["edits"].append(self.disturb(rule, 0.5 if number else 0.8))
+            fault = self.fail(rule)
+            one["rules"].append(fault)
+        one["edits"].append(self.disturb(rule, 0.3))
+        for number in range(5):
+            status, planned = self.run()
+            due = not one["edits"][-1] and fault["moment"] != "recorded"
+            if number == 0 and due and rule not in planned:
+                one["wrong"].append(f"{rule} is not planned after it failed")
+            if status == 0:
+                break
+        else:
+            one["wrong"].append(f"does not end well: {self.said()[-2000:]}")
+        one["wrong"] += stale(self.folder, self.seed)
+        return one | {"seconds": round(time.monotonic() - begin, 1)}
+
+    def rounds(self, count: int) -> Iterator[dict]:
+        """So many rounds; the last one is followed by a run that has nothing to do."""
+        for _ in range(count):
+            yield self.round()
+        status, planned = self.run()
+        assert status == 0 and not planned, planned
+
+
+def table(rounds: Sequence[dict]) -> str:
+    """Failures by rule, way and moment, and rounds that left something wrong."""
+    lines = []
+    for key in ("rule", "way", "moment"):
+        count = Counter(fault[key] for one in rounds for fault in one["rules"])
+        wrong = Counter(f[key] for one in rounds if one["wrong"] for f in one["rules"])
+        lines += [
+            f"{key:7} {n:20} {count[n]:4} failures, {wrong[n]:3} wrong" for n in sorted(count)
+        ]
+    wrong = sum(bool(one["wrong"]) for one in rounds)
+    failures = sum(len(one["rules"]) for one in rounds)
+    return "\n".join([*lines, f"{len(rounds)} rounds with {failures} failures, {wrong} wrong"])
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("folder", type=Path)
+    given = parser.parse_args()
+    folder = given.folder.absolute()
+    shutil.rmtree(folder / "project", ignore_errors=True)
+    failures = Failures(make_hollow(folder / "project"), given.seed)
+    failures.prepare()
+    wrong = False
+    for one in failures.rounds(given.rounds):
+        wrong = wrong or bool(one["wrong"])
+        with (folder / "failures.jsonl").open("a") as stream:
+            stream.write(json.dumps({"seed": given.seed} | one) + "\n")
+        print(json.dumps(one), flush=True)
+    print(table([json.loads(line) for line in (folder / "failures.jsonl").open()]))
+    sys.exit(wrong)
+
+
+if __name__ == "__main__":
+    main()
