@@ -61,8 +61,8 @@ rule export:
 rule originals:
     input:
         tiles="tiles/{city}",
-        left=lambda w: [with_rpc_files(s, "left")[0] for s in scenes_of(w.city)],
-        right=lambda w: [with_rpc_files(s, "right")[0] for s in scenes_of(w.city)],
+        left=lambda w: [with_files_beside(s, "left")[0] for s in scenes_of(w.city)],
+        right=lambda w: [with_files_beside(s, "right")[0] for s in scenes_of(w.city)],
     output:
         directory("originals/{city}"),
     log:

@@ -1,28 +1,28 @@
 """Input functions: which files a stage takes of a scene or a city."""
 
+from stereotruth.epipolar.image_files import files_beside
+
 
 def given(path):
     """A file that users give: it lies here, also where the products go to object storage."""
     return local(str(path))
 
 
-def with_rpc_files(scene, view):
-    """An image of a scene and the RPC files beside it, so that an edited RPC is seen."""
-    image = Path(getattr(scene, f"{view}_image"))
+def with_files_beside(scene, view):
+    """An image of a scene, and all that is read with it and with its mask: edits are seen."""
+    image, mask = getattr(scene, f"{view}_image"), getattr(scene, f"{view}_mask")
     if is_synthetic(scene):
         return [str(image)]
-    beside = [image.with_suffix(s) for s in (".RPB", ".rpb")]
-    beside += [image.with_name(f"{image.stem}{s}") for s in ("_RPC.TXT", "_rpc.txt", "_RPC.txt")]
-    beside += sorted(image.parent.glob("RPC_*.XML"))  # of DIMAP, both views'
-    return [given(image), *(given(file) for file in beside if file.is_file())]
+    beside = [file for of in (image, mask) if of for file in files_beside(of)]
+    return [given(file) for file in (image, *dict.fromkeys(beside))]
 
 
 def left_image(wildcards):
-    return with_rpc_files(SCENES[wildcards.scene], "left")
+    return with_files_beside(SCENES[wildcards.scene], "left")
 
 
 def right_image(wildcards):
-    return with_rpc_files(SCENES[wildcards.scene], "right")
+    return with_files_beside(SCENES[wildcards.scene], "right")
 
 
 def given_in(column):

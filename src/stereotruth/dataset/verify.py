@@ -9,6 +9,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from ..errors import InputError
+from ..products.folders import is_foreign
 from ..products.provenance import file_sha256
 from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest
@@ -20,12 +21,6 @@ log = logging.getLogger("stereotruth")
 LOOSE = (
     *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE),
     *("croissant.json", "stac/collection.json", "stac/rpc/*"),
-)
-FOREIGN = (  # what other programs leave beside the files that they open; in lower case
-    "*.aux.xml",  # GDAL, QGIS: statistics
-    "*.ovr",  # GDAL, QGIS: pyramids
-    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
-    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
 )
 
 
@@ -72,7 +67,7 @@ def _is_loose(name: str) -> bool:
 
 
 def _is_foreign(path: Path) -> bool:
-    return path.name != STYLE and any(fnmatch(path.name.lower(), p) for p in FOREIGN)
+    return path.name != STYLE and is_foreign(path.name)
 
 
 def foreign_files(folder: str | Path) -> list[str]:

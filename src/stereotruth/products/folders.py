@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
 from pathlib import Path
+
+FOREIGN = (  # what other programs leave beside the files that they open; in lower case
+    "*.aux.xml",  # GDAL, QGIS: statistics
+    "*.ovr",  # GDAL, QGIS: pyramids
+    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
+    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
+)
+
+
+def is_foreign(name: str) -> bool:
+    """Whether a file of this name is one that another program has left."""
+    return any(fnmatch(name.lower(), pattern) for pattern in FOREIGN)
 
 
 def files_below(

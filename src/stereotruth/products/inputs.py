@@ -18,12 +18,13 @@ from pathlib import Path
 
 from ..errors import InputError
 from . import remote_files
-from .folders import files_below
+from .folders import files_below, is_foreign
 from .provenance import file_sha256
 
 TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
 # What runs write in the working directory, which may lie in the folder of a dataset.
 WRITTEN_BY_RUNS = ("results", "logs", "benchmark", "audit")
+MADE = ("results", "tiles", "dataset", "originals", "benchmark", "audit", "submission", "score")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,14 @@ class Stamp:
     young: bool
 
 
+def _is_made(folder: Path) -> bool:
+    """Whether a folder is a product: who looks at it leaves files there that are none of it."""
+    here = Path.cwd()
+    inside = folder.relative_to(here) if folder.is_relative_to(here) else folder
+    top = inside.parts[0] if inside.parts else ""
+    return top.split("_")[0] in MADE
+
+
 def _files(path: Path) -> Iterator[tuple[str, Path]]:
     """All files in a folder, by name, links followed; or the file itself."""
     if not path.is_dir():
@@ -51,8 +60,9 @@ def _files(path: Path) -> Iterator[tuple[str, Path]]:
     def enter(folder: Path) -> bool:
         return not folder.name.startswith(".") and folder.absolute() not in written
 
+    made = _is_made(path)
     for file in files_below(path, enter):
-        if not file.name.startswith("."):
+        if not (file.name.startswith(".") or (made and is_foreign(file.name))):
             yield str(file.relative_to(path)), file
 
 
