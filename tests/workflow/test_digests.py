@@ -137,21 +137,14 @@ def test_every_script_has_its_rule_and_log(script):
     assert ast.unparse(work.items[0].context_expr).startswith("job(snakemake.log[0], ")
     assert not any(isinstance(node, ast.Expr) for node in main.body)
     if makes_something(rule):
-        publication = "publication(snakemake.input, snakemake.output, snakemake.params.made)"
+        publication = "publication(snakemake.input, snakemake.output, snakemake.params)"
         held = [n for n in ast.walk(main) if isinstance(n, ast.With)]
         assert publication in {ast.unparse(i.context_expr) for node in held for i in node.items}
 
 
 @pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
-def test_every_product_is_held_against_the_record_of_its_inputs(name):
-    """The parameter that changes if an input is not what the product was made of."""
-    params = WITH_SCRIPT[name].directives["params"]
-    assert f"made=lambda w: making_of(rules.{name}, w)," in params
-
-
-@pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
 def test_every_script_counts_by_its_content(name):
-    """Snakemake would compare the time of its file; profiles/default has it leave that."""
+    """Snakemake would compare the time of its file: profiles/default has it leave that."""
     rule = WITH_SCRIPT[name]
     assert f'script=content_of("../scripts/{rule.script}.py"),' in rule.directives["params"]
     profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())

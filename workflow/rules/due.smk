@@ -6,6 +6,8 @@ which products are absent, and that a job follows from another that runs. Its fu
 replaced are private: tests/workflow/test_due.py fails where a new version has others.
 """
 
+from contextlib import suppress
+
 from snakemake.dag import DAG
 from snakemake.io import _IOFile
 from snakemake.logging import logger
@@ -55,9 +57,15 @@ async def never(*_):
     return False
 
 
+def if_possible(persistence, before=PersistenceBase.save_iocache):
+    with suppress(OSError):  # a plan in a folder that is read-only
+        before(persistence)
+
+
 instead(PersistenceBase, "params_changed", due)
 instead(PersistenceBase, "has_metadata", lambda *_: True)
 instead(PersistenceBase, "has_outdated_metadata", lambda *_: False)
 instead(PersistenceBase, "input_changed", lambda *_, **__: [])
 instead(_IOFile, "is_newer", never)
 instead(DAG, "check_output_mtime", never)
+PersistenceBase.save_iocache = if_possible

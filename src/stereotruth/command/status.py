@@ -62,11 +62,10 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
     given = [*targets, "--dry-run", "--cores", "1"]
     if configfiles:
         given += ["--configfile", *map(str, configfiles)]
-    said, records, remarks = io.StringIO(), [], []
+    said, records = io.StringIO(), []
     status: object = 0
     with (
         _heard("snakemake", records),
-        _heard("stereotruth", remarks),
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
@@ -85,9 +84,8 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
         if str(getattr(record, "event", "")).endswith("job_info"):
             wildcards = dict(record.wildcards or {})
             of = "/".join(wildcards.get(name, "") for name in ("scene", "lidar", "tile")).strip("/")
-            changed = [r.args[1] for r in remarks if str(r.args[0]) in record.output]
-            reason = "; ".join(f"changed: {files}" for files in changed) or record.reason
-            jobs.append(PlannedJob(record.rule_name, wildcards.get("city", ""), of, reason))
+            city = wildcards.get("city", "")
+            jobs.append(PlannedJob(record.rule_name, city, of, record.reason))
     return jobs
 
 
@@ -126,8 +124,7 @@ class CityStatus:
 
 def _short(reason: str) -> str:
     text = " ".join(reason.split())
-    text = re.sub(r"^Params have changed.*?before:", "settings before:", text)
-    text = re.sub(r"^Code has changed", "code has changed", text)
+    text = text.removeprefix("Params have changed since last execution: ")
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
 
 

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
+from zarr.abc.buffer import Buffer
 from zarr.codecs import BloscCodec, BloscShuffle
+from zarr.storage import LocalStore
 
 from ..errors import InputError
 from .files import replacing, whole_folder
@@ -52,6 +54,15 @@ def compressor() -> BloscCodec:
     return BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.bitshuffle)
 
 
+class PlainStore(LocalStore):
+    """A store in a folder for one writer; makes no hard links, which exFAT does not have."""
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Set a key that is not there yet."""
+        if not await self.exists(key):
+            await self.set(key, value)
+
+
 @contextmanager
 def building(path: str | Path) -> Iterator[Path]:
     """An empty scratch folder whose store becomes ``path`` if the block ends well."""
@@ -81,7 +92,7 @@ def create_grid(
     """
     if shard % chunk:
         raise ValueError(f"shard of {shard} px is no multiple of the chunk of {chunk} px")
-    group = zarr.open_group(path, mode="w", zarr_format=3)
+    group = zarr.open_group(PlainStore(path), mode="w", zarr_format=3)
     group.attrs.update({"conventions": CONVENTIONS, **attrs})
     arrays = {}
     for name, layer in layers.items():
@@ -146,6 +157,14 @@ class Strip:
             scratch.write_text(f'{{"strip": "{self}"}}\n')
 
 
+def _damaged(path: str | Path, error: Exception) -> InputError:
+    return InputError(
+        f"damaged Zarr store ({type(error).__name__})",
+        file=path,
+        remedy="delete it and run the workflow again",
+    )
+
+
 def require_complete(path: str | Path) -> zarr.Group:
     """Open a store's group for reading.
 
@@ -153,11 +172,14 @@ def require_complete(path: str | Path) -> zarr.Group:
     """
     try:
         group = zarr.open_group(path, mode="r")
-    except (FileNotFoundError, ValueError) as error:
+        complete = group.attrs.get("complete", False)
+    except FileNotFoundError as error:
         raise InputError(
             "no such Zarr store", file=path, remedy="run the stage that makes it"
         ) from error
-    if not group.attrs.get("complete", False):
+    except Exception as error:  # whatever a damaged zarr.json makes of Zarr
+        raise _damaged(path, error) from error
+    if not complete:
         raise InputError(
             "half-written Zarr store", file=path, remedy="delete it and run the workflow again"
         )
@@ -169,4 +191,7 @@ def open_grid(path: str | Path) -> xr.Dataset:
     import xarray as xr  # a quarter of a job's start-up, and most jobs need none
 
     require_complete(path)
-    return xr.open_zarr(path, consolidated=True, mask_and_scale=False, chunks=None)
+    try:
+        return xr.open_zarr(path, consolidated=True, mask_and_scale=False, chunks=None)
+    except Exception as error:
+        raise _damaged(path, error) from error

@@ -12,7 +12,7 @@ from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..job import progress
 from ..kernels import inlined, kernel
-from ..products.grids import building
+from ..products.grids import PlainStore, building
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
@@ -168,7 +168,7 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
     left = prepare(city, scene).left
     totals = np.zeros(3)
     with building(out_zarr) as scratch:
-        group = zarr.open_group(scratch, mode="w", zarr_format=3)
+        group = zarr.open_group(PlainStore(scratch), mode="w", zarr_format=3)
         group.attrs.update({
             "conventions": "arrays are [row, col] of the left image; pixel (0, 0) is the centre "
             "of the upper-left pixel",

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from stereotruth.command.status import CityStatus, PlannedJob
 
-PARAMS = (
-    "Params have changed since last execution: Union of exclusive params before and now across all "
-    "output: before: 'affine' now: 'shift'"
-)
+SAYS = "Params have changed since last execution:"
+PARAMS = f"{SAYS} changed: model 'affine' -> 'shift'"
 FOLLOWS = "Input files updated by another job: results/align/A/A-1/alignment.json"
 JOBS = (
     PlannedJob("align", "A", "A-1", PARAMS),
     PlannedJob("align", "A", "A-2", PARAMS),
     PlannedJob("align", "A", "A-3", PARAMS),
-    PlannedJob("refine", "A", "A-1", f"{FOLLOWS}; Code has changed since last execution"),
+    PlannedJob("refine", "A", "A-1", f"{FOLLOWS}; {SAYS} changed: code"),
     PlannedJob("project", "A", "A-1", FOLLOWS),
 )
 
@@ -23,8 +21,8 @@ def test_causes_are_said_once_and_what_follows_from_them_not_at_all():
     assert status.state == "out of date"
     assert status.why() == [
         "align 3, refine 1, project 1",
-        "align A-1, align A-2 and 1 more: settings before: 'affine' now: 'shift'",
-        "refine A-1: code has changed since last execution",
+        "align A-1, align A-2 and 1 more: changed: model 'affine' -> 'shift'",
+        "refine A-1: changed: code",
     ]
 
 

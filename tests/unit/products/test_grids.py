@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import random
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -8,6 +10,7 @@ import zarr
 from stereotruth.errors import InputError
 from stereotruth.products.files import replacing
 from stereotruth.products.grids import Layer, blocks, building, create_grid, open_grid
+from stereotruth.products.resumable_grids import making
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
 
@@ -79,3 +82,35 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_grid_is_made_and_published_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    """As on exFAT and some network drives."""
+
+    def refused(*_, **__):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("os.link", refused)
+    block, path = (slice(0, 64), slice(0, 64)), tmp_path / "grid.zarr"
+    with making(path, (64, 64), LAYERS, chunk=32, shard=64) as store:
+        store.write(block, "key", {"disparity": np.ones((64, 64), "float32")}, None)
+        store.publish(path, [block], {"scene": "A-1"})
+    assert open_grid(path).disparity.values.sum() == 64 * 64
+
+
+def test_any_damage_to_the_metadata_is_one_sentence_with_the_store(tmp_path):
+    """Seeded bytes of zarr.json: refused, or read as what it says."""
+    path = make(tmp_path / "grid.zarr")
+    whole, rng = (path / "zarr.json").read_bytes(), random.Random(3)
+    refused = 0
+    for _ in range(120):
+        damaged = bytearray(whole)
+        at = rng.randrange(len(damaged))
+        damaged[at : at + rng.choice((1, 1, 30))] = rng.randbytes(rng.choice((0, 1, 9)))
+        (path / "zarr.json").write_bytes(damaged)
+        try:
+            open_grid(path).disparity.values  # noqa: B018
+        except InputError as error:
+            assert "grid.zarr" in str(error)
+            refused += 1
+    assert refused > 60

@@ -1,0 +1,46 @@
+"""The private parts of Snakemake that due.smk replaces are as it takes them to be."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import pytest
+import snakemake.cli  # noqa: F401  first: the others import in a circle
+from snakemake.dag import DAG
+from snakemake.io import _IOFile
+from snakemake.persistence import PersistenceBase
+
+REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the version"
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (PersistenceBase.params_changed, ["self", "job", "file"]),
+        (PersistenceBase.has_metadata, ["self", "job"]),
+        (PersistenceBase.has_outdated_metadata, ["self", "job"]),
+        (PersistenceBase.input_changed, ["self", "job", "file"]),
+        (_IOFile.is_newer, ["self", "time"]),
+        (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
+        (PersistenceBase.save_iocache, ["self"]),
+    ],
+)
+def test_a_function_that_is_replaced_is_there(function, arguments):
+    assert list(inspect.signature(function).parameters) == arguments, REMEDY
+
+
+def test_a_plan_asks_these_questions_and_no_others():
+    """What makes a job due in a plan of this Snakemake; each is answered from our records."""
+    source = inspect.getsource(DAG.update_needrun)
+    asked = set(re.findall(r"workflow\.persistence\.(\w+)", source))
+    assert asked == {
+        "input_checksums",  # only of files that are newer
+        "has_metadata",
+        "has_outdated_metadata",
+        "params_changed",
+        "input_changed",
+        "code_changed",  # not among the triggers of profiles/default
+        "software_stack_changed",  # of conda and containers: Snakemake's own
+    }, REMEDY
+    assert "f.is_newer" in source, REMEDY
