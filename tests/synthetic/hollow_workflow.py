@@ -32,11 +32,11 @@ WAYS = ("kill", "refuse", "disk", "defect", "node")
 MOMENTS = ("start", "begun", "half", "written", "recorded")
 FAULT, STRUCK = Path("fault.json"), Path("fault.struck")
 SUFFIXES = {".json", ".csv", ".png", ".npz", ".tif", ".laz", ".html", ".md", ".pt", ".tiff"}
-SCRIPT = '''"""Stands in for the script of rule {rule}."""
+SCRIPT = '''"""Stands in for the script {name}."""
 from tests.synthetic.hollow_workflow import work
 
 if __name__ == "__main__":
-    work(snakemake, "{rule}")
+    work(snakemake)
 '''
 GIVEN = ("left.tif", "right.tif", "left_RPC.TXT", "lidar/1.laz", "lidar/2.laz", "gcps.csv")
 TARGETS = (
@@ -74,7 +74,7 @@ def make_hollow(folder: Path) -> Project:
     """A project with a city of its own and a synthetic one, nothing made yet."""
     project = copy_project(folder)
     for script in (folder / "workflow/scripts").glob("*.py"):
-        script.write_text(SCRIPT.format(rule=script.stem))
+        script.write_text(SCRIPT.format(name=script.stem))
     run = folder / "workflow/rules/run.smk"
     run.write_text(
         run.read_text().replace("    say(made())\n", "").replace("    list_pages()\n", "")
@@ -100,10 +100,10 @@ def set_seed(project: Project, seed: int) -> None:
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "seed": seed}))
 
 
-def work(snakemake: Any, rule: str) -> None:
+def work(snakemake: Any) -> None:
     """Write into each product what it is made of; or fail, if that is asked."""
-    fail_at = _fault(rule)
-    with job(snakemake.log[0], rule):
+    fail_at = _fault(snakemake.rule)
+    with job(snakemake.log[0], snakemake.rule):
         fail_at("start")
         with publication(snakemake.input, snakemake.output, snakemake.params):
             fail_at("begun")

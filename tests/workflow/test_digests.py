@@ -69,7 +69,7 @@ REACH = {
 # there are, and a scene more is no other scene.
 ANYWHERE = {"errors", "error_statistics", "job", "kernels", "settings"}
 # Who reports and records does not change what is computed.
-NOT_COVERED = {"job", "products.provenance", "products.publication"}
+NOT_COVERED = {"job", "products.provenance", "products.publication", "report.index_page"}
 
 
 def covered(rule) -> set[str]:

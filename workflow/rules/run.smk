@@ -75,7 +75,10 @@ def list_pages():
     """Write the index of all pages, of this run and of earlier ones; its path, if there are any."""
     from stereotruth.report.index_page import write_index
 
-    return write_index()
+    try:
+        return write_index()
+    except (InputError, OSError) as error:
+        return f"none, {error}"
 
 
 def say(text):

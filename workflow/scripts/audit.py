@@ -6,6 +6,7 @@ from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
+from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params
@@ -22,3 +23,4 @@ if __name__ == "__main__":
             code=params.measuring,
             index=INDEX,
         )
+        write_index()

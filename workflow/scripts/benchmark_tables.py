@@ -7,6 +7,7 @@ from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
 from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
+from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
@@ -23,3 +24,4 @@ if __name__ == "__main__":
             seed=params.seed,
             index=INDEX,
         )
+        write_index()

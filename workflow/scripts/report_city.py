@@ -5,6 +5,7 @@ from pathlib import Path
 from stereotruth.job import job
 from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
+from stereotruth.report.index_page import write_index
 from stereotruth.report.page import write_report
 
 if __name__ == "__main__":
@@ -40,3 +41,4 @@ if __name__ == "__main__":
             workers=snakemake.threads,
             code=snakemake.params.code,
         )
+        write_index()

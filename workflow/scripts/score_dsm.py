@@ -6,6 +6,7 @@ from stereotruth.evaluation.surface_models.score import score_surface_model
 from stereotruth.job import job
 from stereotruth.products.html_page import INDEX
 from stereotruth.products.publication import publication
+from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
@@ -15,3 +16,4 @@ if __name__ == "__main__":
     ):
         verdict = score_surface_model(snakemake.input.dsm, LidarReference(snakemake.input.points))
         write_verdict(verdict, snakemake.output[0], f"{scene} by {method}", index=INDEX)
+        write_index()

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import InputError
+from ..products.html_page import INDEX
 from ..report.index_page import pages_of, write_index
 
 
@@ -16,7 +17,11 @@ def pages(words: Iterable[str] = ()) -> list[Path]:
     Raises InputError if there is none.
     """
     words = list(words)
-    index, found = write_index(), pages_of(Path())
+    found = pages_of(Path())
+    try:
+        index = write_index()
+    except OSError:  # a folder that is read-only: as its last run has left it
+        index = INDEX if INDEX.is_file() else None
     chosen = [page for page in found if any(word in str(page) for word in words)]
     if not words and index:
         chosen = [index, *found]

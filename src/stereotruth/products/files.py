@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
 from .locks import exclusive
 from .publication import publishing
 
@@ -101,3 +102,19 @@ def write_json(path: str | Path, values: Mapping[str, Any]) -> None:
     """A JSON file, whole or absent."""
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """What a product in JSON holds. Raises InputError if it is damaged."""
+    try:
+        found = json.loads(Path(path).read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise _damaged(path) from error
+    if not isinstance(found, dict):
+        raise _damaged(path)
+    return found
+
+
+def _damaged(path: str | Path) -> InputError:
+    remedy = "run the workflow again, which makes it again"
+    return InputError("damaged: no JSON of ours", file=path, remedy=remedy)

@@ -1,18 +1,20 @@
 """The index of a folder's pages: cities, benchmarks, audits, surface models, with their figures.
 
-It lists what is there, and no plan of a run knows that beforehand: each run writes it when it ends,
-as does whoever opens it.
+It lists what is there, and no plan of a run knows that beforehand. Each job that makes a page
+writes the index before it ends, and so do each run and whoever opens it: what is recorded as made
+is in it.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..products.files import read_json
 from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
+from ..products.locks import exclusive
 from ..products.pictures import encode_file
 
 PAGES = (
@@ -32,11 +34,21 @@ def pages_of(root: Path) -> list[Path]:
 
 
 def write_index(root: Path = Path()) -> Path | None:
-    """Write the index of the pages in a folder; None if there are none, and no index then."""
+    """Write the index of the pages in a folder; None if there are none, and no index then.
+
+    Raises InputError if what it shows of a page cannot be read.
+    """
     out = root / INDEX
     if not pages_of(root):
         out.unlink(missing_ok=True)
         return None
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with exclusive(out.with_name("pages")):  # other jobs' pages are in it, or are so later
+        _write(root, out)
+    return out
+
+
+def _write(root: Path, out: Path) -> None:
     values = {
         "cities": [_city(root, out, page) for page in sorted(root.glob(PAGES[0]))],
         "benchmarks": _benchmarks(root, out),
@@ -53,11 +65,10 @@ def write_index(root: Path = Path()) -> Path | None:
         ],
     }
     write_page(out, TEMPLATE, values)
-    return out
 
 
 def _read(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return read_json(file) if file.is_file() else {}
 
 
 def _link(out: Path, page: Path, text: str) -> Cell:
