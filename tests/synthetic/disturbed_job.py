@@ -24,7 +24,7 @@ from stereotruth.errors import InputError
 from stereotruth.products import records
 from stereotruth.products.files import replacing, whole_folder
 from stereotruth.products.publication import publication
-from stereotruth.products.records import why_due
+from stereotruth.products.records import mark_begun, why_due
 from stereotruth.products.runs import begin_run, end_older_jobs
 
 SOURCE, FILE, FOLDER = Path("in.csv"), Path("out/a.json"), Path("out/b")
@@ -46,6 +46,7 @@ def _work(setting: str, slow: float) -> None:
 
 
 def _start(setting: str, slow: float) -> int:
+    mark_begun(FILE)
     pid = os.fork()
     if pid:
         return pid

@@ -75,10 +75,13 @@ class Failures:
         assert status == 0, self.said()[-4000:]
         self.rules = sorted(rules)
         for edit in EDITS:
+            file = self.folder / (edit if edit != "seed" else "my.yaml")
+            before, seed = file.read_bytes(), self.seed
             self.edit(edit)
             status, self.reached[edit] = self.run("--dry-run")
             assert status == 0 and self.reached[edit], (edit, self.said()[-4000:])
-        assert self.run()[0] == 0, self.said()[-4000:]
+            file.write_bytes(before)
+            self.seed = seed
 
     def edit(self, what: str) -> None:
         self.version += 1

@@ -23,6 +23,7 @@ REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the ve
         (PersistenceBase.input_changed, ["self", "job", "file"]),
         (_IOFile.is_newer, ["self", "time"]),
         (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
+        (PersistenceBase.started, ["self", "job", "external_jobid"]),
         (PersistenceBase.save_iocache, ["self"]),
     ],
 )

@@ -13,7 +13,7 @@ from snakemake.io import _IOFile
 from snakemake.logging import logger
 from snakemake.persistence import PersistenceBase, ParamsChange
 
-from stereotruth.products.records import why_due
+from stereotruth.products.records import mark_begun, why_due
 
 
 def is_recorded(rule):
@@ -57,6 +57,12 @@ async def never(*_):
     return False
 
 
+def started(persistence, job, *more, before=PersistenceBase.started, **named):
+    if is_recorded(job.rule):
+        mark_begun(job.output[0])  # its record takes the mark away, and nothing else does
+    return before(persistence, job, *more, **named)
+
+
 def if_possible(persistence, before=PersistenceBase.save_iocache):
     with suppress(OSError):  # a plan in a folder that is read-only
         before(persistence)
@@ -68,4 +74,5 @@ instead(PersistenceBase, "has_outdated_metadata", lambda *_: False)
 instead(PersistenceBase, "input_changed", lambda *_, **__: [])
 instead(_IOFile, "is_newer", never)
 instead(DAG, "check_output_mtime", never)
+PersistenceBase.started = started
 PersistenceBase.save_iocache = if_possible

@@ -164,9 +164,9 @@ class PointStore:
         try:
             self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
             self.count = int(self.attrs["points"]["kept"])
-            cells = self._cell_table()
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._damaged(ATTRIBUTES) from error
+        cells = self._cell_table()
         self.cell_row = cells["row"].astype(np.int64)
         self.cell_col = cells["col"].astype(np.int64)
         self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
@@ -201,7 +201,7 @@ class PointStore:
             data = (self.path / CELLS).read_bytes()
         except OSError as error:
             raise self._damaged(CELLS) from error
-        if zlib.crc32(data) != self.attrs["cells_crc32"]:
+        if zlib.crc32(data) != self.attrs.get("cells_crc32"):
             raise self._damaged(CELLS)
         return np.load(BytesIO(data))
 

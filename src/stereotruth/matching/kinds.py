@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from .imported_files import imported_files
 
 FOLDER = "folder"
 TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
@@ -44,10 +45,10 @@ def _results(settings: Mapping[str, Any]) -> list[Path]:
 
 
 def _code(settings: Mapping[str, Any]) -> list[Path]:
-    """The user's file, or those of the module; of a module in a package, all of the package."""
+    """The user's file, or all of the module's package, and what they import of the user's."""
     place = place_of(settings.get("function", ""))[0]
     if place.endswith(".py"):
-        return [Path(place)]
+        return imported_files([Path(place)])
     top = place.partition(".")[0]
     try:
         spec = find_spec(top) if top else None  # imports nothing, since it has no parent
@@ -69,7 +70,7 @@ def _code(settings: Mapping[str, Any]) -> list[Path]:
             remedy="name a function of a module or package that has .py files",
         )
     here = Path.cwd()
-    return sorted(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
+    return imported_files(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
 
 
 def words_of(command: str) -> list[str]:

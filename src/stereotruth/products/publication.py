@@ -18,7 +18,6 @@ from .records import (
     DamagedRecord,
     Record,
     contents_of,
-    mark_begun,
     names_of,
     plain,
     read_record,
@@ -35,17 +34,14 @@ class _Job:
         self.settings = plain(settings)
         self.run = Run()
         self.published: dict[str, Marks] = {}
-        self.begin()
+        with self.run.standing():
+            pass
         inputs = contents_of(inputs)
         self.marks = marks(inputs)
         self.checksums = Checksums(KEPT / "checksums")
         self.inputs = Inputs(inputs, self.checksums)
         for path, found in self.inputs.checksums.items():
             _refuse_damaged(path, found)
-
-    def begin(self) -> None:
-        with self.run.standing():
-            mark_begun(next(iter(self.outputs.values())))
 
     @contextmanager
     def standing(self) -> Iterator[None]:

@@ -1,8 +1,8 @@
 """Records of jobs: what their products were made of, and what is due because that no longer holds.
 
-A job marks that it has begun, and keeps its record when all of its products are in their places:
-settings and digests of code, checksums of inputs and of products. What is recorded is all that a
-plan goes by (:func:`why_due`). Times of files count for nothing. Records lie in ``results``, and
+Before a job starts, a mark is laid (:func:`mark_begun`). The job's record takes it away, when all of
+its products are in their places: settings and digests of code, checksums of inputs and of products.
+Record and mark are all that a plan goes by (:func:`why_due`). Times of files count for nothing. Records lie in ``results``, and
 travel with it; copies of them lie beside Snakemake's own, for products that outlive ``results``.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -109,10 +110,11 @@ def _mark(product: str | Path) -> Path:
 
 
 def mark_begun(product: str | Path) -> None:
-    """Note that a job has begun to make its products, of which this is the first."""
+    """Note that a job is to make its products, of which this is the first."""
     mark = _mark(product)
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.touch()
+    with suppress(OSError):  # a full disk: what changed is seen nevertheless
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
 
 
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
