@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,12 +33,6 @@ def _edit_laz(data: bytes) -> bytes:
     return out.getvalue()
 
 
-def _edit_alignment(data: bytes) -> bytes:
-    values = json.loads(data)
-    values["left"]["affine"][0][2] += 0.7
-    return (json.dumps(values, indent=1) + "\n").encode()
-
-
 def _edit_image(data: bytes) -> bytes:
     """Another left image: brighter in every second pixel."""
     from rasterio.io import MemoryFile
@@ -53,17 +46,12 @@ def _edit_image(data: bytes) -> bytes:
         return out.read()
 
 
-def _drop_lines(data: bytes) -> bytes:
-    lines = data.splitlines(keepends=True)
-    return b"".join([lines[0], *lines[1 : 1 + (len(lines) - 1) // 2]])
-
-
 @dataclass(frozen=True)
 class Stage:
     """A rule, what is edited of its input, and its products; ``{c}`` stands for the city.
 
-    ``other`` makes the other version of a file; the other version of a folder is the product of
-    ``of``, another stage, where that one's own input was edited.
+    ``other`` makes the other version of a file that users give. The other version of a product is
+    damaged: it is made again, and nothing is made of it.
     """
 
     rule: str
@@ -71,7 +59,6 @@ class Stage:
     input: str
     products: tuple[str, ...]
     other: Callable[[bytes], bytes] | None = None
-    of: str = ""
 
 
 STAGES = {
@@ -100,7 +87,6 @@ STAGES = {
             f"results/refine/{{c}}/{{c}}-1/{n}"
             for n in ("alignment.json", "observations.csv", "refinement.png")
         ),
-        _edit_alignment,
     ),
     "rectify": Stage(
         "rectify",
@@ -110,49 +96,42 @@ STAGES = {
             f"results/rectify/{{c}}/{{c}}-1/{n}"
             for n in ("epipolar.json", "left.zarr", "right.zarr")
         ),
-        _edit_alignment,
     ),
     "project": Stage(
         "project",
         "logs/project/{c}/{c}-1.log",
         "results/ingest/{c}/{c}-1/Tiny-1_0_0.points",
         ("results/project/{c}/{c}-1.zarr",),
-        of="ingest",
     ),
     "export": Stage(
         "export",
         "logs/export/{c}.log",
         "results/project/{c}/{c}-1.zarr",
         ("tiles/{c}", "results/export/{c}/matches.csv", "results/export/{c}/summary.json"),
-        of="project",
     ),
     "evaluate_images": Stage(
         "evaluate_images",
         "logs/evaluate_images/{c}.log",
         "results/export/{c}/matches.csv",
         tuple(f"results/evaluate/{{c}}/{n}.csv" for n in ("table4", "sift", "warping")),
-        _drop_lines,
     ),
     "report": Stage(
         "report_city",
         "logs/report_city/{c}.log",
         "results/evaluate/{c}/sift.csv",
         ("results/report/{c}/index.html",),
-        _drop_lines,
     ),
     "predict": Stage(
         "predict_scene",
         "logs/predict_scene/{c}/{c}-1/sgm.log",
         "results/rectify/{c}/{c}-1/left.zarr",
         ("results/predict/{c}/{c}-1/sgm.zarr",),
-        of="rectify",
     ),
     "dsm": Stage(
         "dsm",
         "logs/dsm/{c}/{c}-1/sgm.log",
         "results/predict/{c}/{c}-1/sgm.zarr",
         ("results/predict/{c}/{c}-1/sgm_dsm.tif",),
-        of="predict",
     ),
     "match": Stage(
         "match",

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -87,16 +90,10 @@ def test_what_changed_in_a_clone_runs_what_it_touches(cloned, tmp_path, file, ol
 
 
 def test_a_clone_is_carried_on(cloned, tmp_path):
-    """The copied records stay where they are, beside those of the run."""
     other = cloned.copy(tmp_path / "other")
     other.edit("tiny.yaml", "size: 128", "size: 96")
     assert other.snakemake(*ARGUMENTS).status == 0
     assert plan(other) == {}
-    assert (
-        (other.folder / ".snakemake/metadata")
-        .resolve()
-        .is_relative_to((other.folder / "results").resolve())
-    )
 
 
 def test_deleted_results_are_made_again(cloned, tmp_path):
@@ -116,3 +113,119 @@ def test_tiles_without_results_are_still_known(made, tmp_path):
     assert plan(other) == {}
     other.edit("tiny.yaml", "size: 128", "size: 96")
     assert {"ingest", "align", "project", "export"} <= set(plan(other))
+    other.edit("tiny.yaml", "size: 96", "size: 128")
+    assert plan(other) == {}
+    other.edit("in/gcps.csv", "1", "2")
+    assert {"align", "refine", "rectify", "project", "export"} <= set(plan(other))
+
+
+FROM = {
+    "align": ["align", "refine", "rectify", "project", "export"],
+    "refine": ["refine", "rectify", "project", "export"],
+    "rectify": ["rectify", "project", "export"],
+    "project": ["project", "export"],
+    "ingest": ["ingest", "refine", "rectify", "project", "export"],
+    "export": ["export"],
+}
+DAMAGE = [
+    ("results/align/Tiny/Tiny-1/alignment.json", "align"),
+    ("results/refine/Tiny/Tiny-1/observations.csv", "refine"),
+    ("results/rectify/Tiny/Tiny-1/left.zarr/*/c/*/*", "rectify"),
+    ("results/rectify/Tiny/Tiny-1/right.zarr/zarr.json", "rectify"),
+    ("results/rectify/Tiny/Tiny-1/epipolar.json", "rectify"),
+    ("results/project/Tiny/Tiny-1.zarr/disparity/c/*/*", "project"),
+    ("results/ingest/Tiny/Tiny-1/Tiny-1_0_0.points/store.json", "ingest"),
+    ("results/ingest/Tiny/Tiny-1/Tiny-1_0_0.points/points.npy", "ingest"),
+    ("tiles/Tiny/disp/*", "export"),
+    ("tiles/Tiny/manifest.csv", "export"),
+    ("tiles/Tiny/export.json", "export"),
+    ("results/export/Tiny/summary.json", "export"),
+]
+
+
+@pytest.mark.parametrize(("file", "rule"), DAMAGE)
+def test_a_product_that_is_damaged_is_made_again_and_said_to_be(cloned, file, rule):
+    """By a bit, or by a file that is gone from a folder; nobody takes it for an edit."""
+    place = sorted(cloned.folder.glob(file))[0]
+    whole = place.read_bytes()
+    try:
+        place.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        run = cloned.snakemake("--dry-run", *ARGUMENTS)
+        assert list(run.jobs) == FROM[rule]
+        assert re.search(r"is not what was made: made again", run.text)
+        place.unlink()
+        alone = "*" not in file and not re.search(r"\.(zarr|points)/|^tiles/", file)
+        assert list(plan(cloned)) == ([] if alone else FROM[rule])  # an absent one is not damaged
+    finally:
+        place.write_bytes(whole)
+
+
+@pytest.mark.parametrize("rule", ["align", "project", "export"])
+def test_a_damaged_record_means_make_it_again(cloned, rule):
+    product = {"align": "results/align/Tiny/Tiny-1/alignment.json", "export": "tiles/Tiny"}
+    name = product.get(rule, "results/project/Tiny/Tiny-1.zarr")
+    record = cloned.folder / f"results/.records/made/{name}.json"
+    whole = record.read_bytes()
+    try:
+        record.write_bytes(whole.replace(b"1", b"2", 1))
+        run = cloned.snakemake("--dry-run", *ARGUMENTS)
+        assert list(run.jobs) == FROM[rule]
+        assert f"damaged record results/.records/made/{name}.json" in run.text
+    finally:
+        record.write_bytes(whole)
+
+
+def test_a_file_beside_an_image_that_comes_later_is_an_input(cloned):
+    for name in ("left.tif.msk", "left_Rpc.Txt", "right.TIF.aux.xml", "left.tfw"):
+        (cloned.folder / "in" / name).write_bytes(b"1")
+        run = cloned.snakemake("--dry-run", *ARGUMENTS)
+        assert list(run.jobs) == FROM["align"] and f"other input: in/{name}" in run.text
+        (cloned.folder / "in" / name).unlink()
+    assert plan(cloned) == {}
+
+
+def test_what_costs_nothing_makes_nothing_again(cloned, tmp_path):
+    """Absolute paths for relative ones, an order that says nothing, files of other programs."""
+    other = cloned.copy(tmp_path / "other")
+    sheet = other.folder / "tiny_scenes.tsv"
+    sheet.write_text(sheet.read_text().replace("in/gcps", f"{other.folder}/in/gcps"))
+    (other.folder / "tiles/Tiny/left/1.tiff.aux.xml").write_text("of QGIS")
+    config = other.folder / "tiny.yaml"
+    config.write_text(config.read_text() + "ingest: {drop_classes: [18, 7]}\nstrips: 2\n")
+    shutil.rmtree(other.folder / "logs", ignore_errors=True)
+    assert plan(other) == {}
+
+
+def test_a_plan_writes_nothing(cloned):
+    """But what Snakemake keeps of it, and checksums, in .snakemake."""
+
+    def state():
+        return {
+            path: (path.lstat().st_mtime_ns, path.lstat().st_size)
+            for path in cloned.folder.rglob("*")
+            if ".snakemake" not in path.parts and path.name != "plan.log"
+        }
+
+    before = state()
+    assert plan(cloned) == {}
+    cloned.snakemake("--summary", *ARGUMENTS)
+    assert state() == before
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts the folder again")
+def test_a_finished_project_that_is_read_only_is_planned(made, tmp_path):
+    other = made.copy(tmp_path / "other")
+    assert plan(other) == {}
+    folder = str(other.folder)
+    mounts = (["mount", "--bind", folder, folder], ["mount", "-o", "remount,ro,bind", folder])
+    if any(subprocess.run(mount, capture_output=True).returncode for mount in mounts):
+        pytest.skip("no right to mount")
+    try:
+        with pytest.raises(OSError):
+            (other.folder / "x").touch()
+        command = [sys.executable, "-m", "snakemake", "--dry-run", "--cores", "1", *ARGUMENTS]
+        run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr[-3000:]
+        assert "Nothing to be done" in run.stdout + run.stderr
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)

@@ -17,7 +17,7 @@ rule ingest:
     params:
         script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
-        drop_classes=list(SETTINGS.ingest.drop_classes),
+        drop_classes=sorted(SETTINGS.ingest.drop_classes),
         code=source_digest("lidar.ingest"),
     message:
         "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"

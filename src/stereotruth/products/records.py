@@ -1,9 +1,10 @@
 """Records of jobs: what their products were made of, and what is due because that no longer holds.
 
-Before a job starts, a mark is laid (:func:`mark_begun`). The job's record takes it away, when all of
-its products are in their places: settings and digests of code, checksums of inputs and of products.
-Record and mark are all that a plan goes by (:func:`why_due`). Times of files count for nothing. Records lie in ``results``, and
-travel with it; copies of them lie beside Snakemake's own, for products that outlive ``results``.
+Before a job starts, a mark is laid (:func:`mark_begun`). The job's record takes it away, when all
+of its products are in their places: settings and digests of code, checksums of inputs and of
+products. Record and mark are all that a plan goes by (:func:`why_due`). Times of files count for
+nothing. Records lie in ``results``, and travel with it; copies of them lie beside Snakemake's own,
+for products that outlive ``results``.
 """
 
 from __future__ import annotations
