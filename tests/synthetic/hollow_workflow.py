@@ -46,6 +46,7 @@ TARGETS = (
     "results/train/cities/net/best.pt",
 )
 CONFIG = {
+    "seed": 0,
     "strips": {"Own-1": 2},
     "project": {"right_view": True},
     "dataset": {"layouts": ["whu", "kitti"]},

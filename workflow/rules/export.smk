@@ -126,8 +126,8 @@ rule verify:
         mem_mb=1000,
         runtime=60,
     params:
-        tiles=[f"tiles/{city}" for city in CITIES],
+        folders=[*(f"tiles/{city}" for city in CITIES), "dataset"],
     message:
-        "Holding the tiles against the checksums of their manifests"
+        "Holding tiles and dataset against the checksums of their manifests"
     script:
         "../scripts/verify.py"

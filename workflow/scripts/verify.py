@@ -1,4 +1,4 @@
-"""The tiles that exist against the checksums of their manifests."""
+"""Tiles and dataset, where they exist, against the checksums of their manifests."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from stereotruth.job import job
 
 if __name__ == "__main__":
     with job(snakemake.log[0], "verify"):
-        folders = [folder for folder in snakemake.params.tiles if Path(folder).is_dir()]
+        folders = [folder for folder in snakemake.params.folders if Path(folder).is_dir()]
         if not folders:
             raise InputError("no tiles to verify", remedy="make some: snakemake tiles/<City>")
         verify(folders)

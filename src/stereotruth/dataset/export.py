@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..job import progress
 from ..products.files import growing_table, replacing, whole_folder, write_table
-from ..products.provenance import describe, file_sha256, source_digest
+from ..products.provenance import describe, file_sha256, own_digest, source_digest
 from .footprints import FOOTPRINTS, feature, write_footprints
 from .ground_looks import write_ground_looks
 from .orientation import save
@@ -228,7 +228,7 @@ def export_city(
             "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
             "provenance": provenance,
         }
-        save(scratch / "export.json", record)
+        save(scratch / "export.json", record | {"digest": own_digest(record)})
         _forget_others(cut, rows)
     return summary
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterable
 from fnmatch import fnmatch
 from pathlib import Path
 
 from ..errors import InputError
+from ..products.files import read_json
 from ..products.folders import is_foreign
-from ..products.provenance import file_sha256
+from ..products.inputs import checksum
+from ..products.provenance import file_sha256, own_digest
+from ..products.records import DamagedRecord, read_record
 from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest
 
@@ -27,7 +29,9 @@ LOOSE = (
 def defects(folder: str | Path) -> list[str]:
     """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
 
-    Works on ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`)
+    ``export.json`` keeps its own digest, and those of the manifest and the footprints. What else no
+    manifest lists is held to the record of the job that made the folder, where there is one. Works
+    on ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`)
     are no defects. Raises InputError if there is no manifest.
     """
     folder = Path(folder)
@@ -53,13 +57,29 @@ def defects(folder: str | Path) -> list[str]:
         f"{name}: not in the manifest" for name in sorted(present - listed) if not _is_loose(name)
     ]
     if (record := folder / "export.json").is_file():
-        said = json.loads(record.read_text(encoding="utf-8"))
+        try:
+            said = read_json(record)
+        except InputError:
+            said = {}
+        if said.get("digest") != own_digest(said):
+            found.append("export.json: changed")
         for name, key in (("manifest.csv", "manifest_sha256"), (FOOTPRINTS, "footprints_sha256")):
             if not (folder / name).is_file():
                 found.append(f"{name}: missing")
-            elif file_sha256(folder / name) != said[key]:
+            elif file_sha256(folder / name) != said.get(key):
                 found.append(f"{name}: changed")
+    if not found and _record_of(folder) not in (None, checksum(folder)):
+        found.append("a file that the manifest does not list: not what was made")
     return found
+
+
+def _record_of(folder: Path) -> str | None:
+    """The checksum of a folder that the workflow has made here, if its record can be read."""
+    try:
+        record = read_record(folder)
+    except DamagedRecord:
+        return None
+    return record.outputs.get(str(folder)) if record else None
 
 
 def _is_loose(name: str) -> bool:

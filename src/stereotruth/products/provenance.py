@@ -11,12 +11,16 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from .. import __version__
 
 PACKAGE = Path(__file__).parents[1]
+# whose versions may decide bytes of products
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs")
+LIBRARIES = (*LIBRARIES, "rasterio", "pyproj", "laspy", "lazrs")
 
 
 def file_sha256(path: str | Path) -> str:
@@ -178,6 +182,16 @@ def script_digest(file: str | Path) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16]
 
 
+@cache
+def libraries() -> dict[str, str]:
+    """Versions of :data:`LIBRARIES`, of those that are installed."""
+    found = {}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
 def describe(
     inputs: Iterable[str | Path] | Mapping[str, str],
     parameters: Mapping[str, Any],
@@ -193,6 +207,7 @@ def describe(
         inputs = {Path(path).name: file_sha256(path) for path in inputs}
     return {
         "software": f"stereotruth {__version__}",
+        "libraries": libraries(),
         "code": code,
         "inputs": dict(sorted(inputs.items())),
         "parameters": dict(parameters),
@@ -203,3 +218,9 @@ def digest(record: Mapping[str, Any]) -> str:
     """Short digest of a provenance record: stands for the product in later stages' records."""
     text = json.dumps(record, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def own_digest(record: Mapping[str, Any]) -> str:
+    """Digest of all that a record in JSON holds, but for its key ``digest``, which keeps it."""
+    rest = {key: value for key, value in record.items() if key != "digest"}
+    return digest(json.loads(json.dumps(rest, default=str)))

@@ -94,3 +94,20 @@ def test_records_hold_checksums_and_are_equal_for_equal_work(tmp_path):
         provenance.describe({"a.txt": sha_of_abc}, {"x": 1}, "code")
     )
     assert str(tmp_path) not in str(record)
+
+
+def test_versions_of_what_decides_bytes_stand_in_the_provenance():
+    told = provenance.describe({}, {}, "code")["libraries"]
+    assert {"numpy", "scipy", "numba", "zarr", "rasterio"} <= set(told)
+    assert all(version[0].isdigit() for version in told.values())
+
+
+def test_a_package_that_is_read_only_is_no_obstacle(package, monkeypatch):
+    """Where ``__pycache__`` is there and cannot be written to, as in containers."""
+
+    def refused(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(Path, "write_text", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    assert len(provenance.source_digest("errors")) == 16
