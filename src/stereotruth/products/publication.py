@@ -34,8 +34,7 @@ class _Job:
         self.settings = plain(settings)
         self.run = Run()
         self.published: dict[str, Marks] = {}
-        with self.run.standing():
-            pass
+        self.run.refuse_older()
         inputs = contents_of(inputs)
         self.marks = marks(inputs)
         self.checksums = Checksums(KEPT / "checksums")
@@ -43,22 +42,19 @@ class _Job:
         for path, found in self.inputs.checksums.items():
             _refuse_damaged(path, found)
 
-    @contextmanager
-    def standing(self) -> Iterator[None]:
-        with self.run.standing():
-            self.inputs.refuse_changed()
-            yield
+    def refuse_late(self) -> None:
+        self.run.refuse_older()
+        self.inputs.refuse_changed()
 
     def end(self) -> None:
         missing = sorted(set(self.outputs) - set(self.published))
         if missing:
             raise RuntimeError(f"written past products.publication: {missing}")
         made = {path: self.checksums.of(path)[1] for path in names_of(self.outputs.values())}
-        with self.standing():
-            for found in self.published.values():
-                refuse_replaced(found)
-            inputs = dict(self.inputs.checksums)
-            write_record(Record(self.run.name, self.settings, inputs, made))
+        self.refuse_late()
+        for found in self.published.values():
+            refuse_replaced(found)
+        write_record(Record(self.run.name, self.settings, dict(self.inputs.checksums), made))
 
 
 def _refuse_damaged(path: str, found: str) -> None:
@@ -101,11 +97,11 @@ def publication(
 def publishing(path: str | Path) -> Iterator[None]:
     """In the block, and at once, a file or folder takes its place."""
     place = str(Path(path).absolute())
-    if _job is None or place not in _job.outputs:
-        yield
-        return
-    with _job.standing():
-        yield
+    ours = _job is not None and place in _job.outputs
+    if ours:
+        _job.refuse_late()
+    yield
+    if ours:
         _job.published[place] = marks([path])
 
 

@@ -1,10 +1,8 @@
 """Which run of the workflow is the newest in a folder; older ones publish nothing any more.
 
 Jobs may outlive their run: it is killed, the batch system goes on. A run begins by writing its
-name where the jobs of all runs see it. A product takes its place only while the name there is
-that of the job's own run, under a lock that the beginning of a run waits for: when a run has begun,
-nothing of an earlier one can appear. Where locks of files do nothing, the name alone is left: what
-slips through between looking and publishing, a moment, is found afterwards and told.
+name where the jobs of all runs see it, and a job looks there before each of its products takes its
+place. What slips through in between is not what the newer run's record says, and made again.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from .locks import FileLock
 
 log = logging.getLogger("stereotruth")
 
@@ -38,25 +35,11 @@ def _newest(folder: Path) -> str:
         return ""
 
 
-@contextmanager
-def _locked(folder: Path, *, shared: bool) -> Iterator[None]:
-    lock = FileLock(folder / "publishing.lock")
-    try:
-        if not lock.take(Path.cwd(), shared=shared, wait=False):
-            log.warning(
-                "%s: waiting for a job that is publishing, or a run that begins", Path.cwd()
-            )
-            lock.take(Path.cwd(), shared=shared)
-        yield
-    finally:
-        lock.close()
-
-
 def begin_run(folder: Path = KEPT) -> None:
     """Make a new run the newest; its jobs get its name by the environment."""
     name = uuid.uuid4().hex
-    with _locked(folder, shared=False):
-        (folder / "run").write_text(name)  # in place: other machines may have it open
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "run").write_text(name)  # in place: other machines may have it open
     os.environ[RUN] = name
 
 
@@ -80,14 +63,6 @@ class Run:
                 file=Path.cwd(),
                 remedy="none is needed, the other run makes what it needs",
             )
-
-    @contextmanager
-    def standing(self) -> Iterator[None]:
-        """No other run begins meanwhile. Raises InputError if one has begun before."""
-        with _locked(self._folder, shared=True):
-            self.refuse_older()
-            yield
-            self.refuse_older()  # where locks do nothing
 
     @contextmanager
     def watched(self) -> Iterator[None]:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -24,16 +23,14 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_job_stands_until_another_run_begins(folder):
+def test_a_job_is_refused_when_another_run_has_begun(folder):
     begin_run(folder)
     job = Run(folder)
-    with job.standing():
-        assert job.is_newest()
+    job.refuse_older()
     begin_run(folder)
-    with pytest.raises(InputError, match="another run has begun"), job.standing():
-        pytest.fail("was let in")
-    with Run(folder).standing():
-        pass
+    with pytest.raises(InputError, match="another run has begun"):
+        job.refuse_older()
+    Run(folder).refuse_older()
 
 
 def test_a_job_that_starts_late_belongs_to_the_run_that_started_it(folder, monkeypatch):
@@ -41,32 +38,12 @@ def test_a_job_that_starts_late_belongs_to_the_run_that_started_it(folder, monke
     late = os.environ[RUN]
     begin_run(folder)
     monkeypatch.setenv(RUN, late)
-    with pytest.raises(InputError), Run(folder).standing():
-        pytest.fail("was let in")
+    with pytest.raises(InputError):
+        Run(folder).refuse_older()
 
 
 def test_without_a_run_there_is_nothing_to_refuse(folder):
-    with Run(folder).standing():
-        pass
-
-
-def test_a_run_waits_for_what_is_publishing(folder, monkeypatch):
-    begin_run(folder)
-    job = Run(folder)
-    with job.standing():
-        other = threading.Thread(target=begin_run, args=(folder,))
-        other.start()
-        time.sleep(0.3)
-        assert other.is_alive() and job.is_newest()
-    other.join(10)
-    assert not other.is_alive() and not job.is_newest()
-
-
-def test_a_run_that_slips_in_where_locks_do_nothing_is_told(folder, monkeypatch):
-    begin_run(folder)
-    job = Run(folder)
-    with pytest.raises(InputError), job.standing():
-        (folder / "run").write_text("another")
+    Run(folder).refuse_older()
 
 
 CHILD = """
