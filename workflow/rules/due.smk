@@ -17,7 +17,7 @@ from stereotruth.products.records import mark_begun, why_due
 
 
 def is_recorded(rule):
-    """Whether a rule is of this workflow and makes something: it has a digest of its code."""
+    """Whether records are kept of what it makes, as of all that has a digest of its code."""
     return rule is not None and "code" in dict(rule.params.items())
 
 
