@@ -125,7 +125,7 @@ def test_a_mark_of_a_killed_upload_has_the_product_made_again(server, stored, da
     """As another machine left it that was killed while it wrote the tiles to the bucket."""
     fresh = checkout(tmp_path / "elsewhere", data)
     product = base64.urlsafe_b64encode(f"s3://{BUCKET}/tiny/tiles/Tiny".encode()).decode()
-    assert f".records/metadata/{product}" in stored.files
+    assert f".records/made/{BUCKET}/tiny/tiles/Tiny.json" in stored.files
     name = f".records/incomplete/{product}"
     server.put(f"tiny/{name}", b'{"external_jobid": null}')
     assert fresh.plan(*CALL, *STORED) == {"export": 1}

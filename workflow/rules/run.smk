@@ -57,10 +57,7 @@ def made():
     from stereotruth.last_lines import last_lines  # takes a second, and no plan needs it
 
     products = [
-        product_name(path)
-        for job in all_records()
-        if job.run == Run().name
-        for path in job.outputs
+        product_name(path) for job in all_records() if job.run == Run().name for path in job.outputs
     ]
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
