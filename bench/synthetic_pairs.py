@@ -24,7 +24,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import whole_folder
 from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, lidar_files
+from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -54,8 +54,11 @@ def gain(image: Image, rng: np.random.Generator) -> Image:
     return image * (1 + GAIN * (field - field.mean()) / field.std())
 
 
-def an_hour_later(city: CitySpec) -> CitySpec:
-    """The city by the sun of an hour later on the same day, from its place and hour angle."""
+def sun_an_hour_later(city: CitySpec) -> tuple[float, float]:
+    """Azimuth and elevation of the sun an hour later on the same day, degrees.
+
+    From the city's place and the sun's hour angle.
+    """
     lat, azimuth, height = map(
         math.radians, (city.lat, city.sun_azimuth_deg, city.sun_elevation_deg)
     )
@@ -68,11 +71,7 @@ def an_hour_later(city: CitySpec) -> CitySpec:
     east, meridian = -across * math.sin(angle), across * math.cos(angle)
     north = pole * math.cos(lat) - meridian * math.sin(lat)
     up = pole * math.sin(lat) + meridian * math.cos(lat)
-    return replace(
-        city,
-        sun_azimuth_deg=math.degrees(math.atan2(east, north)) % 360.0,
-        sun_elevation_deg=math.degrees(math.asin(up)),
-    )
+    return math.degrees(math.atan2(east, north)) % 360.0, math.degrees(math.asin(up))
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,8 @@ class Condition:
         images = [pair.data / f"{view}.tif" for view in VIEWS]
         if self.later:
             made = folder / "right.tif"
-            simulate_image(an_hour_later(pair.city), pair.spec, "right", made, seed=SEED)
+            later = replace(pair.city, right=ViewSpec(sun_deg=sun_an_hour_later(pair.city)))
+            simulate_image(later, pair.spec, "right", made, seed=SEED)
             return [images[0], made]
         if self.change is None:
             return images
