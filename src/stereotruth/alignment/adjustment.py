@@ -22,6 +22,9 @@ MATCHING = 0.01  # px, what even the best match may be off
 SYSTEMATIC = 0.01  # px that all tie points are taken to share, to weigh them against a prior
 CLASSES = 5  # of matches, from the best to the poorest
 FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
+STARTS = 300  # planes, and shifts, from which the adjustment starts
+START_PX = 0.03  # px of an observation, besides its own, when blunders are looked for
+BLUNDER_ODDS = 1.0  # px²: of no blunder to a blunder in a square pixel
 TUKEY = 4.685  # deviations at which an observation has lost all weight
 
 
@@ -145,10 +148,51 @@ def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
     return float(np.sqrt(of_mean * freedom / (freedom - 2)))
 
 
+def _agreement(at: Floats, observed: Floats, scale: Floats) -> Floats:
+    """Residuals [n, 2] px of observations from the plane over the image that most agree with.
+
+    ``at`` [n, 2] positions, ``scale`` [n] px of an observation. Blunders may be most, and may all be
+    off to one side, as long as they agree less with each other than the others do: of shifts by one
+    observation each, and of planes through three each, the one of the greatest likelihood is taken,
+    if as many observations as not are blunders of any size.
+    """
+    count = len(at)
+    basis = np.column_stack([np.ones(count), (at - at.mean(axis=0)) / max(np.ptp(at), 1.0)])
+    rng = np.random.default_rng(count)
+    planes = [np.stack([o, np.zeros(2), np.zeros(2)]) for o in observed[:: 1 + count // STARTS]]
+    for _ in range(STARTS):
+        chosen = rng.choice(count, 3, replace=False)
+        if abs(np.linalg.det(basis[chosen])) > 0.02:
+            planes.append(np.linalg.solve(basis[chosen], observed[chosen]))
+
+    def likelihood(plane: Floats) -> float:
+        squared = np.sum((observed - basis @ plane) ** 2, axis=1) / scale**2
+        return float(np.log1p(BLUNDER_ODDS * np.exp(-squared / 2) / scale**2).sum())
+
+    best = max(planes, key=likelihood)
+    for _ in range(20):
+        squared = np.sum((observed - basis @ best) ** 2, axis=1) / scale**2
+        odds = BLUNDER_ODDS * np.exp(-squared / 2) / scale**2
+        root = np.sqrt(odds / (1.0 + odds))[:, None] / scale[:, None]
+        best = np.linalg.lstsq(
+            np.vstack([basis * root, np.diag([0.0, 1e-3, 1e-3])]),
+            np.vstack([observed * root, np.zeros((3, 2))]),
+            rcond=None,
+        )[0]
+    return observed - basis @ best
+
+
 def estimate(
-    design: Floats, observed: Floats, own: Floats, sites: NDArray[np.int64], prior: Floats
+    design: Floats,
+    observed: Floats,
+    own: Floats,
+    sites: NDArray[np.int64],
+    prior: Floats,
+    at: Floats,
 ) -> Estimate:
     """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
+
+    ``at`` [n, 2] px: where in the left image.
 
     ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
     poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
@@ -163,8 +207,8 @@ def estimate(
     expected = np.hypot(own, MATCHING)[:, None]
     inner = design @ root
     rank = root.shape[1]
-    used = np.ones(len(observed), bool)
-    residuals = observed - np.median(observed, axis=0)
+    residuals = _agreement(at, observed, np.hypot(expected[:, 0], START_PX))
+    used = np.hypot(*residuals.T) < 3.0 * np.hypot(expected[:, 0], START_PX)
     z = np.zeros(rank)
     sigma, site_sigma = np.ones(2), np.zeros(2)
     weights = np.ones(len(observed))
@@ -172,15 +216,12 @@ def estimate(
         relative = residuals / expected
         sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
         length = np.hypot(*(relative / sigma).T)
-        if step < 8:  # first a convex one: Huber's, which any start leads to its minimum
-            weights = np.minimum(1.0, 2.0 / np.maximum(length, 1e-12))
-        else:
-            weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
-            used = weights > 0.0
-            sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
-            site_sigma = np.array(
-                [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
-            )
+        weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
+        used = weights > 0.0
+        sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+        site_sigma = np.array(
+            [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
+        )
         variance = expected**2 * (sigma**2 + counts[:, None] * site_sigma**2)
         information = weights[:, None] / variance
         weighted = inner * information[:, :, None]

@@ -194,7 +194,9 @@ def _search(
             return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
-        found = estimate(design, observed + design @ parameters, ties.sigma, ties.site, prior)
+        found = estimate(
+            design, observed + design @ parameters, ties.sigma, ties.site, prior, ties.left
+        )
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
         last, parameters = parameters, found.parameters

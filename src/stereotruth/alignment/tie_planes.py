@@ -23,13 +23,14 @@ Integers = NDArray[np.int64]
 HALF = 10  # px: windows of 21 x 21
 SIDE = 2 * HALF + 1
 MIN_POINTS = 24  # of a window, on its plane
-MOST_POINTS = 400  # of a window, that a plane is fitted to
+MOST_POINTS = 240  # of a window, that a plane is fitted to
 SPREAD = 0.35  # of an even distribution's variance: less, and the points do not fix the plane
 OFF_SIGMAS = 4.0  # of the points about the plane: farther, and a point lies off it
 OFF_M = 0.1  # m, at least
 GUARD_PX = 2.5  # px around what stands off the plane: the optics' blur and the interpolation
 HOLE_SPACINGS = 2.0  # of the points: pixels farther from the plane's points may show anything
-ROUNDS = 6  # of each of the two robust fits of a plane
+ROUNDS = 5  # of each of the two robust fits of a plane
+NEAREST_M = 0.03  # m: points nearer to a plane do not count for more
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ class SitePoints:
         inside = (col > -0.5) & (col < cols - 0.5) & (row > -0.5) & (row < rows - 0.5)
         col, row, height, firm = (values[inside] for values in (col, row, height, firm))
         pixel = np.rint(row).astype(np.int64) * cols + np.rint(col).astype(np.int64)
-        order = np.lexsort((height, col, row, pixel))  # whatever the order of files
+        order = np.argsort(pixel, kind="stable")
         first = np.zeros(rows * cols + 1, np.int64)
         np.cumsum(np.bincount(pixel, minlength=rows * cols), out=first[1:])
         return cls(col[order], row[order], height[order], firm[order], first, shape, parallax)
@@ -81,8 +82,9 @@ class SitePoints:
     def clear_pixels(self, centre: Integers, plane: Floats) -> Bools:
         """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
         clear = np.empty((SIDE, SIDE), bool)
-        cloud = self.col, self.row, self.height, self.firm
-        _clear_pixels(*cloud, self.parallax, centre, plane, clear)
+        cloud = self.col, self.row, self.height, self.firm, self.first, self.shape
+        heights = float(self.height.min()), float(self.height.max())
+        _clear_pixels(*cloud, heights, self.parallax, centre, plane, clear)
         return clear
 
 
@@ -134,10 +136,11 @@ def _robust_plane(u: Floats, v: Floats, h: Floats, plane: Floats) -> float:
     for step in range(2 * ROUNDS):
         for k in range(h.size):
             distance[k] = abs(h[k] - plane[0] - plane[1] * u[k] - plane[2] * v[k])
-        sigma = max(1.4826 * np.median(distance), 0.01)
+        if step >= ROUNDS:
+            sigma = max(1.4826 * np.median(distance), 0.01)
         for k in range(h.size):
             if step < ROUNDS:
-                weight[k] = 1.0 / max(distance[k], 0.25 * sigma)
+                weight[k] = 1.0 / max(distance[k], NEAREST_M)
             else:
                 t = distance[k] / (4.685 * sigma)
                 weight[k] = (1.0 - t * t) ** 2 if t < 1.0 else 0.0
@@ -220,12 +223,23 @@ def _near(marked: Bools, j: int, i: int, radius: float) -> bool:
     return False
 
 
+@inner
+def _above(
+    col: Floats, row: Floats, height: Floats, plane: Floats, centre: Integers, k: int
+) -> float:
+    """Height m of a point above a plane."""
+    return height[k] - plane[0] - plane[1] * (col[k] - centre[0]) - plane[2] * (row[k] - centre[1])
+
+
 @kernel
 def _clear_pixels(
     col: Floats,
     row: Floats,
     height: Floats,
     firm: Bools,
+    first: Integers,
+    shape: tuple[int, int],
+    heights: tuple[float, float],
     parallax: Floats,
     centre: Integers,
     plane: Floats,
@@ -236,14 +250,14 @@ def _clear_pixels(
     A point off the plane, by height or because it is not firm, is seen at its own pixel in the left
     image, and in the right image displaced by its parallax; both places, what lies between them and
     a guard around all are not clear. Neither is a pixel without points of the plane nearby.
-    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``.
+    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights``: lowest and highest point, m.
     """
     limit = max(OFF_SIGMAS * plane[3], OFF_M)
+    rows, cols = shape
     on = 0
-    for k in range(col.size):
-        x, y = col[k] - centre[0], row[k] - centre[1]
-        if abs(x) <= HALF and abs(y) <= HALF and firm[k]:
-            on += abs(height[k] - plane[0] - plane[1] * x - plane[2] * y) <= limit
+    for y in range(centre[1] - HALF, centre[1] + HALF + 1):
+        for k in range(first[y * cols + centre[0] - HALF], first[y * cols + centre[0] + HALF + 1]):
+            on += firm[k] and abs(_above(col, row, height, plane, centre, k)) <= limit
     spacing = SIDE / np.sqrt(max(on, 1))
     guard, hole = GUARD_PX + spacing, HOLE_SPACINGS * spacing + 1.0
     margin = int(max(guard, hole)) + 1
@@ -251,16 +265,23 @@ def _clear_pixels(
     off, held = np.zeros((wide, wide), np.bool_), np.zeros((wide, wide), np.bool_)
     middle = HALF + margin
     length = np.hypot(parallax[0], parallax[1])
-    for k in range(col.size):
-        x, y = col[k] - centre[0], row[k] - centre[1]
-        above = height[k] - plane[0] - plane[1] * x - plane[2] * y
-        if firm[k] and abs(above) <= limit:
-            _mark(held, x + middle, y + middle)
-            continue
-        steps = int(abs(above) * length / 1.5) + 1
-        for s in range(steps + 1):
-            t = above * s / steps
-            _mark(off, x + t * parallax[0] + middle, y + t * parallax[1] + middle)
+    # Points of other pixels are displaced into the window if they are high enough.
+    most = max(abs(heights[0] - plane[0]), abs(heights[1] - plane[0])) + np.hypot(
+        plane[1] * cols, plane[2] * rows
+    )
+    reach = middle + int(most * length) + 1
+    for y in range(max(centre[1] - reach, 0), min(centre[1] + reach + 1, rows)):
+        start = first[y * cols + max(centre[0] - reach, 0)]
+        for k in range(start, first[y * cols + min(centre[0] + reach + 1, cols)]):
+            above = _above(col, row, height, plane, centre, k)
+            x, v = col[k] - centre[0] + middle, row[k] - centre[1] + middle
+            if firm[k] and abs(above) <= limit:
+                _mark(held, x, v)
+                continue
+            steps = int(abs(above) * length / 1.5) + 1
+            for s in range(steps + 1):
+                t = above * s / steps
+                _mark(off, x + t * parallax[0], v + t * parallax[1])
     for j in range(SIDE):
         for i in range(SIDE):
             near_off = _near(off, j + margin, i + margin, guard)
