@@ -189,10 +189,12 @@ def estimate(
     sites: NDArray[np.int64],
     prior: Floats,
     at: Floats,
+    common_px: float = 0.0,
 ) -> Estimate:
     """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
 
-    ``at`` [n, 2] px: where in the left image.
+    ``at`` [n, 2] px: where in the left image. ``common_px``: standard deviation of an error that all
+    observations have in common and that no residual shows.
 
     ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
     poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
@@ -245,6 +247,7 @@ def estimate(
     values, squares = values[seen], (vectors[:, seen].T @ right) ** 2
     own = expected[:, 0]
     common = np.array([_shared_sigma(residuals[:, k], information[:, k], own) for k in (0, 1)])
+    common = np.hypot(common, common_px)
     # That of the right side, by errors of the observations that have this in common:
     floor = SYSTEMATIC**-2.0
     single -= (shared * (total + floor - (common * floor) ** 2) / total**2) @ shared.T

@@ -68,6 +68,7 @@ ROUNDS = 5
 SETTLED = 0.01  # px, change of a round after which no other follows
 MOVED = 3.0  # px in the left image after which places are looked for anew
 MIN_PLACES, MIN_SITES = 30, 8
+COMMON = 0.005  # px that all tie points share and no residual shows: rms over simulated scenes
 LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
 MIN_USED = 0.5
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
@@ -195,7 +196,7 @@ def _search(
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
         found = estimate(
-            design, observed + design @ parameters, ties.sigma, ties.site, prior, ties.left
+            design, observed + design @ parameters, ties.sigma, ties.site, prior, ties.left, COMMON
         )
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)

@@ -32,8 +32,8 @@ Picture = NDArray[np.float32]
 
 
 STEEPEST = 3.0  # ratio of scales between the images along any direction
-MIN_CORRELATION = 0.6
-POOR_SIGMA = 0.2  # px: a match that is worse by its own residuals is none
+MIN_CORRELATION = 0.5
+POOR_SIGMA = 0.25  # px: a match that is worse by its own residuals is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,11 +24,11 @@ Picture = NDArray[np.float32]
 SITES = 120  # about; each is read by itself
 SITE = 168  # px of the left image, side of a site
 PER_SIDE = 3  # places per side of a site, at most
-STEP = 5  # px between the candidates for a place
+STEP = 4  # px between the candidates for a place
 FLAT_PX = 0.3  # standard deviation of a place's points about their plane, as disparity
 MARGIN = 24  # px around a site whose points are looked at
-TRIED = 10  # windows of each part of a site that are looked at pixel by pixel
-MIN_CLEAR = 110  # pixels of a window, a quarter
+TRIED = 24  # windows of each part of a site that are looked at pixel by pixel
+MIN_CLEAR = 90  # pixels of a window, a fifth
 MIN_TOLD = 12.0  # smaller eigenvalue of what they tell, in pixels of the usual slope
 VEGETATION = (3, 4, 5)  # ASPRS classes
 
