@@ -45,7 +45,8 @@ class Draw:
     ``density``: LiDAR points per m². ``noise``, ``gain``: of both images, as in
     :mod:`synthetic_pairs`. ``later``: the right image is of an hour later. ``bare``: the view
     without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range of the ground.
-    ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built.
+    ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built. ``sun_deg``: the sun's
+    elevation, None for one that is drawn.
     """
 
     seed: int
@@ -56,6 +57,8 @@ class Draw:
     ground_look: tuple[float, float] = (1.5, 0.3)
     lobes: int = 8
     porosity: float = 0.35
+    trunk_m: tuple[float, float] = (0.4, 2.2)
+    slimness: tuple[float, float] = (0.75, 1.1)
     density: float = 4.0
     noise: bool = False
     gain: bool = False
@@ -66,6 +69,7 @@ class Draw:
     roofs: str = "mixed"
     buildings: float = 0.7
     side_px: int = 2000
+    sun_deg: float | None = None
 
     @property
     def city(self) -> CitySpec:
@@ -74,7 +78,7 @@ class Draw:
         canopy = None
         if self.ground_m2 is not None:
             canopy = Canopy(self.arrangement, self.ground_m2, self.radius_m, self.lobes,
-                            self.brightness, self.porosity)  # fmt: skip
+                            self.brightness, self.porosity, self.trunk_m, self.slimness)  # fmt: skip
         character = replace(
             drawn.character, relief_m=self.relief_m, valley=0.3, wavelength_m=900.0, river_m=0.0,
             max_slope_deg=30.0, lakes=0.0, zones=ZONES, towers_m=(20.0, 40.0), trees=0.0,
@@ -83,7 +87,12 @@ class Draw:
         )  # fmt: skip
         scene = replace(drawn.scenes[0], name="Wooded", lidar_grid=(1, 1))
         city = replace(
-            drawn, name="Wooded", character=character, las_format="las-1.4-6", scenes=(scene,)
+            drawn,
+            name="Wooded",
+            character=character,
+            las_format="las-1.4-6",
+            scenes=(scene,),
+            sun_elevation_deg=self.sun_deg or drawn.sun_elevation_deg,
         )
         views = {
             view: ViewSpec(
