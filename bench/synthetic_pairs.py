@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
+from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.alignment.refine import refine
 from stereotruth.epipolar.image_reader import open_pair
@@ -111,6 +112,11 @@ def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], fol
     alignment = align(*images, gcps)
     if stores:
         alignment, _ = refine(alignment, *images, stores)
+    rectify_by(alignment, images, folder)
+
+
+def rectify_by(alignment: Alignment, images: Sequence[Path], folder: Path) -> None:
+    """Rectify a pair by an alignment: ``epipolar.json``, ``left.zarr``, ``right.zarr``."""
     model = epipolar_model(alignment)
     with open_pair(*images) as opened:
         rectify(

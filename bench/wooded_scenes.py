@@ -28,27 +28,37 @@ from stereotruth.simulate.cities import Canopy, CitySpec, SceneSpec, ViewSpec, l
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
+from stereotruth.simulate.surfaces import TREE
 from stereotruth.simulate.training_cities import training_city
 from stereotruth.simulate.truth import SURFACES, truth_at
 
 Floats = NDArray[np.float64]
 STEP_PX = 8.0  # between the places where an alignment is examined
 STEP_M = 0.5  # of height between a place and where its label lies: more is another surface
-ZONES = {"lowrise": 2, "village": 3, "slabs": 0.7, "park": 1.5, "fields": 1}
+ZONES = {
+    "suburb": {"lowrise": 2, "village": 3, "slabs": 0.7, "park": 1.5, "fields": 1},
+    "park": {"park": 5, "village": 1.5, "fields": 0.5},
+    "town": {"towers": 1.5, "slabs": 3, "lowrise": 3, "industry": 1, "park": 1},
+}
+LOW = {"trunk_m": (0.0, 0.3), "slimness": (0.4, 0.7)}  # bushes, orchards
+HIGH = {"trunk_m": (0.4, 2.2), "slimness": (0.75, 1.1)}
+MIXED = {"trunk_m": (0.0, 2.2), "slimness": (0.4, 1.1)}
 
 
 @dataclass(frozen=True)
 class Draw:
     """What a scene is drawn from.
 
-    ``ground_m2`` per crown, None for no crowns, and ``arrangement``: as in :class:`Canopy`.
-    ``density``: LiDAR points per m². ``noise``, ``gain``: of both images, as in
-    :mod:`synthetic_pairs`. ``later``: the right image is of an hour later. ``bare``: the view
-    without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range of the ground.
-    ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built.
+    ``zones``: land use, one of ZONES. ``ground_m2`` per crown, None for no crowns, and what follows
+    it: as in :class:`Canopy`. ``density``: LiDAR points per m². ``noise``, ``gain``: of both
+    images, as in :mod:`synthetic_pairs`. ``later``: the right image is of an hour later. ``bare``:
+    the view without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range of the
+    ground. ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built. ``sun_deg``:
+    the sun's elevation, None for one that is drawn.
     """
 
     seed: int
+    zones: str = "suburb"
     ground_m2: float | None = 250.0
     arrangement: str = "single"
     radius_m: tuple[float, float] = (1.5, 4.5)
@@ -56,6 +66,8 @@ class Draw:
     ground_look: tuple[float, float] = (1.5, 0.3)
     lobes: int = 8
     porosity: float = 0.35
+    trunk_m: tuple[float, float] = (0.4, 2.2)
+    slimness: tuple[float, float] = (0.75, 1.1)
     density: float = 4.0
     noise: bool = False
     gain: bool = False
@@ -66,6 +78,7 @@ class Draw:
     roofs: str = "mixed"
     buildings: float = 0.7
     side_px: int = 2000
+    sun_deg: float | None = None
 
     @property
     def city(self) -> CitySpec:
@@ -73,17 +86,24 @@ class Draw:
         drawn = training_city(self.seed, 27, self.side_px)
         canopy = None
         if self.ground_m2 is not None:
-            canopy = Canopy(self.arrangement, self.ground_m2, self.radius_m, self.lobes,
-                            self.brightness, self.porosity)  # fmt: skip
+            canopy = Canopy(
+                self.arrangement, self.ground_m2, self.radius_m, self.lobes, self.brightness,
+                self.porosity, self.trunk_m, self.slimness,
+            )  # fmt: skip
         character = replace(
             drawn.character, relief_m=self.relief_m, valley=0.3, wavelength_m=900.0, river_m=0.0,
-            max_slope_deg=30.0, lakes=0.0, zones=ZONES, towers_m=(20.0, 40.0), trees=0.0,
-            zone_m=260.0, canopy=canopy, ground_look=self.ground_look,
+            max_slope_deg=30.0, lakes=0.0, zones=ZONES[self.zones], towers_m=(20.0, 40.0),
+            trees=0.0, zone_m=260.0, canopy=canopy, ground_look=self.ground_look,
             buildings=self.buildings, flat_roofs=self.roofs == "flat", vehicles=self.vehicles,
         )  # fmt: skip
         scene = replace(drawn.scenes[0], name="Wooded", lidar_grid=(1, 1))
         city = replace(
-            drawn, name="Wooded", character=character, las_format="las-1.4-6", scenes=(scene,)
+            drawn,
+            name="Wooded",
+            character=character,
+            las_format="las-1.4-6",
+            scenes=(scene,),
+            sun_elevation_deg=self.sun_deg or drawn.sun_elevation_deg,
         )
         views = {
             view: ViewSpec(
@@ -107,16 +127,14 @@ class Scene:
     draw: Draw
     folder: Path
 
-    @property
-    def city(self) -> CitySpec:
-        return self._city
-
     @cached_property
-    def _city(self) -> CitySpec:
+    def city(self) -> CitySpec:
+        """The city that is drawn."""
         return self.draw.city
 
     @property
     def spec(self) -> SceneSpec:
+        """Its one scene."""
         return self.city.scenes[0]
 
     @cached_property
@@ -162,6 +180,19 @@ class Scene:
                     ingest(scratch / file, scratch / f"{Path(file).stem}.points")
                     (scratch / file).unlink()
         return sorted(made.glob("*.points"))
+
+    @property
+    def points(self) -> list[Path]:
+        """Point stores, by the name that a :class:`synthetic_pairs.Pair` has for them."""
+        return self.stores
+
+    @cached_property
+    def crown_share(self) -> float:
+        """Share of the left image that shows crowns."""
+        cols, rows = self.spec.cols, self.spec.rows
+        at = np.meshgrid(np.arange(0, cols, 2 * STEP_PX), np.arange(0, rows, 2 * STEP_PX))
+        surface = truth_at(self.city, self.spec, *at)["surface"]
+        return float((surface == TREE).sum() / (surface > 0).sum())
 
     def gcps(self, count: int) -> Path:
         """gcps.csv of so many control points of 0.25 px noise, spread over the scene."""

@@ -42,8 +42,8 @@ def place_canopy(
     rng = np.random.default_rng([city.world_seed, 4])
     xy = _ARRANGEMENTS[canopy.arrangement](canopy, s, sites, rng)
     radius = rng.uniform(*canopy.radius_m, len(xy))
-    half = radius * rng.uniform(0.75, 1.1, len(xy))
-    trunk = rng.uniform(0.4, 2.2, len(xy))
+    half = radius * rng.uniform(*canopy.slimness, len(xy))
+    trunk = rng.uniform(*canopy.trunk_m, len(xy))
     ground = terrain_heights(s, xy)[:, 0]
     trees = np.column_stack([xy, ground + trunk + half, radius, half, (radius / half) ** 2])
     keep = near_scenes(city, xy, city.margin_m - 60) & (ground > s.water + 0.5)

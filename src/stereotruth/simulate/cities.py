@@ -52,7 +52,8 @@ class Canopy:
     ``arrangement``: "single" (anywhere), "rows" or "forest". ``ground_m2``: ground per crown.
     ``radius_m``: least and greatest radius. ``lobes``: ellipsoids that stand out of a crown's top.
     ``brightness``: factor on the reflectance of leaves. ``porosity``: share of the LiDAR pulses
-    that the top of a crown lets pass.
+    that the top of a crown lets pass. ``trunk_m``: least and greatest height of a crown's lower
+    end; ``slimness``: of its height over its width.
     """
 
     arrangement: str = "single"
@@ -61,6 +62,8 @@ class Canopy:
     lobes: int = 8
     brightness: float = 0.4
     porosity: float = 0.35
+    trunk_m: tuple[float, float] = (0.4, 2.2)
+    slimness: tuple[float, float] = (0.75, 1.1)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ VANS = 0.12  # share of the vehicles
 NARROWEST_M = 3.5  # half width of a street that vehicles use
 LANE = 0.35  # distance from the middle over half the width
 SLOW_M = (0.5, 6.0)  # way of a vehicle in slow traffic between the views
+APART_M = 15.0  # more than two bodies and the ways of both
 PARKED, SLOW, LEAVING, COMING = 0.25, 0.35, 0.15, 0.15  # shares; the others are in the LiDAR only
 
 
@@ -54,6 +55,7 @@ def place_vehicles(city: CitySpec, s: Surfaces, sites: cKDTree) -> Placed:
     views = np.array([IN_IMAGES, IN_LEFT, IN_LEFT, IN_RIGHT, IN_LIDAR], np.uint8)[state]
     slow = np.flatnonzero(state == 1)
     street = (zone[:, 7] < len(BUILT)) & (zone[:, 6] > NARROWEST_M)
+    street[cKDTree(xy).query_pairs(APART_M, output_type="ndarray").max(axis=1, initial=-1)] = False
 
     order = np.concatenate([np.arange(count), slow])
     at = np.concatenate([xy, xy[slow] + way[slow, None] * heading[slow]])
