@@ -99,7 +99,8 @@ class Block:
         """What labels the block; ``points_per_m2`` None, or more than there are: all points."""
         settings = Settings(method=method, fill=fill)
         images = (self.rectified / f"{view}.zarr" for view in ("left", "right"))
-        job = SceneInputs(*images, tuple(self.pair.points), settings, self.view)
+        alignment = self.pair.alignment(self.rectified)
+        job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)
         share = min((points_per_m2 or self.density) / self.density, 1.0)
         job.__dict__["stores"] = tuple(Thinned(path, share) for path in self.pair.points)
         return job

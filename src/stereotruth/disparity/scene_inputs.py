@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from ..lidar.point_store import PointStore, open_stores
@@ -27,7 +28,8 @@ class SceneInputs:
     """The rectified images and point stores of a scene, and how to judge and condense the points.
 
     Plain values, so that it can go to another process; what they stand for is opened when it is
-    asked for. ``view``: left, or right for the labels of the right image.
+    asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
+    file whose corrections the images were rectified with; without it, it counts as exact.
     """
 
     left_store: Path
@@ -35,6 +37,7 @@ class SceneInputs:
     point_stores: tuple[Path, ...]
     settings: Settings
     view: str = "left"
+    alignment: Path | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
@@ -43,6 +46,10 @@ class SceneInputs:
     def pair(self) -> Pair:
         """The images with their geometry; its left image is the one that gets labels."""
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
+        model = EpipolarModel.from_dict(left.attrs["epipolar"])
+        uncertainty = LabelUncertainty.none()
+        if self.alignment is not None:
+            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
         return seen_from(
             self.view,
             Pair(
@@ -52,8 +59,8 @@ class SceneInputs:
                     else group["image"]
                     for group in (left, right)
                 ),
-                EpipolarModel.from_dict(left.attrs["epipolar"]),
-                LabelUncertainty.from_attrs(left.attrs),
+                model,
+                uncertainty,
             ),
         )
 
