@@ -31,8 +31,8 @@ class Thinned(PointStore):
         self.count = int(self.count * share)
 
     @property
-    def cell_counts(self) -> NDArray[np.int64]:
-        return np.maximum((super().cell_counts * self.share).astype(np.int64), 1)
+    def square_counts(self) -> NDArray[np.float64]:
+        return super().square_counts * self.share
 
     def query(self, *box: float) -> Points:
         points = super().query(*box)

@@ -227,6 +227,8 @@ def export_city(
             )
             drawn.append(pool.submit(draw, rows))
             gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+            for source in sources:
+                gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             half = disparity_dtype == "float16"
             summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
             summary["quality"] = gates

@@ -54,6 +54,7 @@ class SceneStores:
     flags: Mapping[int, str]
     inputs: Mapping[str, str]
     points_per_px: float | None
+    points_per_m2: float | None
     doubts: tuple[str, ...]
 
 
@@ -105,6 +106,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
         inputs=inputs,
         points_per_px=disparity.attrs.get("points_per_px"),
+        points_per_m2=disparity.attrs.get("points_per_m2"),
         doubts=doubts,
     )
 

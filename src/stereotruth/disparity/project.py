@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import block_progress
-from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, making
@@ -52,10 +51,10 @@ ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have
 
 def _tell_density(inputs: SceneInputs) -> None:
     """Log how dense the points are, and what that leaves without a label."""
-    per_px = inputs.scale.points_per_px
-    pixel = inputs.rays.cell[1] * LATTICE_DEG * DEGREE_M / CELL_PX
+    pixel = inputs.rays.cell_m / CELL_PX
+    per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
-    said = f"about {per_px / pixel**2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
+    said = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
     if inputs.settings.fills or share > ENOUGH:
         log.info("%s", said)
         return
@@ -193,7 +192,8 @@ def project_scene(
         "epipolar": dict(left_attrs["epipolar"]),
         "points_bounds": points_bounds,
         "alignment_sigma_px": inputs.pair.uncertainty.sigma,
-        "points_per_px": round(inputs.scale.points_per_px, 4),
+        "points_per_m2": round(inputs.points_per_m2, 4),
+        "points_per_px": round(inputs.points_per_m2 * (inputs.rays.cell_m / CELL_PX) ** 2, 4),
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
         "settings": parameters,

@@ -7,11 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
+from ..lidar.density import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
 from .image_patches import MaskedImage
@@ -87,10 +86,12 @@ class SceneInputs:
     @cached_property
     def scale(self) -> Scale:
         """Of the triangles between the points."""
-        cells = np.concatenate([(s.cell_row << 32) + s.cell_col for s in self.stores])
-        counts = np.concatenate([s.cell_counts for s in self.stores])
-        _, which = np.unique(cells, return_inverse=True)
-        return Scale.of(np.bincount(which, weights=counts), self.rays.cell)
+        return Scale.of(self.points_per_m2, self.rays.cell_m)
+
+    @cached_property
+    def points_per_m2(self) -> float:
+        """Over the ground that the points cover."""
+        return points_per_m2(self.stores)
 
     @property
     def halo(self) -> int:
