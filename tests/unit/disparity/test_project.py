@@ -464,6 +464,9 @@ def test_settings_are_checked(plane) -> None:
         project_with(*plane.images, [], plane.folder / "x.zarr")
 
 
-def test_store_bounds_are_kept(plane) -> None:
+def test_store_bounds_and_density_are_kept(plane) -> None:
+    """Points every 0.4 m over 230 m, in cells of 117 m."""
     grid = plane.project(method="none")
+    assert grid.attrs["points_per_m2"] == pytest.approx(0.4**-2, rel=0.02)
+    assert grid.attrs["points_per_px"] == pytest.approx((0.65 / 0.4) ** 2, rel=0.1)
     assert grid.attrs["points_bounds"] == list(PointStore(plane.store).bounds)
