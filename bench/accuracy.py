@@ -21,7 +21,6 @@ from stereotruth import sheets
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.dataset import warped_tile
 from stereotruth.dataset.manifest import labelled_tiles
 from stereotruth.epipolar.fit import fit_epipolar
@@ -287,6 +286,8 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         model=config["alignment"]["model"],
         scene=scene.scene,
     )
+    folder.mkdir(parents=True)
+    aligned.save(folder / "alignment.json")
     model = epipolar_model(aligned)
     with open_pair(scene.left_image, scene.right_image) as (left, right):
         rectify(
@@ -297,7 +298,6 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
             folder / "left.zarr",
             folder / "right.zarr",
             workers=workers,
-            left_attrs=LabelUncertainty.of(aligned, model).to_attrs(),
         )
     project_scene(
         folder / "left.zarr",
@@ -306,6 +306,7 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         folder / "disparity.zarr",
         Settings.of(config),
         workers=workers,
+        alignment=folder / "alignment.json",
         code=source_digest("disparity.project"),
     )
     return folder / "disparity.zarr"

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.alignment.refine import refine
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
@@ -107,7 +106,7 @@ class Condition:
 def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], folder: Path) -> None:
     """Align a pair, refine that by the points if there are any, and rectify it.
 
-    Makes ``epipolar.json``, ``left.zarr`` and ``right.zarr`` in the folder.
+    Makes ``alignment.json``, ``epipolar.json``, ``left.zarr`` and ``right.zarr`` in the folder.
     """
     alignment = align(*images, gcps)
     if stores:
@@ -116,7 +115,8 @@ def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], fol
 
 
 def rectify_by(alignment: Alignment, images: Sequence[Path], folder: Path) -> None:
-    """Rectify a pair by an alignment: ``epipolar.json``, ``left.zarr``, ``right.zarr``."""
+    """Rectify a pair: ``alignment.json``, ``epipolar.json``, ``left.zarr``, ``right.zarr``."""
+    alignment.save(folder / "alignment.json")
     model = epipolar_model(alignment)
     with open_pair(*images) as opened:
         rectify(
@@ -125,7 +125,6 @@ def rectify_by(alignment: Alignment, images: Sequence[Path], folder: Path) -> No
             folder / "epipolar.json",
             *(folder / f"{view}.zarr" for view in VIEWS),
             workers=1,
-            left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
         )
 
 
@@ -171,6 +170,12 @@ class Pair:
             with whole_folder(made) as scratch:
                 self._rectify(CONDITIONS[condition], scratch)
         return made
+
+    def alignment(self, rectified: Path) -> Path:
+        """The alignment that the pair was rectified with into a folder."""
+        own = self.results / "refine" / self.city.name / self.name / "alignment.json"
+        made = rectified / "alignment.json"
+        return made if made.is_file() else own
 
     def _rectify(self, condition: Condition, folder: Path) -> None:
         tables = [folder / f"{name}.csv" for name in ("gcps", "gcps_exact", "checkpoints")]

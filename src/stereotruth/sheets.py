@@ -83,7 +83,8 @@ class Scene:
     """CSV of ground control points, see below; empty without any, if `alignment.refine` is true:
     the refinement then starts from the RPCs alone (10 px standard deviation is assumed, 3e-4 of
     scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
-    images lie on the LiDAR: the attribute `alignment_sigma` of `left.zarr` says how well"""
+    images lie on the LiDAR: the attribute `alignment_sigma_px` of the scene's disparity store says
+    how well"""
 
     left_mask: Text = ""
     """optional column: a raster on the left image's grid, not zero where the image is not to be

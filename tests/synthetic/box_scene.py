@@ -101,7 +101,7 @@ def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path
     return folder / f"{name}.points"
 
 
-RUN = ("code", "view", "workers", "scheduler", "scene", "max_points", "strip")
+RUN = ("code", "alignment", "view", "workers", "scheduler", "scene", "max_points", "strip")
 
 
 def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):

@@ -49,7 +49,7 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
         placed = [file.heights for file in surveyed if file.heights]
         reach = dense = ""
         if area := sum(file.area_m2 for file in surveyed):
-            dense = f", {points / area:.2g} points/m² by their headers"
+            dense = f", at least {points / area:.2g} points/m² (over the boxes of their headers)"
         if placed:
             reach = f", {min(h[0] for h in placed):.0f} to {max(h[1] for h in placed):.0f} m"
         found.say(

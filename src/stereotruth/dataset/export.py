@@ -76,10 +76,21 @@ def _refuse_empty(
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
             "project.fill: surface, the default, labels pixels between them"
         )
+    doubts = "; ".join(
+        f"the alignment of scene {source.scene} is in doubt: {doubt}"
+        for source in sources
+        for doubt in source.doubts
+    )
+    remedy = (
+        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
+        f"or LiDAR that covers the overlap of the two images{sparse}"
+    )
+    if doubts:
+        doubts = f". Labels are missing where LiDAR and images disagree: {doubts}"
+        remedy = f"first what the alignment's doubts say; else {remedy}"
     raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)})",
-        remedy=f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
-        f"{min_labelled:g}), or LiDAR that covers the overlap of the two images{sparse}",
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){doubts}",
+        remedy=remedy,
     )
 
 
@@ -216,6 +227,8 @@ def export_city(
             )
             drawn.append(pool.submit(draw, rows))
             gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+            for source in sources:
+                gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             half = disparity_dtype == "float16"
             summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
             summary["quality"] = gates

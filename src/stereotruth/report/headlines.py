@@ -56,6 +56,9 @@ def headlines(
     found += _of_images(scenes, height_m_per_px)
     if alignments:
         found.append(_gcps(alignments, refined))
+    if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
+        text = f"{spread(dense, '.2g')} points/m²"
+        found.append(Headline("LiDAR density", text, "over the ground that it covers"))
     low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
     high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
     if low and high:
