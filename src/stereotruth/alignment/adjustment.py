@@ -151,10 +151,10 @@ def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
 def _agreement(at: Floats, observed: Floats, scale: Floats) -> Floats:
     """Residuals [n, 2] px of observations from the plane over the image that most agree with.
 
-    ``at`` [n, 2] positions, ``scale`` [n] px of an observation. Blunders may be most, and may all be
-    off to one side, as long as they agree less with each other than the others do: of shifts by one
-    observation each, and of planes through three each, the one of the greatest likelihood is taken,
-    if as many observations as not are blunders of any size.
+    ``at`` [n, 2] positions, ``scale`` [n] px of an observation. Blunders may be most, and all of
+    them off to one side, as long as they agree less with each other than the others do. Shifts by
+    one observation each and planes through three each are tried, and the one of the greatest
+    likelihood is taken, blunders of any size being as probable as good observations.
     """
     count = len(at)
     basis = np.column_stack([np.ones(count), (at - at.mean(axis=0)) / max(np.ptp(at), 1.0)])
@@ -193,8 +193,8 @@ def estimate(
 ) -> Estimate:
     """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
 
-    ``at`` [n, 2] px: where in the left image. ``common_px``: standard deviation of an error that all
-    observations have in common and that no residual shows.
+    ``at`` [n, 2] px: where in the left image. ``common_px``: standard deviation of an error
+    that all observations have in common and that no residual shows.
 
     ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
     poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]

@@ -104,8 +104,8 @@ def _discord(
 ) -> float:
     """Standard deviation px of the mean shift, by how much the parts of a window differ.
 
-    Along the direction ``along`` [2] in which heights move a point, each of PARTS² parts has a shift
-    of its own; their variance beyond what the misfits explain is that between studies of a
+    Along the direction ``along`` [2] in which heights move a point, each of PARTS² parts has a
+    shift of its own; their variance beyond what the misfits explain is that between studies of a
     meta-analysis (DerSimonian & Laird 1986).
     """
     side = int(np.sqrt(weight.size))

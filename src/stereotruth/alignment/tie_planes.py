@@ -8,7 +8,7 @@ plane lies within a guard distance of it, as either image sees that point.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,7 @@ ROUNDS = 5  # of each of the two robust fits of a plane
 NEAREST_M = 0.03  # m: points nearer to a plane do not count for more
 
 
-@dataclass(frozen=True, eq=False)
-class SitePoints:
+class SitePoints(NamedTuple):
     """The points of a site, sorted by the pixel of the left image in which they lie.
 
     ``col``, ``row`` px [n] from the upper-left pixel of the site's wide box, ``height`` m [n];
@@ -75,22 +74,20 @@ class SitePoints:
     def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
         """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
         planes, share = np.empty((len(centres), 4)), np.empty(len(centres))
-        cloud = self.col, self.row, self.height, self.firm, self.first
-        _fit_planes(*cloud, self.shape[1], centres, planes, share)
+        _fit_planes(self, centres, planes, share)
         return planes, share
 
     def clear_pixels(self, centre: Integers, plane: Floats) -> Bools:
         """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
         clear = np.empty((SIDE, SIDE), bool)
-        cloud = self.col, self.row, self.height, self.firm, self.first, self.shape
         heights = float(self.height.min()), float(self.height.max())
-        _clear_pixels(*cloud, heights, self.parallax, centre, plane, clear)
+        _clear_pixels(self, heights, centre, plane, clear)
         return clear
 
 
 @inner
 def _solve_plane(u: Floats, v: Floats, h: Floats, weight: Floats, plane: Floats) -> bool:
-    """Fill ``plane`` [3] (level at (0, 0), slopes) by weighted least squares; False if undetermined.
+    """Fill ``plane`` [3] (level at (0, 0), slopes) by weighted least squares; False if that fails.
 
     ``u``, ``v`` in [-1, 1] over the window.
     """
@@ -150,23 +147,14 @@ def _robust_plane(u: Floats, v: Floats, h: Floats, plane: Floats) -> float:
 
 
 @kernel
-def _fit_planes(
-    col: Floats,
-    row: Floats,
-    height: Floats,
-    firm: Bools,
-    first: Integers,
-    cols: int,
-    centres: Integers,
-    planes: Floats,
-    share: Floats,
-) -> None:
+def _fit_planes(points: SitePoints, centres: Integers, planes: Floats, share: Floats) -> None:
     """Robust planes through the points of windows around ``centres`` int[k, 2] (col, row) px.
 
     Fills ``planes`` [k, 4]: height at the centre (m), slopes along columns and rows (m/px), robust
     standard deviation of the points (m), NaN where none is determined; ``share`` [k]: of all points
-    of the window, those on the plane. Points as in :class:`SitePoints`, ``cols`` of its box.
+    of the window, those on the plane.
     """
+    first, cols = points.first, points.shape[1]
     for c in range(len(centres)):
         planes[c] = np.nan
         share[c] = 0.0
@@ -181,9 +169,9 @@ def _fit_planes(
         for y in range(j - HALF, j + HALF + 1):
             for k in range(first[y * cols + i - HALF], first[y * cols + i + HALF + 1]):
                 seen += 1
-                if seen % every == 0 and firm[k]:
-                    u[n], v[n] = (col[k] - i) / HALF, (row[k] - j) / HALF
-                    h[n] = height[k]
+                if seen % every == 0 and points.firm[k]:
+                    u[n], v[n] = (points.col[k] - i) / HALF, (points.row[k] - j) / HALF
+                    h[n] = points.height[k]
                     n += 1
         if n < MIN_POINTS:
             continue
@@ -224,23 +212,16 @@ def _near(marked: Bools, j: int, i: int, radius: float) -> bool:
 
 
 @inner
-def _above(
-    col: Floats, row: Floats, height: Floats, plane: Floats, centre: Integers, k: int
-) -> float:
+def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float:
     """Height m of a point above a plane."""
-    return height[k] - plane[0] - plane[1] * (col[k] - centre[0]) - plane[2] * (row[k] - centre[1])
+    col, row = points.col[k] - centre[0], points.row[k] - centre[1]
+    return points.height[k] - plane[0] - plane[1] * col - plane[2] * row
 
 
 @kernel
 def _clear_pixels(
-    col: Floats,
-    row: Floats,
-    height: Floats,
-    firm: Bools,
-    first: Integers,
-    shape: tuple[int, int],
+    points: SitePoints,
     heights: tuple[float, float],
-    parallax: Floats,
     centre: Integers,
     plane: Floats,
     clear: Bools,
@@ -250,14 +231,16 @@ def _clear_pixels(
     A point off the plane, by height or because it is not firm, is seen at its own pixel in the left
     image, and in the right image displaced by its parallax; both places, what lies between them and
     a guard around all are not clear. Neither is a pixel without points of the plane nearby.
-    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights``: lowest and highest point, m.
+    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights`` of the lowest and the
+    highest point, m.
     """
+    first, (rows, cols) = points.first, points.shape
+    parallax = points.parallax
     limit = max(OFF_SIGMAS * plane[3], OFF_M)
-    rows, cols = shape
     on = 0
     for y in range(centre[1] - HALF, centre[1] + HALF + 1):
         for k in range(first[y * cols + centre[0] - HALF], first[y * cols + centre[0] + HALF + 1]):
-            on += firm[k] and abs(_above(col, row, height, plane, centre, k)) <= limit
+            on += points.firm[k] and abs(_above(points, plane, centre, k)) <= limit
     spacing = SIDE / np.sqrt(max(on, 1))
     guard, hole = GUARD_PX + spacing, HOLE_SPACINGS * spacing + 1.0
     margin = int(max(guard, hole)) + 1
@@ -273,9 +256,10 @@ def _clear_pixels(
     for y in range(max(centre[1] - reach, 0), min(centre[1] + reach + 1, rows)):
         start = first[y * cols + max(centre[0] - reach, 0)]
         for k in range(start, first[y * cols + min(centre[0] + reach + 1, cols)]):
-            above = _above(col, row, height, plane, centre, k)
-            x, v = col[k] - centre[0] + middle, row[k] - centre[1] + middle
-            if firm[k] and abs(above) <= limit:
+            above = _above(points, plane, centre, k)
+            x = points.col[k] - centre[0] + middle
+            v = points.row[k] - centre[1] + middle
+            if points.firm[k] and abs(above) <= limit:
                 _mark(held, x, v)
                 continue
             steps = int(abs(above) * length / 1.5) + 1

@@ -122,7 +122,9 @@ class Geometry:
         where = np.rint(exact)
         height = places.height + np.sum((where - exact) * places.slope, axis=1)
         at, carry = _carry(left, right, where, height, places.slope)
-        ends = [right.project(*left.localize(*where.T, height + z), height + z) for z in (-5.0, 5.0)]
+        ends = [
+            right.project(*left.localize(*where.T, height + z), height + z) for z in (-5.0, 5.0)
+        ]
         moved = np.stack(ends[1], axis=-1) - np.stack(ends[0], axis=-1)
         known = np.isfinite(carry).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
         along = np.zeros_like(moved)

@@ -148,16 +148,14 @@ def _smaller_eigenvalue(xx: Floats, xy: Floats, yy: Floats) -> Floats:
 
 
 def _window_sums(values: Floats) -> Floats:
-    return cv2.boxFilter(
-        values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
+    return cv2.boxFilter(values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def _candidates(told: tuple[Floats, Floats, Floats], share: Floats, at: NDArray[np.int64]) -> list:
     """For each of PER_SIDE² parts of a site, indices [≤ TRIED] of the most promising windows.
 
-    By what their pixels tell, and by the share of the points that lie on the plane. ``share`` [k, k]
-    of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
+    By what their pixels tell, and by the share of the points that lie on the plane. ``share``
+    [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
     """
     score = np.maximum(_smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in told)), 0.0)
     score = score[np.ix_(at, at)] * share**4
@@ -193,9 +191,7 @@ def _query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | No
     )
     middle = (low + high) / 2
     ground = [left.localize(col0 + corner_cols, row0 + corner_rows, z) for z in (low, high)]
-    at_right = right.project(
-        *left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle
-    )
+    at_right = right.project(*left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle)
     ground += [right.localize(*at_right, z) for z in (low, high)]
     ground = np.hstack([np.stack(g) for g in ground])
     if not np.isfinite(ground).all():
@@ -269,7 +265,9 @@ def find_places(
         if pair is not None and len(pair[0]):
             where, planes, clear = pair
             lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
-            found.append((np.full(len(where), number), lon, lat, planes[:, 0], planes[:, 1:], clear))
+            found.append(
+                (np.full(len(where), number), lon, lat, planes[:, 0], planes[:, 1:], clear)
+            )
     if not found:
         empty = np.empty(0)
         none = np.empty((0, SIDE, SIDE), bool)
