@@ -270,6 +270,31 @@ def estimate(
     )
 
 
+def agreement_of_halves(
+    design: Floats,
+    observed: Floats,
+    own: Floats,
+    sites: NDArray[np.int64],
+    prior: Floats,
+    at: Floats,
+) -> tuple[float, float]:
+    """Mean misfit of one half of the sites, in deviations: as they came, and by the other half.
+
+    A misfit counts TUKEY deviations at most, so that blunders say nothing. Arguments as in
+    :func:`estimate`.
+    """
+    halves = np.unique(sites, return_inverse=True)[1] % 2
+    before, after = 0.0, 0.0
+    for half in (0, 1):
+        told, asked = halves != half, halves == half
+        found = estimate(design[told], observed[told], own[told], sites[told], prior, at[told])
+        scale = np.hypot(own[asked], MATCHING)[:, None] * found.ratio
+        left = observed[asked] - design[asked] @ found.parameters
+        before += float(np.minimum(np.hypot(*(observed[asked] / scale).T), TUKEY).sum())
+        after += float(np.minimum(np.hypot(*(left / scale).T), TUKEY).sum())
+    return before / len(observed), after / len(observed)
+
+
 def linearised_at(
     alignment: Alignment, model: EpipolarModel, ties: TiePoints | Geometry
 ) -> tuple[Floats, Floats]:

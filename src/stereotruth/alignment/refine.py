@@ -34,6 +34,7 @@ from ..lidar.point_store import PointStore, open_stores
 from .adjustment import (
     Estimate,
     Observations,
+    agreement_of_halves,
     epipolar_model,
     estimate,
     linearised_at,
@@ -68,7 +69,6 @@ ROUNDS = 5
 SETTLED = 0.01  # px, change of a round after which no other follows
 MOVED = 3.0  # px in the left image after which places are looked for anew
 MIN_PLACES, MIN_SITES = 30, 8
-COMMON = 0.005  # px that all tie points share and no residual shows: rms over simulated scenes
 LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
 MIN_USED = 0.5
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
@@ -157,8 +157,8 @@ def _search(
     sources: tuple[Source, Source],
     stores: Sequence[PointStore],
     prior: Floats,
-) -> tuple[Observations, Estimate, Alignment] | str:
-    """Tie points, estimate and refined alignment; or why there is none."""
+) -> tuple[Observations, Estimate, Alignment, tuple[float, float]] | str:
+    """Tie points, estimate, refined alignment and :func:`agreement_of_halves`; or why not."""
     sizes = sources[0].size, sources[1].size
     parameters = np.zeros(12)
     places, found_at = None, parameters
@@ -196,7 +196,13 @@ def _search(
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
         found = estimate(
-            design, observed + design @ parameters, ties.sigma, ties.site, prior, ties.left, COMMON
+            design,
+            observed + design @ parameters,
+            ties.sigma,
+            ties.site,
+            prior,
+            ties.left,
+            places.guard.common_px,
         )
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
@@ -219,7 +225,11 @@ def _search(
             f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
             "blunders): LiDAR and images do not show the same ground, or not at the same height"
         )
-    return observations, found, current
+    halves = agreement_of_halves(
+        design, observations.before, ties.sigma, ties.site, prior, ties.left
+    )
+    log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
+    return observations, found, current, halves
 
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
@@ -312,16 +322,27 @@ def refine(
             replace(alignment, warnings=warnings, refinement=record, provenance=record_of),
             None,
         )
-    observations, found, refined = result
-    insignificant = _chance(found) > SIGNIFICANT
-    reason = "the tie points do not contradict the alignment" if insignificant else ""
+    observations, found, refined, (before, after) = result
+    reason = ""
+    if _chance(found) > SIGNIFICANT:
+        reason = "the tie points do not contradict the alignment"
+    elif after >= before and gcps:
+        reason = (
+            "the tie points of one half of the scene fit the other half's less well than the "
+            f"control points do ({after:.2f} deviations, {before:.2f} before)"
+        )
+        doubts.append(f"not refined: {reason}")
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
-    if insignificant:  # what is not applied adds to the uncertainty
+    record["misfit_of_one_half_by_the_other"] = {
+        "before": round(before, 3),
+        "after": round(after, 3),
+    }
+    if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
         observations = replace(observations, after=observations.before)

@@ -27,10 +27,24 @@ MOST_POINTS = 240  # of a window, that a plane is fitted to
 SPREAD = 0.35  # of an even distribution's variance: less, and the points do not fix the plane
 OFF_SIGMAS = 4.0  # of the points about the plane: farther, and a point lies off it
 OFF_M = 0.1  # m, at least
-GUARD_PX = 2.5  # px around what stands off the plane: the optics' blur and the interpolation
 HOLE_SPACINGS = 2.0  # of the points: pixels farther from the plane's points may show anything
 ROUNDS = 5  # of each of the two robust fits of a plane
 NEAREST_M = 0.03  # m: points nearer to a plane do not count for more
+
+
+class Guard(NamedTuple):
+    """How far pixels stay from what stands off a plane: ``px`` plus ``spacings`` of the points.
+
+    The optics' blur and the interpolation reach that far, and so does what the points leave open.
+    ``common_px``: what matches behind such a guard have in common, rms over simulated scenes.
+    """
+
+    px: float
+    spacings: float
+    common_px: float
+
+
+GUARDS = (Guard(2.5, 1.0, 0.005), Guard(1.8, 0.75, 0.012), Guard(1.2, 0.5, 0.05))
 
 
 class SitePoints(NamedTuple):
@@ -77,11 +91,11 @@ class SitePoints(NamedTuple):
         _fit_planes(self, centres, planes, share)
         return planes, share
 
-    def clear_pixels(self, centre: Integers, plane: Floats) -> Bools:
+    def clear_pixels(self, centre: Integers, plane: Floats, guard: Guard) -> Bools:
         """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
         clear = np.empty((SIDE, SIDE), bool)
         heights = float(self.height.min()), float(self.height.max())
-        _clear_pixels(self, heights, centre, plane, clear)
+        _clear_pixels(self, heights, guard, centre, plane, clear)
         return clear
 
 
@@ -222,6 +236,7 @@ def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float
 def _clear_pixels(
     points: SitePoints,
     heights: tuple[float, float],
+    guard: Guard,
     centre: Integers,
     plane: Floats,
     clear: Bools,
@@ -232,7 +247,7 @@ def _clear_pixels(
     image, and in the right image displaced by its parallax; both places, what lies between them and
     a guard around all are not clear. Neither is a pixel without points of the plane nearby.
     ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights`` of the lowest and the
-    highest point, m.
+    highest point, m; ``guard``: one of GUARDS.
     """
     first, (rows, cols) = points.first, points.shape
     parallax = points.parallax
@@ -242,8 +257,8 @@ def _clear_pixels(
         for k in range(first[y * cols + centre[0] - HALF], first[y * cols + centre[0] + HALF + 1]):
             on += points.firm[k] and abs(_above(points, plane, centre, k)) <= limit
     spacing = SIDE / np.sqrt(max(on, 1))
-    guard, hole = GUARD_PX + spacing, HOLE_SPACINGS * spacing + 1.0
-    margin = int(max(guard, hole)) + 1
+    away, hole = guard.px + guard.spacings * spacing, HOLE_SPACINGS * spacing + 1.0
+    margin = int(max(away, hole)) + 1
     wide = SIDE + 2 * margin
     off, held = np.zeros((wide, wide), np.bool_), np.zeros((wide, wide), np.bool_)
     middle = HALF + margin
@@ -268,5 +283,5 @@ def _clear_pixels(
                 _mark(off, x + t * parallax[0], v + t * parallax[1])
     for j in range(SIDE):
         for i in range(SIDE):
-            near_off = _near(off, j + margin, i + margin, guard)
+            near_off = _near(off, j + margin, i + margin, away)
             clear[j, i] = not near_off and _near(held, j + margin, i + margin, hole)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..epipolar.image_reader import Source
 from ..epipolar.rpc import SensorModel
 from ..lidar.point_store import PointStore, query_points
-from .tie_planes import HALF, MIN_POINTS, SIDE, SitePoints
+from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,6 +30,7 @@ MARGIN = 24  # px around a site whose points are looked at
 TRIED = 24  # windows of each part of a site that are looked at pixel by pixel
 MIN_CLEAR = 90  # pixels of a window, a fifth
 MIN_TOLD = 12.0  # smaller eigenvalue of what they tell, in pixels of the usual slope
+ENOUGH = 120  # places of a scene
 VEGETATION = (3, 4, 5)  # ASPRS classes
 
 
@@ -38,7 +39,7 @@ class Places:
     """n places on smooth textured ground: ``site`` int[n], ``lon``, ``lat`` degrees, ``height`` m.
 
     ``slope`` [n, 2]: change of the plane's height along col and row of the left image, m/px;
-    ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone.
+    ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone, by ``guard``.
     """
 
     site: NDArray[np.int64]
@@ -47,6 +48,7 @@ class Places:
     height: Floats
     slope: Floats
     clear: Bools
+    guard: Guard
 
     def __len__(self) -> int:
         return self.site.size
@@ -205,6 +207,7 @@ def _places_of(
     source: Source,
     stores: Sequence[PointStore],
     site: Site,
+    guard: Guard,
 ) -> tuple[Floats, Floats, Bools] | None:
     """The places of a site: (col, row) px of the left image [n, 2], planes [n, 3], clear pixels."""
     col0, row0 = site[:2]
@@ -235,7 +238,7 @@ def _places_of(
     for candidates in _candidates(told, share.reshape(len(at), len(at)), at):
         scored = []
         for k in candidates:
-            pixels = cloud.clear_pixels(centres[k], planes[k])
+            pixels = cloud.clear_pixels(centres[k], planes[k], guard)
             i, j = centres[k] - MARGIN
             own = [t[j - HALF : j + HALF + 1, i - HALF : i + HALF + 1] for t in told]
             pixels &= np.isfinite(own[0])
@@ -258,18 +261,24 @@ def find_places(
     stores: Sequence[PointStore],
     sites: Sequence[Site],
 ) -> Places:
-    """The best places of every site, seen by the left image (``source``); memory for one site."""
-    found = []
-    for number, site in enumerate(sites):
-        pair = _places_of(left, right, source, stores, site)
-        if pair is not None and len(pair[0]):
-            where, planes, clear = pair
-            lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
-            found.append(
-                (np.full(len(where), number), lon, lat, planes[:, 0], planes[:, 1:], clear)
-            )
+    """The best places of every site, seen by the left image (``source``); memory for one site.
+
+    With a wide guard around all that stands off their planes; where that leaves too few places
+    (crowns in rows, dense woods), with the narrower ones.
+    """
+    for guard in GUARDS:
+        found = []
+        for number, site in enumerate(sites):
+            there = _places_of(left, right, source, stores, site, guard)
+            if there is not None:
+                where, planes, clear = there
+                lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
+                number_of = np.full(len(where), number)
+                found.append((number_of, lon, lat, planes[:, 0], planes[:, 1:], clear))
+        if sum(len(part[0]) for part in found) >= ENOUGH:
+            break
     if not found:
         empty = np.empty(0)
         none = np.empty((0, SIDE, SIDE), bool)
-        return Places(np.empty(0, np.int64), empty, empty, empty, np.empty((0, 2)), none)
-    return Places(*(np.concatenate(parts) for parts in zip(*found)))
+        return Places(np.empty(0, np.int64), empty, empty, empty, np.empty((0, 2)), none, guard)
+    return Places(*(np.concatenate(parts) for parts in zip(*found)), guard)
