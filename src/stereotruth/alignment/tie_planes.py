@@ -80,7 +80,7 @@ class SitePoints(NamedTuple):
         inside = (col > -0.5) & (col < cols - 0.5) & (row > -0.5) & (row < rows - 0.5)
         col, row, height, firm = (values[inside] for values in (col, row, height, firm))
         pixel = np.rint(row).astype(np.int64) * cols + np.rint(col).astype(np.int64)
-        order = np.argsort(pixel, kind="stable")
+        order = np.lexsort((height, pixel))  # whatever the order of files
         first = np.zeros(rows * cols + 1, np.int64)
         np.cumsum(np.bincount(pixel, minlength=rows * cols), out=first[1:])
         return cls(col[order], row[order], height[order], firm[order], first, shape, parallax)
