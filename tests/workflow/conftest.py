@@ -60,6 +60,7 @@ SETTINGS = {
         },
         "split": None,
         "bootstrap": 100,
+        "panels": 1,  # a second of matplotlib each
     },
     "predict": {"block_px": 256, "overlap_px": 32},
 }

@@ -40,5 +40,5 @@ def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
 
 
 def test_an_unknown_dataset_is_named(tiled):
-    run = tiled.snakemake("audit/nothing", *ARGUMENTS)
-    assert run.status != 0 and "no dataset 'nothing'" in run.text
+    run = tiled.refuse("audit/nothing", *ARGUMENTS)
+    assert "no dataset 'nothing'" in run.text
