@@ -15,6 +15,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 OF_ONE_CITY = {"audit", "benchmark", "disturbed", "end_to_end", "predict", "report", "restart"}
 
 
+def shares_the_city(file: PurePosixPath) -> bool:
+    """Whether a test file is one of OF_ONE_CITY."""
+    return file.parent.name == "workflow" and file.stem.removeprefix("test_") in OF_ONE_CITY
+
+
+def pytest_collection_modifyitems(items):
+    """Whole runs first, so that no process is left with them when the others have ended."""
+
+    def place(item: pytest.Item) -> int:
+        file = PurePosixPath(item.nodeid.partition("::")[0])
+        return 0 if shares_the_city(file) else 1 if file.parent.name == "workflow" else 2
+
+    items.sort(key=place)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """Each file's tests by one process, and those of OF_ONE_CITY too: fixtures are made once.
@@ -27,8 +42,7 @@ def pytest_xdist_make_scheduler(config, log):
     class ByFixtures(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = PurePosixPath(nodeid.partition("::")[0])
-            name = file.stem.removeprefix("test_")
-            shared = file.parent.name == "workflow" and name in OF_ONE_CITY
-            return "one city" if shared else str(file)
+            return "one city" if shares_the_city(file) else str(file)
 
+    config.option.loadscopereorder = False  # by the number of tests
     return ByFixtures(config, log)

@@ -82,7 +82,8 @@ def later(tiled, tmp_path_factory) -> Project:
     project = tiled.copy(tmp_path_factory.mktemp("later") / "project")
     run = project.snakemake(
         *("dataset", "report", "audit/synthetic", "benchmark/synthetic/sgm"),
-        *("results/predict/Tiny/Tiny-1/sgm_dsm.tif", "score_dsm/Tiny/Tiny-1/sgm"),
+        *("submission/synthetic/sgm", "results/predict/Tiny/Tiny-1/sgm_dsm.tif"),
+        *("score_dsm/Tiny/Tiny-1/sgm", "verify"),
         *("--configfile", "tiny.yaml", "later.yaml"),
     )
     assert run.status == 0, run.text[-4000:]

@@ -49,9 +49,6 @@ def test_a_threshold_or_the_seed_scores_again_but_matches_nothing(later, tmp_pat
 def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     """The results in the folder are SGM's as they are submitted, so that scores are the same."""
     scored = later.copy(tmp_path / "scored")
-    packed = scored.snakemake("submission/synthetic/sgm", *ARGUMENTS)
-    assert packed.status == 0, packed.text[-4000:]
-    assert packed.jobs == {"submission": 1}
     submission = scored.folder / "submission/synthetic/sgm"
     assert (submission / "submission.json").is_file()
     shutil.copytree(submission, scored.folder / "theirs", dirs_exist_ok=True)
