@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import pickle
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import IO, Any
 from uuid import uuid4
 
 import numba
@@ -22,6 +24,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).parent
+LONGEST_S = 120.0  # that another process is waited for: one whose compilation has failed holds on
 
 
 class KernelCache:
@@ -29,12 +32,14 @@ class KernelCache:
 
     The name of a file holds a digest of all that its code follows from, see :func:`content`. So
     nothing is ever out of date: an edit of a kernel, or of a function of another file that it
-    calls, has another name; an edit of anything else compiles nothing.
+    calls, has another name; an edit of anything else compiles nothing. Of processes that need the
+    same kernel at the same time one compiles it, and the others wait.
     """
 
     def __init__(self, function: FunctionType, options: str) -> None:
         """``options`` of the compiler: others give other code."""
         self.function = function
+        self.claims: dict[Path, IO[bytes]] = {}
         self.compiler = (numba.__version__, sys.implementation.cache_tag, options)
 
     @property
@@ -49,27 +54,56 @@ class KernelCache:
         run's jobs. What is compiled needs the runtime only.
         """
         rtsys.initialize(target)
-        try:
-            parts = pickle.loads(self._file(types, target.codegen()).read_bytes())
-        except (OSError, EOFError, pickle.UnpicklingError):  # absent, or cut by a crash
+        file = self._file(types, target.codegen())
+        parts = _read(file)
+        if parts is None:
+            self._claim(file)
+            parts = _read(file)
+        if parts is None:
             return None
+        self._release(file)
         return CompileResult._rebuild(target, *parts)
 
     def save_overload(self, types: tuple, compiled: CompileResult) -> None:
         """Keep a compiled kernel, if the folder can be written to and is not full."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # holds addresses
-            return
         file = self._file(types, compiled.codegen)
-        scratch = file.with_suffix(f".{uuid4().hex}")
+        holds_addresses = compiled.lifted or compiled.library.has_dynamic_globals
+        if not holds_addresses:
+            scratch = file.with_suffix(f".{uuid4().hex}")
+            with suppress(OSError):
+                scratch.write_bytes(dumps(compiled._reduce()))
+                scratch.replace(file)
+        self._release(file)
+
+    def _claim(self, file: Path) -> None:
+        """Return when no other process compiles this, or after LONGEST_S."""
+        end = time.monotonic() + LONGEST_S
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            scratch.write_bytes(dumps(compiled._reduce()))
-            scratch.replace(file)
+            lock = self.claims.setdefault(file, file.with_suffix(".lock").open("ab"))
+            while time.monotonic() < end:
+                try:
+                    return fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    time.sleep(0.05)
+
+    def _release(self, file: Path) -> None:
+        if lock := self.claims.pop(file, None):
+            lock.close()
+            file.with_suffix(".lock").unlink(missing_ok=True)
 
     def _file(self, types: tuple, target: Any) -> Path:
         parts = (self.compiler, target.magic_tuple(), content(self.function), *_arguments(types))
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         return folder() / f"{name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.bin"
+
+
+def _read(file: Path) -> tuple | None:
+    """What a compiled kernel is made again from; None if it is absent, or cut by a crash."""
+    try:
+        return pickle.loads(file.read_bytes())
+    except (OSError, EOFError, pickle.UnpicklingError):
+        return None
 
 
 def content(function: FunctionType) -> str:

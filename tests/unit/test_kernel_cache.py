@@ -141,6 +141,20 @@ def test_an_edit_of_what_a_kernel_calls_compiles_it_and_another_edit_does_not(tm
     assert run() == ["18.0", "True"]
 
 
+def test_of_two_processes_one_compiles(tmp_path) -> None:
+    for name, text in {**after(), "main": MAIN}.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "compiled")}
+    call = [sys.executable, "main.py"]
+    both = [
+        subprocess.Popen(call, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [process.communicate()[0].split() for process in both]
+    assert sorted(said) == [["18.0", "False"], ["18.0", "True"]]
+    assert [*(tmp_path / "compiled").glob("*.lock")] == []
+
+
 @pytest.mark.parametrize("home", ["none", "read-only", "writable"])
 def test_compiled_code_has_a_place_without_a_home_and_with_a_read_only_package(
     tmp_path, monkeypatch, home
