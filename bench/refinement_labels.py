@@ -152,7 +152,7 @@ def asked_of_labels(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     found = [["hidden pixels labelled, %, worst scene", "≤ 0.8", f"{np.nanmax(hidden):.2f}"]]
     for density, limit in ((4.0, 75), (1.0, 50)):
         of = [row["labels"]["crowns"] for row in rows if row["draw"]["density"] == density]
-        if of:
+        if np.isfinite(of).any():
             name = f"visible crown pixels with a label at {density:g} points/m², %, mean"
             found.append([name, f"≥ {limit}", f"{np.nanmean(of):.0f}"])
     for group in ("by status", "by slope"):

@@ -18,11 +18,14 @@ from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import whole_folder
+from stereotruth.products.provenance import source_digest
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files
 from stereotruth.simulate.control_points import simulate_points
@@ -114,7 +117,9 @@ def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], fol
     rectify_by(alignment, images, folder)
 
 
-def rectify_by(alignment: Alignment, images: Sequence[Path], folder: Path) -> None:
+def rectify_by(
+    alignment: Alignment, images: Sequence[Path], folder: Path, *, workers: int = 1
+) -> None:
     """Rectify a pair: ``alignment.json``, ``epipolar.json``, ``left.zarr``, ``right.zarr``."""
     alignment.save(folder / "alignment.json")
     model = epipolar_model(alignment)
@@ -124,8 +129,29 @@ def rectify_by(alignment: Alignment, images: Sequence[Path], folder: Path) -> No
             model,
             folder / "epipolar.json",
             *(folder / f"{view}.zarr" for view in VIEWS),
-            workers=1,
+            workers=workers,
         )
+
+
+def label_by(
+    alignment: Alignment,
+    images: Sequence[Path],
+    stores: Sequence[Path],
+    folder: Path,
+    settings: Settings,
+    *,
+    workers: int = 1,
+) -> Path:
+    """Rectify a pair by an alignment into a folder and label it: its ``disparity.zarr``."""
+    rectify_by(alignment, images, folder, workers=workers)
+    made = folder / "disparity.zarr"
+    rectified = (folder / f"{view}.zarr" for view in VIEWS)
+    code = source_digest("disparity.project")
+    project_scene(
+        *rectified, stores, made, settings, alignment=folder / "alignment.json", workers=workers,
+        code=code,
+    )  # fmt: skip
+    return made
 
 
 CONDITIONS = {

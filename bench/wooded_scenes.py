@@ -186,6 +186,10 @@ class Scene:
         """Point stores, by the name that a :class:`synthetic_pairs.Pair` has for them."""
         return self.stores
 
+    def alignment(self, rectified: Path) -> Path:
+        """The alignment that the pair was rectified with into a folder."""
+        return rectified / "alignment.json"
+
     @cached_property
     def crown_share(self) -> float:
         """Share of the left image that shows crowns."""
