@@ -8,6 +8,7 @@ the reference table from them.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -20,6 +21,7 @@ from pydantic import (
     StrictFloat,
     StrictInt,
     StrictStr,
+    StringConstraints,
     ValidationError,
 )
 from pydantic.dataclasses import dataclass as validated
@@ -33,6 +35,8 @@ Whole = StrictInt
 Number = StrictInt | StrictFloat  # a whole one stays whole, in records too
 Flag = StrictBool
 Text = StrictStr
+LONGEST_NAME = 100  # characters; a file's name has 255 bytes, with what is added to it
+REPEATED = re.compile(r"(.+)\1{18}$")  # once more, and Snakemake takes it for an endless recursion
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,19 @@ def each_once(values: Values) -> Values:
     if len(set(values)) < len(values):
         raise ValueError("has a value twice")
     return values
+
+
+def not_repeated(value: str) -> str:
+    """The name; ValueError if it ends with the same characters again and again."""
+    if REPEATED.search(value):
+        raise ValueError("ends with the same characters again and again")
+    return value
+
+
+def name_of(characters: str) -> Any:
+    """The type of names that paths are made of: so many of the ``characters`` (of a pattern)."""
+    limits = StringConstraints(pattern=f"^[{characters}]+$", max_length=LONGEST_NAME)
+    return Annotated[Text, limits, AfterValidator(not_repeated)]
 
 
 Odd = Annotated[Whole, AfterValidator(is_odd)]

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from .errors import InputError
-from .settings import Text, Whole, settings
+from .settings import LONGEST_NAME, REPEATED, Text, Whole, name_of, settings
 from .settings_text import check
 
 LIDAR_SUFFIXES = (".las", ".laz")
@@ -33,10 +33,10 @@ Given = Annotated[Text, StringConstraints(min_length=1)]
 class City:
     """One row of the cities sheet; the counts are those of the paper's table 3."""
 
-    city: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    city: name_of("A-Za-z0-9_-")
     """name of letters, digits, `-` and `_`; its tiles go to `tiles/<city>/`"""
 
-    prefix: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9]+$")]
+    prefix: name_of("A-Za-z0-9")
     """what its tile names begin with (SG, KM, YD, QC, WH, HY …), of letters and digits"""
 
     training: Count
@@ -54,7 +54,7 @@ class City:
 class Scene:
     """One row of the scenes sheet: a stereo pair, its LiDAR and its ground control points."""
 
-    scene: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9-]+$")]
+    scene: name_of("A-Za-z0-9-")
     """unique id of letters, digits and `-`"""
 
     city: Given
@@ -239,7 +239,10 @@ def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
 
 
 def store_names(files: Iterable[Path]) -> dict[str, Path]:
-    """A unique name for each LiDAR file: its stem, with a hash of its path if two share it."""
+    """A unique name for each LiDAR file: its stem, with a hash of its path if two share it.
+
+    Stems that are too long for a name, or repeat themselves, are cut short and get the hash too.
+    """
 
     def stem(file: Path) -> str:
         name = re.sub(r"(\.copc)?\.(las|laz)$", "", file.name, flags=re.IGNORECASE)
@@ -249,8 +252,10 @@ def store_names(files: Iterable[Path]) -> dict[str, Path]:
     shared = {name for name, n in Counter(map(stem, files)).items() if n > 1}
 
     def unique(file: Path) -> str:
-        if stem(file) not in shared:
-            return stem(file)
-        return f"{stem(file)}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+        name = stem(file)
+        if name not in shared and len(name) <= LONGEST_NAME and not REPEATED.search(name):
+            return name
+        mark = hashlib.sha256(str(file).encode("utf-8", "surrogateescape")).hexdigest()[:8]
+        return f"{name[: LONGEST_NAME - 9]}-{mark}"
 
     return {unique(file): file for file in files}
