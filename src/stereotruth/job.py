@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
+from .errors import InputError, without_secrets
 
 log = logging.getLogger("stereotruth")
 # New objects before garbage is collected: compiling kernels makes many that stay, and walking
@@ -41,8 +41,8 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
-    terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
-    file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
+    terminal.setFormatter(_Discreet(f"{name}: %(message)s"))
+    file.setFormatter(_Discreet(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     handlers = (terminal, file)
     for handler in handlers:
         log.addHandler(handler)
@@ -68,6 +68,13 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
         for handler in handlers:
             log.removeHandler(handler)
             handler.close()
+
+
+class _Discreet(logging.Formatter):
+    """Lines, tracebacks too, whose URLs have no secrets."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return without_secrets(super().format(record))
 
 
 def _keep_memory() -> None:
