@@ -19,14 +19,23 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from .errors import InputError
-from .settings import LONGEST_NAME, REPEATED, Text, Whole, name_of, settings
+from .settings import (
+    LONGEST_NAME,
+    PATTERN,
+    REPEATED,
+    FilePath,
+    Text,
+    Whole,
+    name_of,
+    settings,
+)
 from .settings_text import check
 
 LIDAR_SUFFIXES = (".las", ".laz")
 
 
 Count = Annotated[Whole, Field(ge=0)]
-Given = Annotated[Text, StringConstraints(min_length=1)]
+Given = Annotated[FilePath, StringConstraints(min_length=1)]
 
 
 @settings
@@ -75,23 +84,23 @@ class Scene:
     lidar_crs: Text
     """EPSG code or WKT (compound allowed) for files that carry none; else empty"""
 
-    geoid: Text
+    geoid: FilePath
     """geoid grid (GTX or GeoTIFF), m, where the LiDAR's heights are orthometric; else empty:
     heights are ellipsoidal"""
 
-    gcps: Text
+    gcps: FilePath
     """CSV of ground control points, see below; empty without any, if `alignment.refine` is true:
     the refinement then starts from the RPCs alone (10 px standard deviation is assumed, 3e-4 of
     scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
     images lie on the LiDAR: the attribute `alignment_sigma` of `left.zarr` says how well"""
 
-    left_mask: Text = ""
+    left_mask: FilePath = ""
     """optional column: a raster on the left image's grid, not zero where the image is not to be
     used (cloud, water, anything): no labels, no tie points, no correlation there; the pixels have
     the status `masked` (11), as have those that the image's own mask or alpha band hides. The tile
     shows them all the same, but for the image's own mask"""
 
-    right_mask: Text = ""
+    right_mask: FilePath = ""
     """likewise, of the right image"""
 
 
@@ -225,6 +234,12 @@ def lidar_files(pattern: str) -> list[Path]:
         raise InputError(
             f"no LiDAR file at {pattern!r}",
             remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
+        )
+    if patterns := [file for file in found if PATTERN.search(str(file))]:
+        raise InputError(
+            "has a name in { }, which stands for something else in the workflow",
+            file=patterns[0],
+            remedy="rename it",
         )
     return sorted(found)
 
