@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 URL = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]*:/+)([^\s'\"<>]+)")
@@ -44,3 +48,59 @@ def _name(file: str) -> str:
     """A file or URL as messages call it; a URL may hold blanks."""
     scheme, slashes, rest = re.split(r"(:/+)", file, maxsplit=1) if ":/" in file else (file, "", "")
     return scheme + slashes + _shown(rest) if slashes else file
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+GONE = (errno.ENOENT, errno.ENOTDIR)
+SYSTEM = {
+    FULL: (
+        "no space left on the disk",
+        "make space there (also for new files: df -i), and run again: what is done is kept",
+    ),
+    REFUSED: ("no permission", "get the right to it (ls -l), and run again"),
+    GONE: (
+        "no such file: it was there, and was taken away",
+        "put it back, or run again: what is missing of the products is made again",
+    ),
+}
+
+
+def told_by_system(error: BaseException | None) -> InputError | None:
+    """What the operating system refuses, in words, if that is behind an exception.
+
+    A full disk, no permission, a file that is gone; also where a library tells it by its text only.
+    """
+    while error is not None:
+        if isinstance(error, BaseExceptionGroup):
+            return next(filter(None, map(told_by_system, error.exceptions)), None)
+        if isinstance(error, OSError) and (numbers := _refusal(error)):
+            place = error.filename or (Path.cwd() if numbers is FULL else error)
+            problem, remedy = SYSTEM[numbers]
+            return InputError(problem, file=place, remedy=remedy)
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _refusal(error: OSError) -> tuple[int, ...]:
+    """Which key of SYSTEM an error belongs to; empty for none."""
+    if error.errno is None:  # of a library
+        kinds = {FileNotFoundError: GONE, PermissionError: REFUSED}
+        for kind, numbers in kinds.items():
+            if isinstance(error, kind):
+                return numbers
+        said = {n: numbers for numbers in SYSTEM for n in numbers if os.strerror(n) in str(error)}
+        return next(iter(said.values()), ())
+    found = next((numbers for numbers in SYSTEM if error.errno in numbers), ())
+    return found if error.filename or found is FULL else ()
+
+
+@contextmanager
+def in_words() -> Iterator[None]:
+    """In the block, or the function that it decorates, such an error becomes an InputError."""
+    try:
+        yield
+    except OSError as error:
+        if (told := told_by_system(error)) is None:
+            raise
+        raise told from None

@@ -12,7 +12,7 @@ import yaml
 
 from . import sheets
 from .configuration import Configuration
-from .errors import InputError
+from .errors import InputError, in_words
 from .products.remote_files import (
     FOLDER,
     bring_files,
@@ -140,6 +140,7 @@ def sheet(settings: Configuration, name: str) -> str:
     return here_or_shipped(path) if path == getattr(Configuration, name) else path
 
 
+@in_words()
 def read_scenes(
     settings: Configuration, *, ask: bool = True
 ) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene]]:
@@ -176,6 +177,7 @@ def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
     return replace(scene, **found)
 
 
+@in_words()
 def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
     """The LiDAR files of a scene by the names of their stores, after its files were found.
 
@@ -197,6 +199,7 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
     return sheets.store_names(sheets.find_lidar(scene, rows))
 
 
+@in_words()
 def check_fixed(settings: Configuration, scenes: Mapping[str, sheets.Scene]) -> None:
     """Raise InputError if alignment.fixed names a scene or a file that does not exist."""
     for name, file in settings.alignment.fixed.items():

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from rasterio.errors import RasterioIOError
 
-from stereotruth.errors import InputError, without_secrets
+from stereotruth.errors import InputError, in_words, told_by_system, without_secrets
 
 SECRET = "hunter2"
 
@@ -51,3 +52,39 @@ def test_secrets_without_their_url_are_not_shown(key):
 )
 def test_other_texts_stay_as_they_are(text):
     assert without_secrets(text) == text
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device", "a.zarr"), "a.zarr: no space left on the disk"),
+        (OSError(28, "No space left on device"), "no space left on the disk"),
+        (OSError(122, "Disk quota exceeded", "a"), "a: no space left"),
+        (FileNotFoundError(2, "No such file or directory", "left.zarr"), "left.zarr: no such file"),
+        (FileNotFoundError("left.zarr"), "left.zarr: no such file: it was there"),
+        (PermissionError(13, "Permission denied", "a.laz"), "a.laz: no permission"),
+        (RasterioIOError("a.tif: No such file or directory"), "a.tif: No such file"),
+        (RasterioIOError("Attempt to create a.tif failed: No space left on device"), "no space"),
+        (ExceptionGroup("of threads", [ValueError(), PermissionError(13, "x", "b")]), "b: no perm"),
+    ],
+)
+def test_what_the_system_refuses_is_one_sentence(error, words):
+    behind = RuntimeError("in a thread")
+    behind.__cause__ = error
+    for given in (error, behind):
+        told = str(told_by_system(given))
+        assert words in told and "Remedy: " in told and "\n" not in told
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), OSError(5, "Input/output error", "a"), None])
+def test_other_errors_are_defects(error):
+    assert told_by_system(error) is None
+
+
+def test_a_function_tells_in_words():
+    @in_words()
+    def read():
+        raise PermissionError(13, "Permission denied", "scenes.tsv")
+
+    with pytest.raises(InputError, match=r"scenes\.tsv: no permission"):
+        read()
