@@ -31,6 +31,8 @@ from .settings import (
 )
 from .settings_text import check
 
+MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
+MOST_BYTES = 20_000_000  # of a sheet
 LIDAR_SUFFIXES = (".las", ".laz")
 
 
@@ -109,6 +111,12 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     columns = [f.name for f in fields(sheet)]
     needed = [f.name for f in fields(sheet) if f.default is MISSING]
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{path.stat().st_size / 1e6:.0f} MB are no sheet",
+                file=path,
+                remedy=f"its columns are {', '.join(columns)}",
+            )
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(
@@ -117,7 +125,12 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     except (UnicodeDecodeError, IsADirectoryError) as error:
         raise InputError(str(error), file=path, remedy="save it as UTF-8 text") from None
     rows = csv.reader(text.splitlines(), delimiter="\t")
-    numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
+    try:
+        numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
+    except csv.Error as error:
+        raise InputError(
+            f"no sheet of text ({error})", file=path, remedy="save it as text with tabs"
+        ) from None
     numbered = [(n, row) for n, row in numbered if not row[0].startswith("#")]
     if not numbered:
         raise InputError("empty sheet", file=path, remedy=f"its columns are {', '.join(columns)}")
@@ -184,6 +197,13 @@ def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene
     path = Path(path)
     scenes = {}
     rows = _read_table(path, Scene)
+    if len(rows) > MOST_SCENES:
+        raise InputError(
+            f"{len(rows)} scenes; a project has at most {MOST_SCENES}",
+            file=path,
+            remedy="share them among several projects (their datasets can be put together), or "
+            "among several sheets that key scenes names in turn",
+        )
     for number, cells in rows:
         scene = check(cells, Scene, f"{path}, line {number}")
         if cells["city"] not in cities:

@@ -246,3 +246,14 @@ def test_lidar_files_that_snakemake_takes_for_patterns_are_refused(tmp_path):
     (tmp_path / "a{city}.laz").touch()
     with pytest.raises(InputError, match=r"name in \{ \}"):
         sheets.lidar_files(str(tmp_path))
+
+
+def test_more_scenes_than_are_planned_are_refused_by_number(tmp_path, cities):
+    rows = [with_cell("scene", f"Q-{k}") for k in range(20_000)]
+    file = write(tmp_path / "s.tsv", scenes_text(*rows))
+    with pytest.raises(InputError, match="20000 scenes; a project has at most 2000"):
+        sheets.read_scenes(file, cities)
+    with pytest.raises(InputError, match="no sheet of text"):
+        sheets.read_scenes(write(tmp_path / "s.tsv", '"' + "x" * 200_000), cities)
+    with pytest.raises(InputError, match="25 MB are no sheet"):
+        sheets.read_scenes(write(tmp_path / "s.tsv", "x" * 25_000_000), cities)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -159,7 +160,7 @@ def check(
     from .check import check_project
     from .check_table import show
 
-    if show(check_project(configfile, scenes or [])):
+    if show(check_project(configfile, scenes or [], partial(typer.echo, err=True))):
         raise typer.Exit(1)
 
 
