@@ -331,7 +331,6 @@ def refine(
             "the tie points of one half of the scene fit the other half's less well than the "
             f"control points do ({after:.2f} deviations, {before:.2f} before)"
         )
-        doubts.append(f"not refined: {reason}")
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
