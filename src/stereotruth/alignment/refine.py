@@ -7,11 +7,12 @@ heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the t
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
 settle the relative part, and the rest as far as they see it.
 
-Blunders (moved or built since, vegetation, water, repetition) get no weight (Tukey's biweight).
-Thousands of matches do not pretend thousandths of a pixel: neighbours share errors, by an amount
-that is estimated from the scatter between sites, and all share one, that is estimated from how much
-good and poor matches differ. If the tie points do not contradict the alignment, it is left exactly
-as it is.
+The adjustment starts from what most tie points agree on, and blunders (moved or built since,
+vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
+by an amount that is estimated from the scatter between sites. All share one, that is estimated
+from how much good and poor matches differ. The alignment is left exactly as it is if the tie
+points do not contradict it, or if the corrections from one half of the sites do not improve the
+other half.
 """
 
 from __future__ import annotations
