@@ -51,7 +51,7 @@ class SitePoints(NamedTuple):
     """The points of a site, sorted by the pixel of the left image in which they lie.
 
     ``col``, ``row`` px [n] from the upper-left pixel of the site's wide box, ``height`` m [n];
-    ``firm`` bool[n]: neither vegetation by its class nor one of several returns of its pulse;
+    ``firm`` bool[n]: no vegetation or water by its class, and the only return of its pulse;
     ``first`` int[rows * cols + 1]: index of the first point of each pixel; ``shape`` of the box;
     ``parallax`` [2] px/m: by how much a point is displaced in the right image against the plane
     per metre that it lies above the plane, in px of the left image.

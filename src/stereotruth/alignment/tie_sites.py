@@ -31,7 +31,7 @@ TRIED = 24  # windows of each part of a site that are looked at pixel by pixel
 MIN_CLEAR = 90  # pixels of a window, a fifth
 MIN_TOLD = 12.0  # smaller eigenvalue of what they tell, in pixels of the usual slope
 ENOUGH = 120  # places of a scene
-VEGETATION = (3, 4, 5)  # ASPRS classes
+NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +218,7 @@ def _places_of(
     if len(points) < MIN_POINTS:
         return None
     col, row = left.project(points.lon, points.lat, points.height)
-    firm = ~np.isin(points.classification, VEGETATION)
+    firm = ~np.isin(points.classification, NOT_FIRM)
     several = points.number_of_returns > 1
     if several.mean() < 0.5:  # else the pulses' returns tell nothing here
         firm &= ~several
