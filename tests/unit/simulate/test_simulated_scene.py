@@ -60,6 +60,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "",
         "errors",
         "job",
+        "kernel_cache",
         "kernels",
         "products",
         "products.files",
