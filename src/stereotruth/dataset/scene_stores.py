@@ -45,6 +45,7 @@ class SceneStores:
     height: zarr.Array
     of_right: zarr.Group | None
     surface_class: zarr.Array | None
+    uncertainty: zarr.Array | None
     gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
@@ -94,6 +95,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         height=disparity["height"],
         of_right=of_right,
         surface_class=disparity.get("surface_class"),
+        uncertainty=disparity.get("uncertainty"),
         gcp_rms=None if item.alignment is None else _gcp_rms(item.alignment),
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},

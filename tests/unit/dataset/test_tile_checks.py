@@ -30,7 +30,7 @@ from ...synthetic.tiled_scene import (
 )
 
 SIZE = 96
-LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9)
+LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9, 0.01)
 
 
 def rough(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
