@@ -36,7 +36,7 @@ MIN_CELLS = 5  # with fewer, by number or by weight, their scatter says nothing
 SIFT_SIGMA_PX = 0.02  # what SIFT is off on exact labels: bench/label_doubts.py
 STATED = 0.2  # quantile of the labels' uncertainties
 REMARK_PX = 0.1
-REACH = 4.0  # scales from the location at which a match no longer counts
+REACH = 3.0  # scales from the location at which a match no longer counts
 STEPS = 100  # of the iteration, at most
 PARALLAX = "y-parallax"
 JUDGED = (LabelSurface.OPEN_GROUND.words, LabelSurface.ROOFS.words, PARALLAX)
@@ -111,34 +111,36 @@ class Doubt:
 def location(values: Floats) -> tuple[float, Floats, float]:
     """Robust location of values with tails to one side; each one's influence; its sum's slope.
 
-    Tukey's biweight, which gives no weight to what is ``REACH`` scales away, about the half-sample
-    mode, so that the denser part is followed and not the tail. The scale is the median distance
-    from that mode, as a standard deviation. The location is where the influences add up to zero.
+    Tukey's biweight, which gives no weight to what is ``REACH`` scales away, from the half-sample
+    mode on, so that the dense part is followed and not the tail. The scale is that of a normal
+    distribution whose densest half is as wide. The influences add up to zero.
     """
     at = half_sample_mode(values)
-    scale = max(TO_SIGMA * float(np.median(np.abs(values - at))), 1e-4)
+    width = float(np.ptp(shortest_half(np.sort(values))))
+    reach = REACH * max(width * TO_SIGMA / 2.0, 1e-4)
     for _ in range(STEPS):
-        u = (values - at) / (REACH * scale)
-        weight = np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
+        weight = np.maximum(1.0 - ((values - at) / reach) ** 2, 0.0) ** 2
         step = float((weight * (values - at)).sum() / weight.sum())
         at += step
         if abs(step) < 1e-6:
             break
-    u = (values - at) / (REACH * scale)
-    inside = np.abs(u) < 1.0
-    influence = np.where(inside, (1.0 - u**2) ** 2, 0.0) * (values - at)
-    slope = float(np.where(inside, (1.0 - u**2) * (1.0 - 5.0 * u**2), 0.0).sum())
-    return at, influence, slope
+    inside = np.maximum(1.0 - ((values - at) / reach) ** 2, 0.0)
+    slope = float((inside * (5.0 * inside - 4.0)).sum())
+    return at, inside**2 * (values - at), slope
+
+
+def shortest_half(ordered: Floats) -> Floats:
+    """Of ascending values, the half that lies in the shortest interval."""
+    half = (ordered.size + 1) // 2
+    first = int(np.argmin(ordered[half - 1 :] - ordered[: ordered.size - half + 1]))
+    return ordered[first : first + half]
 
 
 def half_sample_mode(values: Floats) -> float:
     """The mode by halving (Bickel and Frühwirth 2006): the densest half of the densest half …"""
     v = np.sort(values)
     while v.size > 2:
-        half = (v.size + 1) // 2
-        widths = v[half - 1 :] - v[: v.size - half + 1]
-        first = int(np.argmin(widths))
-        v = v[first : first + half]
+        v = shortest_half(v)
     return float(v.mean())
 
 

@@ -1,9 +1,9 @@
 """Which kind of surface a tile's labels lie on, as far as images can be held against them.
 
-Open ground and roofs are where labels vary as a plane does, ``GUARD_PX`` away from everything else:
-from pixels without label among labelled ones, and from steps of height. What SIFT says there is of
-one surface. Crowns are the LiDAR's vegetation; where the LiDAR tells neither vegetation nor
-buildings apart, what is not smooth. The rest is near edges.
+Open ground and roofs are where labels vary as a plane does, with nothing else in a square of
+``GUARD_PX``: no pixel without label among labelled ones, no step of height. What SIFT says there is
+of one surface. Crowns, with what lies in such a square beside them, are the LiDAR's vegetation;
+where the LiDAR tells neither vegetation nor buildings, what is not smooth. The rest is near edges.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def label_surfaces(
     dense = share >= DENSE * np.median(share[known])
     values = np.where(known, disparity - np.median(disparity[known]), 0.0)
     smooth = known & dense & (off_plane(values, known) < SMOOTH_PX)
-    pure = smooth & ~_near(other) & (_near(buildings) == buildings)
-    found[pure & ~_near(buildings)] = LabelSurface.OPEN_GROUND
+    pure, built = smooth & ~_near(other), _near(buildings)
+    found[known & (_near(vegetation) if classed else ~smooth & ~built)] = LabelSurface.CROWNS
+    found[pure & ~built] = LabelSurface.OPEN_GROUND
     found[pure & ~_near(known & ~buildings)] = LabelSurface.ROOFS
-    found[known & (vegetation if classed else ~smooth & ~buildings)] = LabelSurface.CROWNS
     return found
 
 
