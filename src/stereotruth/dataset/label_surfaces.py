@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 from .tile_classes import BUILDING_CODE, CLASSED_CODES, off_plane
 
 Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
 
 VEGETATION_CODES = (3, 4, 5)  # ASPRS
 GROUND_CODES = (0, 1, 2)  # never classified, unclassified, ground
 SMOOTH_PX = 0.15  # standard deviation of labels from a plane: noise of points, and relief
 GUARD_PX = 9  # side of the square in which nothing else may be
+UNSURE_PX = 0.2  # of a label's uncertainty, above what all labels of the tile share: rough
+SHARED = 0.2  # quantile of the uncertainties that tells what they share
 DENSE = 0.95  # share of labelled pixels in the square, of what is usual in the tile
 
 
@@ -40,11 +43,12 @@ class LabelSurface(IntEnum):
 
 
 def label_surfaces(
-    disparity: NDArray[np.float64], surface_class: NDArray[np.uint8], buildings: Bools
+    disparity: Floats, sigma: Floats, surface_class: NDArray[np.uint8], buildings: Bools
 ) -> NDArray[np.uint8]:
     """:class:`LabelSurface` of each pixel of a tile; 0 where there is no label.
 
-    ``disparity`` float64[h, w], px, NaN where there is no label; ``surface_class``: the LiDAR's
+    ``disparity`` [h, w], px, NaN where there is no label, ``sigma`` its uncertainty, px, 0 where that
+    is not known; ``surface_class``: the LiDAR's
     class of each pixel, 0 where it is not known; ``buildings``: pixels of buildings.
     """
     known = np.isfinite(disparity)
@@ -53,12 +57,13 @@ def label_surfaces(
         return found
     classed = bool(np.isin(surface_class, CLASSED_CODES).any())
     vegetation = np.isin(surface_class, VEGETATION_CODES)
-    other = known & (vegetation | ~np.isin(surface_class, (*GROUND_CODES, BUILDING_CODE)))
+    unsure = known & (sigma > np.hypot(np.quantile(sigma[known], SHARED), UNSURE_PX))
+    other = unsure | known & (vegetation | ~np.isin(surface_class, (*GROUND_CODES, BUILDING_CODE)))
     guard = (GUARD_PX, GUARD_PX)
     share = cv2.boxFilter(known.astype(np.float32), -1, guard, borderType=cv2.BORDER_REFLECT)
     dense = share >= DENSE * np.median(share[known])
     values = np.where(known, disparity - np.median(disparity[known]), 0.0)
-    smooth = known & dense & (off_plane(values, known) < SMOOTH_PX)
+    smooth = known & dense & ~unsure & (off_plane(values, known) < SMOOTH_PX)
     pure, built = smooth & ~_near(other), _near(buildings)
     found[known & (_near(vegetation) if classed else ~smooth & ~built)] = LabelSurface.CROWNS
     found[pure & ~built] = LabelSurface.OPEN_GROUND

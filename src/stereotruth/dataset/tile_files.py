@@ -181,7 +181,7 @@ class LabelsKnown:
         return cls(
             kind=buildings.tile_class(building_share),
             surface_class=surface_class,
-            surface=label_surfaces(disparity, surface_class, buildings.found),
+            surface=label_surfaces(disparity, sigma, surface_class, buildings.found),
             sigma=sigma,
         )
 
