@@ -47,9 +47,9 @@ def label_surfaces(
 ) -> NDArray[np.uint8]:
     """:class:`LabelSurface` of each pixel of a tile; 0 where there is no label.
 
-    ``disparity`` [h, w], px, NaN where there is no label, ``sigma`` its uncertainty, px, 0 where that
-    is not known; ``surface_class``: the LiDAR's
-    class of each pixel, 0 where it is not known; ``buildings``: pixels of buildings.
+    ``disparity`` [h, w], px, NaN where there is no label; ``sigma``: its uncertainty, px, 0 where
+    that is not known; ``surface_class``: the LiDAR's class, 0 where it is not known;
+    ``buildings``: pixels of buildings.
     """
     known = np.isfinite(disparity)
     found = np.zeros(disparity.shape, np.uint8)
