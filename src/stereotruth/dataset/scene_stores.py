@@ -48,6 +48,7 @@ class SceneStores:
     height: zarr.Array
     of_right: zarr.Group | None
     surface_class: zarr.Array | None
+    uncertainty: zarr.Array | None
     gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
@@ -100,6 +101,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         height=disparity["height"],
         of_right=of_right,
         surface_class=disparity.get("surface_class"),
+        uncertainty=disparity.get("uncertainty"),
         gcp_rms=gcp_rms,
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
