@@ -60,7 +60,7 @@ def made(tmp_path_factory):
         scene = make_scene(folder / "s1", bare_from=240, texture=rough, **planted)
         alignment = folder / "alignment.json"
         rms = {"left": {"rms": {"after": 0.3}}, "right": {"rms": {"after": 0.4}}}
-        alignment.write_text(json.dumps(rms))
+        alignment.write_text(json.dumps({**rms, "warnings": []}))
         scene = scene._replace(alignment=alignment)
         out, matches = folder / "Town", folder / "matches.csv"
         summary = run([scene], out, size=SIZE, quality=LIMITS, matches=matches, workers=2)

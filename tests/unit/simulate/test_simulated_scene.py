@@ -63,6 +63,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "kernel_cache",
         "kernels",
         "products",
+        "products.damaged_chunks",
         "products.files",
         "products.folders",
         "products.grids",
