@@ -18,7 +18,7 @@ CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup first-run help docs networks test test-all test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup first-run first-city first-labels help docs networks test test-all test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -31,11 +31,17 @@ $(READY): envs/requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r envs/requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	-$(BIN)/python -m compileall -q -j 0 .venv/lib src  # each of a run's jobs starts a Python
-	-$(MAKE) --no-print-directory first-run
+	-$(MAKE) --no-print-directory -j $(CORES) first-run
 	touch $@
 
-# All kernels are compiled beside the package by a run of the smallest city, so that no job has to.
-first-run:
+# All kernels are compiled beside the package, so that no job has to: by a run of the smallest city,
+# and, at the same time, those of its last stage by labels of a box.
+first-run: first-city first-labels
+
+first-labels:
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -q -p no:cacheprovider tests/unit/disparity/test_project.py -k same_in_any_order
+
+first-city:
 	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init --example .venv/first && \
 	  cd .venv/first && stereotruth run tiles/Demo --cores $(CORES) --quiet && cd ../.. && rm -rf .venv/first
 

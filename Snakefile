@@ -2,12 +2,20 @@
 
 from pathlib import Path
 
+from snakemake.exceptions import WorkflowError
 from snakemake.utils import min_version
+
+from stereotruth.errors import InputError
+from stereotruth.project import read_mapping
 
 min_version("9.10")
 
 
 if Path("config/config.yaml").is_file():  # of the working directory; see common.smk
+    try:
+        read_mapping(Path("config/config.yaml"))  # Snakemake names no file that it cannot read
+    except InputError as error:
+        raise WorkflowError(str(error))
 
     configfile: "config/config.yaml"
 

@@ -16,24 +16,23 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from drawn_cities import DENSITIES, NAMED, compare_drawn
+from synthetic_pairs import label_by
 
 from stereotruth import sheets
-from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.dataset import warped_tile
 from stereotruth.dataset.manifest import labelled_tiles
+from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.error_statistics import LIMITS
+from stereotruth.error_statistics import LIMITS, ErrorSum
 from stereotruth.errors import InputError
 from stereotruth.evaluation import checkpoints, geometry_errors, labels_against_truth, scene_warping
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
-from stereotruth.products.provenance import source_digest
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -219,7 +218,12 @@ def table4(city: str) -> list[dict[str, str]]:
 
 
 def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
-    disparity, parallax = (e.figures() for e in geometry_errors.geometry_errors(model, store))
+    return error_row(scene, alignment, *geometry_errors.geometry_errors(model, store))
+
+
+def error_row(scene: str, alignment: str, *sums: ErrorSum) -> dict[str, str]:
+    """Errors of an alignment: of disparity, and the y-parallax."""
+    disparity, parallax = (e.figures() for e in sums)
     return {
         "scene": scene,
         "alignment": alignment,
@@ -274,10 +278,6 @@ class Made:
 
 def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
     """Align with noise-free GCPs, rectify and project again; the disparity store."""
-    from stereotruth.disparity.project import project_scene
-    from stereotruth.disparity.settings import Settings
-    from stereotruth.epipolar.rectify import rectify
-
     scene = made.scene
     shutil.rmtree(folder, ignore_errors=True)
     aligned = align(
@@ -287,28 +287,9 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         model=config["alignment"]["model"],
         scene=scene.scene,
     )
-    model = epipolar_model(aligned)
-    with open_pair(scene.left_image, scene.right_image) as (left, right):
-        rectify(
-            left,
-            right,
-            model,
-            folder / "epipolar.json",
-            folder / "left.zarr",
-            folder / "right.zarr",
-            workers=workers,
-            left_attrs=LabelUncertainty.of(aligned, model).to_attrs(),
-        )
-    project_scene(
-        folder / "left.zarr",
-        folder / "right.zarr",
-        made.points,
-        folder / "disparity.zarr",
-        Settings.of(config),
-        workers=workers,
-        code=source_digest("disparity.project"),
-    )
-    return folder / "disparity.zarr"
+    folder.mkdir(parents=True)
+    images = scene.left_image, scene.right_image
+    return label_by(aligned, images, made.points, folder, Settings.of(config), workers=workers)
 
 
 def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
@@ -396,6 +377,15 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         warped = scene_warping.evaluate_warping(made.left, made.right, made.disparity)
         tiles_warped = panels(made, arguments.panels or Path(), 2 if arguments.panels else 0)
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
+    settings = Settings.of(config)
+    for name in arguments.drawn:
+        for density in DENSITIES:
+            drawn = compare_drawn(name, density, settings, arguments.workers)
+            by_city[drawn.name] = drawn.labels
+            report["truth"].append(truth_row(f"{drawn.name} scene", drawn.labels.whole.total))
+            report["geometry"] += [
+                error_row(drawn.name, word, *sums) for word, sums in drawn.alignments.items()
+            ]
     parts = {c: r.all_tiles if r.tiles else r.whole for c, r in by_city.items()}
     report["cities"] = [truth_row(city, part.total) for city, part in parts.items()]
     report["table4"] = [row for city in dict.fromkeys(cities) for row in table4(city)]
@@ -456,6 +446,9 @@ def show(report: Mapping[str, Any]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--city", nargs="*", help="these cities only")
+    parser.add_argument(
+        "--drawn", nargs="+", choices=list(NAMED), default=[], help="and these, which no sheet has"
+    )
     parser.add_argument(
         "--configfile", nargs="*", type=Path, default=[], help="as given to snakemake"
     )

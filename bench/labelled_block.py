@@ -31,8 +31,8 @@ class Thinned(PointStore):
         self.count = int(self.count * share)
 
     @property
-    def cell_counts(self) -> NDArray[np.int64]:
-        return np.maximum((super().cell_counts * self.share).astype(np.int64), 1)
+    def square_counts(self) -> NDArray[np.float64]:
+        return super().square_counts * self.share
 
     def query(self, *box: float) -> Points:
         points = super().query(*box)
@@ -99,7 +99,8 @@ class Block:
         """What labels the block; ``points_per_m2`` None, or more than there are: all points."""
         settings = Settings(method=method, fill=fill)
         images = (self.rectified / f"{view}.zarr" for view in ("left", "right"))
-        job = SceneInputs(*images, tuple(self.pair.points), settings, self.view)
+        alignment = self.pair.alignment(self.rectified)
+        job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)
         share = min((points_per_m2 or self.density) / self.density, 1.0)
         job.__dict__["stores"] = tuple(Thinned(path, share) for path in self.pair.points)
         return job

@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
+from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import whole_folder
+from stereotruth.products.provenance import source_digest
 from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, lidar_files
+from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -54,8 +57,11 @@ def gain(image: Image, rng: np.random.Generator) -> Image:
     return image * (1 + GAIN * (field - field.mean()) / field.std())
 
 
-def an_hour_later(city: CitySpec) -> CitySpec:
-    """The city by the sun of an hour later on the same day, from its place and hour angle."""
+def sun_an_hour_later(city: CitySpec) -> tuple[float, float]:
+    """Azimuth and elevation of the sun an hour later on the same day, degrees.
+
+    From the city's place and the sun's hour angle.
+    """
     lat, azimuth, height = map(
         math.radians, (city.lat, city.sun_azimuth_deg, city.sun_elevation_deg)
     )
@@ -68,11 +74,7 @@ def an_hour_later(city: CitySpec) -> CitySpec:
     east, meridian = -across * math.sin(angle), across * math.cos(angle)
     north = pole * math.cos(lat) - meridian * math.sin(lat)
     up = pole * math.sin(lat) + meridian * math.cos(lat)
-    return replace(
-        city,
-        sun_azimuth_deg=math.degrees(math.atan2(east, north)) % 360.0,
-        sun_elevation_deg=math.degrees(math.asin(up)),
-    )
+    return math.degrees(math.atan2(east, north)) % 360.0, math.degrees(math.asin(up))
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,8 @@ class Condition:
         images = [pair.data / f"{view}.tif" for view in VIEWS]
         if self.later:
             made = folder / "right.tif"
-            simulate_image(an_hour_later(pair.city), pair.spec, "right", made, seed=SEED)
+            later = replace(pair.city, right=ViewSpec(sun_deg=sun_an_hour_later(pair.city)))
+            simulate_image(later, pair.spec, "right", made, seed=SEED)
             return [images[0], made]
         if self.change is None:
             return images
@@ -106,11 +109,19 @@ class Condition:
 def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], folder: Path) -> None:
     """Align a pair, refine that by the points if there are any, and rectify it.
 
-    Makes ``epipolar.json``, ``left.zarr`` and ``right.zarr`` in the folder.
+    Makes ``alignment.json``, ``epipolar.json``, ``left.zarr`` and ``right.zarr`` in the folder.
     """
     alignment = align(*images, gcps)
     if stores:
         alignment, _ = refine(alignment, *images, stores)
+    rectify_by(alignment, images, folder)
+
+
+def rectify_by(
+    alignment: Alignment, images: Sequence[Path], folder: Path, *, workers: int = 1
+) -> None:
+    """Rectify a pair: ``alignment.json``, ``epipolar.json``, ``left.zarr``, ``right.zarr``."""
+    alignment.save(folder / "alignment.json")
     model = epipolar_model(alignment)
     with open_pair(*images) as opened:
         rectify(
@@ -118,9 +129,29 @@ def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], fol
             model,
             folder / "epipolar.json",
             *(folder / f"{view}.zarr" for view in VIEWS),
-            workers=1,
-            left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
+            workers=workers,
         )
+
+
+def label_by(
+    alignment: Alignment,
+    images: Sequence[Path],
+    stores: Sequence[Path],
+    folder: Path,
+    settings: Settings,
+    *,
+    workers: int = 1,
+) -> Path:
+    """Rectify a pair by an alignment into a folder and label it: its ``disparity.zarr``."""
+    rectify_by(alignment, images, folder, workers=workers)
+    made = folder / "disparity.zarr"
+    rectified = (folder / f"{view}.zarr" for view in VIEWS)
+    code = source_digest("disparity.project")
+    project_scene(
+        *rectified, stores, made, settings, alignment=folder / "alignment.json", workers=workers,
+        code=code,
+    )  # fmt: skip
+    return made
 
 
 CONDITIONS = {
@@ -165,6 +196,12 @@ class Pair:
             with whole_folder(made) as scratch:
                 self._rectify(CONDITIONS[condition], scratch)
         return made
+
+    def alignment(self, rectified: Path) -> Path:
+        """The alignment that the pair was rectified with into a folder."""
+        own = self.results / "refine" / self.city.name / self.name / "alignment.json"
+        made = rectified / "alignment.json"
+        return made if made.is_file() else own
 
     def _rectify(self, condition: Condition, folder: Path) -> None:
         tables = [folder / f"{name}.csv" for name in ("gcps", "gcps_exact", "checkpoints")]

@@ -36,14 +36,14 @@ def thinned(scene: Path, every: int, folder: Path) -> list[Path]:
     return sorted(made.glob("*.points"))
 
 
-def rectified(scene: Path, stores: list[Path], folder: Path) -> list[Path]:
-    """The rectified pair, aligned by control points and these points."""
+def rectified(scene: Path, stores: list[Path], folder: Path) -> Path:
+    """The folder of the rectified pair, aligned by control points and these points."""
     made = folder / "rectified"
     if not made.is_dir():
         images = [scene / f"{view}.tif" for view in VIEWS]
         with whole_folder(made) as scratch:
             rectify_pair(images, scene / "gcps.csv", stores, scratch)
-    return [made / f"{view}.zarr" for view in VIEWS]
+    return made
 
 
 def main() -> None:
@@ -61,7 +61,12 @@ def main() -> None:
         for fill in options.fill:
             store = options.folder / f"every_{every}_{fill}.zarr"
             project_scene(
-                *pair, stores, store, Settings(fill=fill), code=source_digest("disparity.project")
+                *(pair / f"{view}.zarr" for view in VIEWS),
+                stores,
+                store,
+                Settings(fill=fill),
+                alignment=pair / "alignment.json",
+                code=source_digest("disparity.project"),
             )
             f = evaluate_checkpoints(store, options.scene / "checkpoints.csv")
             share = 100.0 * f["labelled"] / f["points"]

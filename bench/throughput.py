@@ -37,7 +37,6 @@ from rasterio.transform import RPCTransformer
 import stereotruth
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.paper_correlation import correlate
 from stereotruth.disparity.pixel_points import Collection
@@ -143,10 +142,11 @@ def make_scene(folder: Path, million: float, seed: int) -> list[Path]:
             print(f"flying {file.name} at {spacing:.3f} m", flush=True)
             file.parent.mkdir(exist_ok=True)
             simulate_lidar_tile(city, scene, file.name, file, spacing_m=spacing, seed=seed)
-    if not (folder / "right.zarr").is_dir():
+    if not ((folder / "right.zarr").is_dir() and (folder / "alignment.json").is_file()):
         print("rectifying", flush=True)
         images = folder / "left.tif", folder / "right.tif"
         alignment = align(*images, PROJECT / "config" / "gcps" / f"{SCENE}.csv", scene=SCENE)
+        alignment.save(folder / "alignment.json")
         model = epipolar_model(alignment)
         with open_pair(*images) as pair:
             rectify(
@@ -156,7 +156,6 @@ def make_scene(folder: Path, million: float, seed: int) -> list[Path]:
                 folder / "left.zarr",
                 folder / "right.zarr",
                 workers=os.cpu_count() or 1,
-                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
             )
     return lidar
 
@@ -287,13 +286,14 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     ingest_all([smallest], folder / "points", 1, env)
     smallest_store = folder / "points" / f"{smallest.stem}.points"
     code = source_digest("disparity.project")
-    project_scene(left, right, [smallest_store], out, Settings(**settings), code=code)
+    options = {"alignment": str(folder / "alignment.json"), "code": code}
+    project_scene(left, right, [smallest_store], out, Settings(**settings), **options)
 
     print("T0, ingest, project", flush=True)
     count = decode(files)  # into the page cache
     seconds = {"T0": math.inf, "ingest": math.inf, "project": math.inf}
     cpu = dict(seconds)
-    told = json.dumps(dict(settings)), json.dumps({"workers": workers, "code": code})
+    told = json.dumps(dict(settings)), json.dumps({"workers": workers} | options)
     for _ in range(arguments.repeats):
         for made in (folder / "points", out.parent):  # nothing of an earlier run is taken over
             shutil.rmtree(made, ignore_errors=True)
@@ -334,7 +334,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         shutil.rmtree(out.parent)
         times = profiled(
             lambda: project_scene(
-                left, right, stores, out, Settings(**settings), scheduler="synchronous", code=code
+                left, right, stores, out, Settings(**settings), scheduler="synchronous", **options
             )
         )
         profiles["project"] = parts(times, count)

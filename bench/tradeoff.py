@@ -82,6 +82,7 @@ def measure(
                 out,
                 Settings(**settings),
                 workers=workers,
+                alignment=made.refined if made.refined.is_file() else made.aligned,
                 code=source_digest("disparity.project"),
             )
         store = open_grid(out)

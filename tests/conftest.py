@@ -11,24 +11,31 @@ pytest.register_assert_rewrite("tests.synthetic")
 # against 32 s for the same tests).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Test files of the workflow whose fixtures build on one city, made once for all of them.
-OF_ONE_CITY = {"audit", "benchmark", "disturbed", "end_to_end", "predict", "report", "restart"}
+# Test files that processes begin with: the first makes the city of the workflow's tests and all
+# that follows from it, which the others wait for; the next ones need nothing of it.
+FIRST = ("test_audit", "test_command", "test_plans")
+
+
+def pytest_collection_modifyitems(items):
+    """Whole runs before short tests, so that no process is left with one at the end."""
+
+    def place(item: pytest.Item) -> int:
+        file = PurePosixPath(item.nodeid.partition("::")[0])
+        if file.parent.name != "workflow":
+            return len(FIRST) + 1
+        return FIRST.index(file.stem) if file.stem in FIRST else len(FIRST)
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Each file's tests by one process, and those of OF_ONE_CITY too: fixtures are made once.
-
-    The marks of pytest-xdist 3.8 (``--dist loadgroup``) do nothing with pytest 9: both processes
-    made every fixture.
-    """
+    """Each file's tests by one process, in the order above: fixtures of a file are made once."""
     from xdist.scheduler import LoadScopeScheduling
 
-    class ByFixtures(LoadScopeScheduling):
+    class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = PurePosixPath(nodeid.partition("::")[0])
-            name = file.stem.removeprefix("test_")
-            shared = file.parent.name == "workflow" and name in OF_ONE_CITY
-            return "one city" if shared else str(file)
+            return nodeid.partition("::")[0]
 
-    return ByFixtures(config, log)
+    config.option.loadscopereorder = False  # by the number of tests
+    return ByFile(config, log)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import errno
 import gc
 import logging
 import multiprocessing
@@ -17,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
+from .errors import InputError, told_by_system, without_secrets
 
 log = logging.getLogger("stereotruth")
 # New objects before garbage is collected: compiling kernels makes many that stay, and walking
@@ -31,7 +30,8 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     """Run one job: log to terminal and file; end with one clear line where the input is at fault.
 
     ``name`` is the stage and the scene. InputError becomes ``<name>: error: …`` and exit status 1,
-    and so does a full disk; anything else is a defect and keeps its traceback.
+    and so does what the operating system refuses: a full disk, no permission, a file that was taken
+    away (its traceback is in the log file). Anything else is a defect and keeps its traceback.
     """
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)  # parallelism belongs to Dask and Snakemake
@@ -41,8 +41,8 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
-    terminal.setFormatter(logging.Formatter(f"{name}: %(message)s"))
-    file.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)s {name}: %(message)s"))
+    terminal.setFormatter(_Discreet(f"{name}: %(message)s"))
+    file.setFormatter(_Discreet(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     handlers = (terminal, file)
     for handler in handlers:
         log.addHandler(handler)
@@ -55,19 +55,24 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:  # panics of libraries in Rust are no Exception
-        if (full := _disk_full(error)) is None:
+        if (told := told_by_system(error)) is None:
             log.exception("unexpected failure")
             raise
-        log.error(
-            "error: %s: no space left on the disk. Remedy: make space there, and run again: "
-            "what is done is kept",
-            full.filename or Path.cwd(),
-        )
+        log.error("error: %s", told)
+        where = "".join(traceback.format_exception(error))
+        file.handle(log.makeRecord(log.name, logging.INFO, "", 0, "%s", (where,), None))
         raise SystemExit(1) from None
     finally:
         for handler in handlers:
             log.removeHandler(handler)
             handler.close()
+
+
+class _Discreet(logging.Formatter):
+    """Lines, tracebacks too, whose URLs have no secrets."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return without_secrets(super().format(record))
 
 
 def _keep_memory() -> None:
@@ -137,17 +142,6 @@ def _report(work: Callable[[], Any], sending: Any, watched: int, held: int) -> N
             error = RuntimeError(traceback.format_exc())
         found = "failed", error
     sending.send(found)
-
-
-def _disk_full(error: BaseException | None) -> OSError | None:
-    """The error of a full disk or quota behind an exception, if that is what it is."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return error
-        if isinstance(error, BaseExceptionGroup):
-            return next(filter(None, map(_disk_full, error.exceptions)), None)
-        error = error.__cause__ or error.__context__
-    return None
 
 
 def progress(items: Iterable, total: int, what: str) -> Iterator:

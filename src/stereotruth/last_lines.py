@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
 from .evaluation.surface_models.page import describe as describe_surface_model
 from .matching.benchmark.score_method import describe
-from .products.files import read_json
 
 
 def last_lines(products: Iterable[str]) -> list[str]:
@@ -24,7 +23,7 @@ def last_lines(products: Iterable[str]) -> list[str]:
         for pattern, say in SAYINGS.items()
         for product in sorted(products)
         if (found := re.fullmatch(pattern, product))
-        for line in _said(say, product, *found.groups())
+        for line in _lines(say, product, *found.groups())
     ]
     if said or not products:
         return said
@@ -32,18 +31,16 @@ def last_lines(products: Iterable[str]) -> list[str]:
     return [f"Made {', '.join(products[-3:])}{more}"]
 
 
-def _said(say: Callable[..., Iterator[str]], product: str, *of: str) -> list[str]:
-    """The lines of a product; that it is damaged, if its figures cannot be read."""
+def _lines(say: Callable[..., Iterator[str]], product: str, *groups: str) -> list[str]:
+    """What to say of a product; where its figures cannot be read, that it is damaged."""
     try:
-        return list(map(str, say(product, *of)))
-    except InputError as error:
-        return [str(error)]
-    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        return [f"{product}: its figures cannot be read ({error!r:.80})"]
+        return list(say(product, *groups))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return [f"Look at {product}: its figures cannot be read; delete it and run again"]
 
 
 def _read(*parts: str) -> Mapping[str, Any]:
-    return read_json(Path(*parts))
+    return json.loads(Path(*parts).read_text(encoding="utf-8"))
 
 
 def _tiles(product: str, city: str) -> Iterator[str]:

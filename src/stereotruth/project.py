@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import yaml
 
 from . import sheets
 from .configuration import Configuration
-from .errors import InputError
+from .errors import InputError, in_words
 from .products.remote_files import (
     FOLDER,
     bring_files,
@@ -30,6 +31,8 @@ _PACKAGE = Path(__file__).parent
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
 SYNTHETIC_FOLDER = "data/synthetic"
 CONFIG = "config.yaml"  # of a user's own project
+MOST_BYTES = 1_000_000  # of a configuration
+MOST_VALUES = 200_000
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -59,17 +62,34 @@ def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration
     read = [*([shared] if shared.is_file() else []), *(map(Path, files) if files else own)]
     values: dict[str, Any] = {}
     for file in read:
-        values = merged(values, _mapping(file))
+        values = merged(values, read_mapping(file))
     names = ", ".join(map(str, read)) or "the defaults"
     return Configuration.of(with_defaults(values), names), names
 
 
-def _mapping(file: Path) -> dict[str, Any]:
+def read_mapping(file: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file. Raises InputError, naming it, if it has none.
+
+    Refused is also what grows beyond all measure when its aliases are put in.
+    """
     try:
-        found = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
+        if file.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{file.stat().st_size / 1e6:.1f} MB are no configuration",
+                file=file,
+                remedy="name the file of the configuration",
+            )
+        loader = yaml.SafeLoader(file.read_text(encoding="utf-8-sig"))
+        node = loader.get_single_node()
+        _refuse_multiplied(node, file)
+        found = None if node is None else loader.construct_document(node)
     except FileNotFoundError:
         raise InputError("no such file", file=file, remedy="correct its path") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except UnicodeDecodeError as error:
+        raise InputError(f"is no UTF-8 ({error})", file=file, remedy="save it as UTF-8") from None
+    except RecursionError:
+        raise InputError("is nested too deeply", file=file, remedy="write it flat") from None
+    except (OSError, yaml.YAMLError) as error:
         problem = " ".join(str(error).split())
         raise InputError(
             f"cannot be read as YAML ({problem})", file=file, remedy="correct what it names"
@@ -79,6 +99,27 @@ def _mapping(file: Path) -> dict[str, Any]:
             "is no mapping of keys to values", file=file, remedy="write it as key: value"
         )
     return found or {}
+
+
+def _refuse_multiplied(top: yaml.Node | None, file: Path) -> None:
+    """Raise InputError if a document has more than MOST_VALUES with all aliases put in."""
+    counts: dict[int, float] = {}
+
+    def count(node: yaml.Node) -> float:
+        if id(node) not in counts:
+            counts[id(node)] = math.inf  # of an alias to what it stands in
+            inside = node.value if isinstance(node, yaml.CollectionNode) else ()
+            pairs = isinstance(node, yaml.MappingNode)
+            parts = [part for pair in inside for part in pair] if pairs else inside
+            counts[id(node)] = 1 + sum(map(count, parts))
+        return counts[id(node)]
+
+    if top is not None and count(top) > MOST_VALUES:
+        raise InputError(
+            f"more than {MOST_VALUES} values, with its aliases (*) put in",
+            file=file,
+            remedy="write out what the aliases stand for",
+        )
 
 
 def is_synthetic(scene: sheets.Scene) -> bool:
@@ -99,6 +140,7 @@ def sheet(settings: Configuration, name: str) -> str:
     return here_or_shipped(path) if path == getattr(Configuration, name) else path
 
 
+@in_words()
 def read_scenes(
     settings: Configuration, *, ask: bool = True
 ) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene]]:
@@ -135,6 +177,7 @@ def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
     return replace(scene, **found)
 
 
+@in_words()
 def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
     """The LiDAR files of a scene by the names of their stores, after its files were found.
 
@@ -156,6 +199,7 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
     return sheets.store_names(sheets.find_lidar(scene, rows))
 
 
+@in_words()
 def check_fixed(settings: Configuration, scenes: Mapping[str, sheets.Scene]) -> None:
     """Raise InputError if alignment.fixed names a scene or a file that does not exist."""
     for name, file in settings.alignment.fixed.items():

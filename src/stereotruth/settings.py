@@ -8,6 +8,7 @@ the reference table from them.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -20,6 +21,7 @@ from pydantic import (
     StrictFloat,
     StrictInt,
     StrictStr,
+    StringConstraints,
     ValidationError,
 )
 from pydantic.dataclasses import dataclass as validated
@@ -33,6 +35,9 @@ Whole = StrictInt
 Number = StrictInt | StrictFloat  # a whole one stays whole, in records too
 Flag = StrictBool
 Text = StrictStr
+LONGEST_NAME = 100  # characters; a file's name has 255 bytes, with what is added to it
+PATTERN = re.compile(r"\{[^{}]*\w[^{}]*\}")
+REPEATED = re.compile(r"(.+)\1{18}$")  # once more, and Snakemake takes it for an endless recursion
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,27 @@ def each_once(values: Values) -> Values:
     return values
 
 
+def not_repeated(value: str) -> str:
+    """The name; ValueError if it ends with the same characters again and again."""
+    if REPEATED.search(value):
+        raise ValueError("ends with the same characters again and again")
+    return value
+
+
+def no_pattern(value: str) -> str:
+    """The path; ValueError if Snakemake would take a part of it for a wildcard and replace it."""
+    if PATTERN.search(value):
+        raise ValueError("has a name in { }, which stands for something else in the workflow")
+    return value
+
+
+def name_of(characters: str) -> Any:
+    """The type of names that paths are made of: so many of the ``characters`` (of a pattern)."""
+    limits = StringConstraints(pattern=f"^[{characters}]+$", max_length=LONGEST_NAME)
+    return Annotated[Text, limits, AfterValidator(not_repeated)]
+
+
+FilePath = Annotated[Text, AfterValidator(no_pattern)]
 Odd = Annotated[Whole, AfterValidator(is_odd)]
 Share = Annotated[Number, Field(ge=0, le=1), Unit("share")]
 Range = Annotated[tuple[Whole, Whole], Unit("px, px")]  # the second is excluded

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from .errors import InputError
 from .settings import Unit, is_odd
 
+LONGEST_VALUE = 300  # characters of a value in messages
 AT_FIRST = re.compile("^(Input|String|Tuple|Dictionary|Value error,) ")  # of pydantic's messages
 ALTERNATIVE = re.compile(r"int|float|str|bool|constrained-\w+|(dict|tuple|literal)\[.*\]|\[key\]")
 
@@ -174,7 +175,9 @@ def complaint(error: ValidationError, of: Any) -> tuple[str, str]:
     if one["type"] == "missing":
         return f"{name}: is required", f"add it: {_meaning(place.key)}"
     said = AT_FIRST.sub("", one["msg"])
-    problem = f"{name or 'value'}: {one['input']!r} {said}"
+    given = repr(one["input"])
+    given = given if len(given) <= LONGEST_VALUE else f"{given[:LONGEST_VALUE]} …"
+    problem = f"{name or 'value'}: {given} {said}"
     if place.key is None:
         return problem, "see config/README.md"
     return problem, f"{place.known} is: {_meaning(place.key)}"

@@ -19,24 +19,35 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from .errors import InputError
-from .settings import Text, Whole, settings
+from .settings import (
+    LONGEST_NAME,
+    PATTERN,
+    REPEATED,
+    FilePath,
+    Text,
+    Whole,
+    name_of,
+    settings,
+)
 from .settings_text import check
 
+MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
+MOST_BYTES = 20_000_000  # of a sheet
 LIDAR_SUFFIXES = (".las", ".laz")
 
 
 Count = Annotated[Whole, Field(ge=0)]
-Given = Annotated[Text, StringConstraints(min_length=1)]
+Given = Annotated[FilePath, StringConstraints(min_length=1)]
 
 
 @settings
 class City:
     """One row of the cities sheet; the counts are those of the paper's table 3."""
 
-    city: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    city: name_of("A-Za-z0-9_-")
     """name of letters, digits, `-` and `_`; its tiles go to `tiles/<city>/`"""
 
-    prefix: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9]+$")]
+    prefix: name_of("A-Za-z0-9")
     """what its tile names begin with (SG, KM, YD, QC, WH, HY …), of letters and digits"""
 
     training: Count
@@ -54,7 +65,7 @@ class City:
 class Scene:
     """One row of the scenes sheet: a stereo pair, its LiDAR and its ground control points."""
 
-    scene: Annotated[Text, StringConstraints(pattern="^[A-Za-z0-9-]+$")]
+    scene: name_of("A-Za-z0-9-")
     """unique id of letters, digits and `-`"""
 
     city: Given
@@ -75,23 +86,24 @@ class Scene:
     lidar_crs: Text
     """EPSG code or WKT (compound allowed) for files that carry none; else empty"""
 
-    geoid: Text
+    geoid: FilePath
     """geoid grid (GTX or GeoTIFF), m, where the LiDAR's heights are orthometric; else empty:
     heights are ellipsoidal"""
 
-    gcps: Text
+    gcps: FilePath
     """CSV of ground control points, see below; empty without any, if `alignment.refine` is true:
     the refinement then starts from the RPCs alone (10 px standard deviation is assumed, 3e-4 of
     scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
-    images lie on the LiDAR: the attribute `alignment_sigma` of `left.zarr` says how well"""
+    images lie on the LiDAR: the attribute `alignment_sigma_px` of the scene's disparity store says
+    how well"""
 
-    left_mask: Text = ""
+    left_mask: FilePath = ""
     """optional column: a raster on the left image's grid, not zero where the image is not to be
     used (cloud, water, anything): no labels, no tie points, no correlation there; the pixels have
     the status `masked` (11), as have those that the image's own mask or alpha band hides. The tile
     shows them all the same, but for the image's own mask"""
 
-    right_mask: Text = ""
+    right_mask: FilePath = ""
     """likewise, of the right image"""
 
 
@@ -100,6 +112,12 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     columns = [f.name for f in fields(sheet)]
     needed = [f.name for f in fields(sheet) if f.default is MISSING]
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{path.stat().st_size / 1e6:.0f} MB are no sheet",
+                file=path,
+                remedy=f"its columns are {', '.join(columns)}",
+            )
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(
@@ -108,7 +126,12 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     except (UnicodeDecodeError, IsADirectoryError) as error:
         raise InputError(str(error), file=path, remedy="save it as UTF-8 text") from None
     rows = csv.reader(text.splitlines(), delimiter="\t")
-    numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
+    try:
+        numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
+    except csv.Error as error:
+        raise InputError(
+            f"no sheet of text ({error})", file=path, remedy="save it as text with tabs"
+        ) from None
     numbered = [(n, row) for n, row in numbered if not row[0].startswith("#")]
     if not numbered:
         raise InputError("empty sheet", file=path, remedy=f"its columns are {', '.join(columns)}")
@@ -175,6 +198,13 @@ def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene
     path = Path(path)
     scenes = {}
     rows = _read_table(path, Scene)
+    if len(rows) > MOST_SCENES:
+        raise InputError(
+            f"{len(rows)} scenes; a project has at most {MOST_SCENES}",
+            file=path,
+            remedy="share them among several projects (their datasets can be put together), or "
+            "among several sheets that key scenes names in turn",
+        )
     for number, cells in rows:
         scene = check(cells, Scene, f"{path}, line {number}")
         if cells["city"] not in cities:
@@ -226,6 +256,12 @@ def lidar_files(pattern: str) -> list[Path]:
             f"no LiDAR file at {pattern!r}",
             remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
         )
+    if patterns := [file for file in found if PATTERN.search(str(file))]:
+        raise InputError(
+            "has a name in { }, which stands for something else in the workflow",
+            file=patterns[0],
+            remedy="rename it",
+        )
     return sorted(found)
 
 
@@ -239,7 +275,10 @@ def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
 
 
 def store_names(files: Iterable[Path]) -> dict[str, Path]:
-    """A unique name for each LiDAR file: its stem, with a hash of its path if two share it."""
+    """A unique name for each LiDAR file: its stem, with a hash of its path if two share it.
+
+    Stems that are too long for a name, or repeat themselves, are cut short and get the hash too.
+    """
 
     def stem(file: Path) -> str:
         name = re.sub(r"(\.copc)?\.(las|laz)$", "", file.name, flags=re.IGNORECASE)
@@ -249,8 +288,10 @@ def store_names(files: Iterable[Path]) -> dict[str, Path]:
     shared = {name for name, n in Counter(map(stem, files)).items() if n > 1}
 
     def unique(file: Path) -> str:
-        if stem(file) not in shared:
-            return stem(file)
-        return f"{stem(file)}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+        name = stem(file)
+        if name not in shared and len(name) <= LONGEST_NAME and not REPEATED.search(name):
+            return name
+        mark = hashlib.sha256(str(file).encode("utf-8", "surrogateescape")).hexdigest()[:8]
+        return f"{name[: LONGEST_NAME - 9]}-{mark}"
 
     return {unique(file): file for file in files}

@@ -71,9 +71,8 @@ class Project:
         if self.edited:
             environment["PYTHONPATH"] = str(self.folder / "src")
             environment.pop("NUMBA_CACHE_DIR", None)
-        if "--dry-run" in arguments:
-            status = planner().ask(self.folder, ["--cores", str(cores), *arguments], environment)
-            return Run(status, (self.folder / "plan.log").read_text())
+        if {"--dry-run", "--touch"} & set(arguments):
+            return self._ask(["--cores", str(cores), *arguments], environment)
         done = subprocess.run(
             [sys.executable, "-m", "snakemake", "--cores", str(cores), *arguments],
             cwd=self.folder,
@@ -84,6 +83,16 @@ class Project:
             timeout=900,
         )
         return Run(done.returncode, done.stdout)
+
+    def _ask(self, arguments: list[str], environment: dict[str, str]) -> Run:
+        status = planner().ask(self.folder, arguments, environment)
+        return Run(status, (self.folder / "plan.log").read_text())
+
+    def refuse(self, *arguments: str) -> Run:
+        """A call for work that ends before any job."""
+        run = self._ask(["--cores", "2", *arguments], dict(os.environ))
+        assert run.status != 0 and "Job stats" not in run.text, run.text
+        return run
 
     def plan(self, *arguments: str) -> dict[str, int]:
         """Jobs by rule that a call would run."""

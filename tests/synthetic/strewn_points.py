@@ -56,6 +56,5 @@ def surface_of(
     builder = VertexBuilder(FLAT, (0, 0), (1_000_000, 1_000_000))
     h = np.rint(height[kept] / LATTICE_M).astype(np.int64)
     builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
-    per_cell = (CELL_M / spacing) ** 2 * (1 << 40) / 9e6
-    scale = Scale.of(np.array([per_cell]), FLAT.cell)
+    scale = Scale.of(spacing**-2, CELL_M)
     return ground_surface(builder.built(), scale, 1.0, FLAT.cell)

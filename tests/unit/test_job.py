@@ -34,6 +34,25 @@ def test_panics_of_libraries_are_logged(tmp_path) -> None:
     assert "index out of bounds" in text
 
 
+def test_a_file_that_is_taken_away_is_one_sentence(tmp_path, capsys) -> None:
+    log = tmp_path / "a.log"
+    with pytest.raises(SystemExit), job(log, "refine"):
+        (tmp_path / "left.zarr").read_bytes()
+    line = f"refine: error: {tmp_path / 'left.zarr'}: no such file: it was there"
+    assert line in capsys.readouterr().err.splitlines()[0]
+    text = log.read_text("utf-8")
+    assert f"ERROR {line}" in text and "Traceback" in text  # for whoever looks for a defect
+
+
+def test_secrets_of_urls_are_not_logged(tmp_path, capsys) -> None:
+    log = tmp_path / "a.log"
+    with pytest.raises(RuntimeError), job(log, "ingest") as lines:
+        lines.info("reads https://me:hunter2@host/a")
+        raise RuntimeError("https://host/a?X-Amz-Signature=hunter2")
+    said = capsys.readouterr().err
+    assert "hunter2" not in log.read_text("utf-8") + said and said.count("host/a") >= 2
+
+
 def test_freed_memory_is_used_again(tmp_path) -> None:
     """What follows a block of 64 MiB (16384 pages) costs no page of the system's within a job."""
     if not hasattr(ctypes.CDLL(None), "mallopt"):

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
-from stereotruth.project import FILES, configured, merged, read_scenes, with_defaults
+from stereotruth.project import (
+    FILES,
+    configured,
+    merged,
+    read_mapping,
+    read_scenes,
+    with_defaults,
+)
 
 
 def test_a_mapping_is_laid_over_another():
@@ -51,3 +59,46 @@ def test_synthetic_cities_are_known_in_any_folder(tmp_path, monkeypatch):
     assert scenes["Qichun-1"].gcps == str(FILES / "config/gcps/Qichun-1.csv")
     with pytest.raises(InputError, match=r"mine\.tsv"):
         read_scenes(Configuration(cities="mine.tsv"))
+
+
+def test_utf_16_is_named(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("seed: 1\n", encoding="utf-16")
+    with pytest.raises(InputError, match=r"c\.yaml: is no UTF-8"):
+        read_mapping(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "".join(
+            [
+                "a0: &a0 [x, x, x, x, x, x, x, x, x]\n",
+                *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12)),
+            ]
+        ),
+        "".join(
+            [
+                "a0: &a0 {x: 1}\n",
+                *(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}\n" for n in range(1, 12)),
+            ]
+        ),
+        "a: &a [1, *a]\n",
+        "a: " + "[" * 5000 + "]" * 5000,
+        "a: x" + "x" * 1_000_000,
+    ],
+    ids=["aliases", "merged", "circle", "deep", "large"],
+)
+def test_what_grows_beyond_measure_is_refused_at_once(tmp_path, text):
+    file = tmp_path / "c.yaml"
+    file.write_text(text)
+    begun = time.process_time()
+    with pytest.raises(InputError, match=r"c\.yaml: (more than 200000 values|is nested|.* MB)"):
+        read_mapping(file)
+    assert time.process_time() - begun < 5
+
+
+def test_aliases_that_do_not_multiply_are_taken(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("a: &a {b: 1}\nc: *a\nd:\n  <<: *a\n  e: 2\n")
+    assert read_mapping(file) == {"a": {"b": 1}, "c": {"b": 1}, "d": {"b": 1, "e": 2}}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,10 @@ def test_a_sheet_is_read_with_crlf_bom_comments_and_short_rows(tmp_path, cities)
         (scenes_text(with_cell("scene", "Qichun_1")), ["line 2", "Qichun_1", "unique id"]),
         (scenes_text(ROW, ROW), ["'Qichun-1'", "more than one row"]),
         (scenes_text(with_cell("lidar", "")), ["line 2", "lidar"]),
+        (scenes_text(with_cell("scene", "x" * 200)), ["line 2", "at most 100 characters"]),
+        (scenes_text(with_cell("scene", "ab" * 25)), ["line 2", "again and again"]),
+        (scenes_text(with_cell("left_image", "in/{city}.tif")), ["line 2", "name in { }"]),
+        (scenes_text(with_cell("gcps", "{scene}.csv")), ["line 2", "name in { }"]),
         (scenes_text(with_cell("right_image", "l.tif")), ["one image twice"]),
         (scenes_text(ROW, columns=(*COLUMNS[:-1], "gcp")), ["'gcps' is missing", "'gcp' is unkn"]),
         (scenes_text(ROW).replace("\t", ","), ["separated by tabs"]),
@@ -223,3 +228,32 @@ def test_lidar_files_of_one_stem_get_names_of_their_own():
     assert sorted(names.values()) == sorted(files)
     assert "2" in names and "1" not in names
     assert names == sheets.store_names(reversed(files))
+
+
+def test_lidar_files_with_endless_names_get_short_ones():
+    """Names of 255 bytes leave no room for what is added, and Snakemake takes repeats for loops."""
+    files = [
+        Path("a", "x1" * 120 + ".laz"),
+        Path("b", "x1" * 120 + "3.laz"),
+        Path("y" * 30 + ".las"),
+    ]
+    names = sheets.store_names(files)
+    assert sorted(names.values()) == sorted(files) and len(names) == 3
+    assert all(len(name) <= 100 and not re.search(r"(.+)\1{18}$", name) for name in names)
+
+
+def test_lidar_files_that_snakemake_takes_for_patterns_are_refused(tmp_path):
+    (tmp_path / "a{city}.laz").touch()
+    with pytest.raises(InputError, match=r"name in \{ \}"):
+        sheets.lidar_files(str(tmp_path))
+
+
+def test_more_scenes_than_are_planned_are_refused_by_number(tmp_path, cities):
+    rows = [with_cell("scene", f"Q-{k}") for k in range(20_000)]
+    file = write(tmp_path / "s.tsv", scenes_text(*rows))
+    with pytest.raises(InputError, match="20000 scenes; a project has at most 2000"):
+        sheets.read_scenes(file, cities)
+    with pytest.raises(InputError, match="no sheet of text"):
+        sheets.read_scenes(write(tmp_path / "s.tsv", '"' + "x" * 200_000), cities)
+    with pytest.raises(InputError, match="25 MB are no sheet"):
+        sheets.read_scenes(write(tmp_path / "s.tsv", "x" * 25_000_000), cities)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,23 +22,51 @@ def project(tmp_path) -> Project:
 
 
 @pytest.fixture(scope="session")
-def data(tmp_path_factory) -> Path:
-    """The city's files: left.tif, right.tif, lidar/, gcps.csv, truth.zarr."""
-    folder = tmp_path_factory.mktemp("data") / "Tiny-1"
-    make_scene(TINY, TINY.scenes[0], folder, spacing_m=0.4, seed=1)
-    return folder
+def once(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """A way to make a folder once for all test processes: the others wait for the first."""
+    top = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        top = top.parent
+
+    def made_once(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = top / f"once_{name}", top / f"once_{name}.done"
+        with (top / f"once_{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of a process that has failed
+                make(folder)
+                done.touch()
+        return folder
+
+    return made_once
 
 
 @pytest.fixture(scope="session")
-def made(data, tmp_path_factory) -> Project:
-    """A project in which tiles/Tiny has been made, by two cores; config in tiny.yaml."""
-    project = copy_project(tmp_path_factory.mktemp("made") / "project")
-    shutil.copytree(data, project.folder / "in")
-    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
-    run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    assert "Look at tiles/Tiny/manifest.csv" in run.text
-    return project
+def data(once) -> Path:
+    """The city's files: left.tif, right.tif, lidar/, gcps.csv, truth.zarr."""
+
+    def make(folder: Path) -> None:
+        make_scene(TINY, TINY.scenes[0], folder / "Tiny-1", spacing_m=0.4, seed=1)
+
+    return once("data", make) / "Tiny-1"
+
+
+@pytest.fixture(scope="session")
+def made(data, once, tmp_path_factory) -> Project:
+    """A project in which tiles/Tiny has been made, by two cores; config in tiny.yaml.
+
+    Each test process has a copy, since a plan writes into the folder, too.
+    """
+
+    def make(folder: Path) -> None:
+        project = copy_project(folder)
+        shutil.copytree(data, project.folder / "in")
+        project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
+        run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
+        assert run.status == 0, run.text[-4000:]
+        assert "Look at tiles/Tiny/manifest.csv" in run.text
+
+    return Project(once("made", make)).copy(tmp_path_factory.mktemp("made") / "project")
 
 
 FUNCTION = """
@@ -60,6 +91,7 @@ SETTINGS = {
         },
         "split": None,
         "bootstrap": 100,
+        "panels": 1,  # a second of matplotlib each
     },
     "predict": {"block_px": 256, "overlap_px": 32},
 }
@@ -75,26 +107,38 @@ def tiled(made, tmp_path_factory) -> Project:
     return project
 
 
+AFTER_THE_TILES = (
+    *(
+        "dataset",
+        "report",
+        "audit/synthetic",
+        "benchmark/synthetic/sgm",
+        "submission/synthetic/sgm",
+    ),
+    *("results/predict/Tiny/Tiny-1/sgm_dsm.tif", "score_dsm/Tiny/Tiny-1/sgm"),
+)
+
+
 @pytest.fixture(scope="session")
-def later(tiled, tmp_path_factory) -> Project:
+def later(tiled, once, tmp_path_factory) -> Project:
     """The project in which the stages after the tiles have run, by one call."""
-    project = tiled.copy(tmp_path_factory.mktemp("later") / "project")
-    run = project.snakemake(
-        *("dataset", "report", "audit/synthetic", "benchmark/synthetic/sgm"),
-        *("results/predict/Tiny/Tiny-1/sgm_dsm.tif", "score_dsm/Tiny/Tiny-1/sgm"),
-        *("--configfile", "tiny.yaml", "later.yaml"),
-    )
-    assert run.status == 0, run.text[-4000:]
-    assert "Traceback" not in run.text
-    last = run.text[run.text.rindex("(100%) done") :]
-    for words in (
-        "Look at results/report/Tiny/index.html",
-        "SGM on synthetic: EPE 0.",
-        "look at benchmark/synthetic/sgm/cities.csv",
-        "Audit of synthetic: ",
-        "Look at results/predict/Tiny/Tiny-1/sgm_dsm.tif",
-        "Surface model of Tiny-1 by sgm: ",
-    ):
-        assert words in last
-    assert "manifest.csv" not in last  # an earlier run has made the tiles
-    return project
+
+    def make(folder: Path) -> None:
+        project, settings = tiled.copy(folder), ("--configfile", "tiny.yaml", "later.yaml")
+        run = project.snakemake(*AFTER_THE_TILES, "verify", *settings)
+        assert run.status == 0, run.text[-4000:]
+        assert "Traceback" not in run.text
+        last = run.text[run.text.rindex("(100%) done") :]
+        for words in (
+            "Look at results/report/Tiny/index.html",
+            "SGM on synthetic: EPE 0.",
+            "look at benchmark/synthetic/sgm/cities.csv",
+            "Audit of synthetic: ",
+            "Look at results/predict/Tiny/Tiny-1/sgm_dsm.tif",
+            "Surface model of Tiny-1 by sgm: ",
+        ):
+            assert words in last
+        assert "manifest.csv" not in last  # an earlier run has made the tiles
+        assert project.plan(*AFTER_THE_TILES, *settings) == {}  # a second call runs nothing
+
+    return Project(once("later", make)).copy(tmp_path_factory.mktemp("later") / "project")

@@ -19,7 +19,6 @@ def test_the_workflow_s_own_dataset_has_no_faults(tiled, later):
     assert found["pairs"] >= 4 and found["labelled_pairs"] >= 4
     assert found["verdicts"]["fault"] == 0, found["statements"]
     assert abs(found["pooled"]["label_bias_px"]["median"]) < 0.1
-    assert later.plan("audit/synthetic", *ARGUMENTS) == {}
 
 
 def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
@@ -30,7 +29,11 @@ def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
     shutil.rmtree(faulty)
     shutil.copytree(audited.folder / "dataset", faulty)
     with (faulty / "manifest.csv").open(newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["disp"]]
+        rows = [row for row in csv.DictReader(stream) if row["disp"]][:3]  # seconds each
+    with (faulty / "manifest.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
     shutil.copyfile(faulty / rows[0]["left"], faulty / rows[0]["right"])
     run = audited.snakemake("audit/faulty", *ARGUMENTS)
     assert run.status == 0, run.text[-4000:]
@@ -40,5 +43,5 @@ def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
 
 
 def test_an_unknown_dataset_is_named(tiled):
-    run = tiled.snakemake("audit/nothing", *ARGUMENTS)
-    assert run.status != 0 and "no dataset 'nothing'" in run.text
+    run = tiled.refuse("audit/nothing", *ARGUMENTS)
+    assert "no dataset 'nothing'" in run.text

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import stereotruth
 from stereotruth.alignment.align import align
 from stereotruth.alignment.align_report import write_alignment
 
@@ -67,31 +64,6 @@ def test_ids_with_signs_of_formulas_do_not_break_the_figure(cases, tmp_path) -> 
     found = align(gcps.with_name("left.tif"), gcps.with_name("right.tif"), tmp_path / "gcps.csv")
     write_alignment(found, *(tmp_path / f"a.{kind}" for kind in ("json", "csv", "png")))
     assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("home", ["none", "read-only", "writable"])
-def test_compiled_code_has_a_place_without_a_home_and_with_a_read_only_package(
-    tmp_path, monkeypatch, home
-) -> None:
-    package, real = Path(stereotruth.__file__).parent, os.access
-    monkeypatch.setattr(os, "access", lambda path, mode: path != package and real(path, mode))
-    (tmp_path / "file").touch()  # nobody can make folders in it
-
-    def where() -> Path:
-        if home == "none":
-            raise RuntimeError("Could not determine home directory.")
-        return tmp_path / ("file" if home == "read-only" else "home")
-
-    monkeypatch.setattr(Path, "home", where)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder = Path(stereotruth._compiled_code_folder())
-    if home == "writable":
-        assert folder.parent == tmp_path / "home/.cache/stereotruth"
-        return
-    assert folder.parent == tmp_path / f"stereotruth-{os.getuid()}"
-    assert folder.parent.stat().st_mode & 0o077 == 0
-    folder.parent.chmod(0o777)  # as if made by somebody else, who could put code there
-    assert Path(stereotruth._compiled_code_folder()).parent != folder.parent
 
 
 @pytest.mark.slow

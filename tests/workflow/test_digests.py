@@ -67,7 +67,7 @@ REACH = {
 }
 # Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
 # there are, and a scene more is no other scene.
-ANYWHERE = {"errors", "error_statistics", "job", "kernels", "settings"}
+ANYWHERE = {"errors", "error_statistics", "job", "kernel_cache", "kernels", "settings"}
 # Who reports and records does not change what is computed.
 NOT_COVERED = {"job", "products.provenance", "products.publication", "report.index_page"}
 

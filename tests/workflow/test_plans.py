@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 
 import pytest
 import yaml
-
-from ..synthetic.project import ROOT
 
 
 def test_a_city_is_planned_from_nothing(project):
@@ -68,8 +64,7 @@ def test_real_scenes_are_evaluated_by_their_images(project):
     ],
 )
 def test_a_wrong_call_ends_before_any_work(project, arguments, words):
-    run = project.snakemake(*arguments)
-    assert run.status != 0
+    run = project.refuse(*arguments)
     for word in words:
         assert word in run.text
     assert not (project.folder / "results").exists()
@@ -115,8 +110,7 @@ def test_a_missing_file_is_named(project, column):
         (project.folder / f"{name}.laz").touch()
         row[name] = f"{name}.laz"
     (project.folder / f"{column}.laz").unlink()
-    run = project.snakemake("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
-    assert run.status != 0
+    run = project.refuse("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
     for word in ("Mine-1", f"{column}.laz", "mine_scenes.tsv", "Remedy"):
         assert word in run.text
 
@@ -179,10 +173,3 @@ def test_a_setting_that_a_method_does_not_have_ends_the_plan(project):
     assert run.status != 0
     for word in ("benchmark.methods.mine", "has no setting 'uncertainty'", "pipeline"):
         assert word in run.text
-
-
-def test_lint_passes():
-    lint = subprocess.run(
-        [sys.executable, "-m", "snakemake", "--lint"], cwd=ROOT, capture_output=True, text=True
-    )
-    assert lint.returncode == 0, lint.stderr

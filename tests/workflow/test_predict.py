@@ -42,9 +42,8 @@ def test_a_scene_becomes_disparities_and_a_surface_model(later):
     assert TINY.base_height_m - 5 < np.ma.median(heights) < TINY.base_height_m + 30
 
 
-def test_a_second_call_runs_nothing_and_a_resolution_only_the_model(later):
+def test_a_resolution_makes_only_the_model(later):
     project = later
-    assert project.plan(TARGET, *ARGUMENTS) == {}
     (project.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
     jobs = project.plan(TARGET, *ARGUMENTS, "coarse.yaml")
     assert jobs == {"dsm": 1}

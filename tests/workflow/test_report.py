@@ -15,18 +15,11 @@ PAGE = "results/report/Tiny/index.html"
 ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 
-@pytest.fixture(scope="module")
-def reported(later):
-    """The project with the city's page."""
-    assert later.plan("report", *ARGUMENTS) == {}
-    return later
-
-
 @pytest.mark.slow
 @needs_chromium
-def test_the_page_of_a_city_shows_every_tile(reported, tmp_path):
-    page = reported.folder / PAGE
-    with (reported.folder / "tiles/Tiny/manifest.csv").open(newline="") as stream:
+def test_the_page_of_a_city_shows_every_tile(later, tmp_path):
+    page = later.folder / PAGE
+    with (later.folder / "tiles/Tiny/manifest.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     labelled = [row["tile"] for row in rows if row["complete"] == "yes"]
     seen = look(
@@ -60,16 +53,16 @@ def test_the_page_of_a_city_shows_every_tile(reported, tmp_path):
         assert image[1000:].std() > 15
 
 
-def test_another_number_of_large_pictures_makes_the_page_alone(reported):
-    (reported.folder / "fewer.yaml").write_text("report: {sliders: 1}\n")
-    jobs = reported.plan("report", *ARGUMENTS, "fewer.yaml")
+def test_another_number_of_large_pictures_makes_the_page_alone(later):
+    (later.folder / "fewer.yaml").write_text("report: {sliders: 1}\n")
+    jobs = later.plan("report", *ARGUMENTS, "fewer.yaml")
     assert set(jobs) == {"report_city", "report"}
 
 
-def test_snakemake_makes_its_own_report_of_all_that_it_marks(reported):
-    run = reported.snakemake("report", *ARGUMENTS, "--report", "all.html")
+def test_snakemake_makes_its_own_report_of_all_that_it_marks(later):
+    run = later.snakemake("report", *ARGUMENTS, "--report", "all.html")
     assert run.status == 0, run.text[-4000:]
-    text = (reported.folder / "all.html").read_text(encoding="utf-8")
+    text = (later.folder / "all.html").read_text(encoding="utf-8")
     for word in ("coverage.png", "contact_sheet.png", "residuals.png", "index.html"):
         assert word in text
     for caption in ("Where the tiles lie", "Residuals of the ground control points"):

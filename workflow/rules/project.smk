@@ -7,6 +7,7 @@ rule project:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
+        alignment=alignment_of,
         points=point_stores,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_{strip}.json"),
     output:
@@ -36,6 +37,7 @@ use rule project as project_right with:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
+        alignment=alignment_of,
         points=point_stores,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_right_{strip}.json"),
     output:
@@ -57,6 +59,7 @@ rule project_strip:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
+        alignment=alignment_of,
         points=point_stores,
     output:
         done=temp("results/project/{city}/strips/{scene}{side}_{strip}.json"),

@@ -23,12 +23,7 @@ rule rectify:
     params:
         script=content_of("../scripts/rectify.py"),
         bands=asdict(SETTINGS.rectify),
-        code=source_digest(
-            "epipolar.rectify",
-            "epipolar.fit",
-            "alignment.aligned_pair",
-            "alignment.label_uncertainty",
-        ),
+        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
     message:
         "Making epipolar images of scene {wildcards.scene}"
     script:
@@ -58,12 +53,7 @@ rule rectify_strip:
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=asdict(SETTINGS.rectify),
-        code=source_digest(
-            "epipolar.rectify",
-            "epipolar.fit",
-            "alignment.aligned_pair",
-            "alignment.label_uncertainty",
-        ),
+        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"
     script:

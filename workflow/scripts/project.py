@@ -18,6 +18,7 @@ if __name__ == "__main__":
             snakemake.input.points,
             snakemake.output.disparity,
             Settings(**snakemake.params.settings),
+            alignment=snakemake.input.alignment,
             view=snakemake.params.view,
             workers=snakemake.threads,
             scheduler=scheduler,

@@ -1,7 +1,6 @@
 """One aligned pair to epipolar images."""
 
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
@@ -38,7 +37,6 @@ if __name__ == "__main__":
                 snakemake.output.left,
                 snakemake.output.right,
                 workers=snakemake.threads,
-                left_attrs=LabelUncertainty.of(alignment, model).to_attrs(),
                 provenance=describe(
                     checksums(files, *masks), snakemake.params.bands, snakemake.params.code
                 ),

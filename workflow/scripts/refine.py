@@ -36,4 +36,5 @@ if __name__ == "__main__":
             snakemake.output.alignment,
             snakemake.output.observations,
             snakemake.output.figure,
+            given.left[0],
         )

@@ -22,6 +22,9 @@ MATCHING = 0.01  # px, what even the best match may be off
 SYSTEMATIC = 0.01  # px that all tie points are taken to share, to weigh them against a prior
 CLASSES = 5  # of matches, from the best to the poorest
 FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
+STARTS = 300  # planes, and shifts, from which the adjustment starts
+START_PX = 0.03  # px of an observation, besides its own, when blunders are looked for
+BLUNDER_ODDS = 1.0  # px²: of no blunder to a blunder in a square pixel
 TUKEY = 4.685  # deviations at which an observation has lost all weight
 
 
@@ -145,10 +148,53 @@ def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
     return float(np.sqrt(of_mean * freedom / (freedom - 2)))
 
 
+def _agreement(at: Floats, observed: Floats, scale: Floats) -> Floats:
+    """Residuals [n, 2] px of observations from the plane over the image that most agree with.
+
+    ``at`` [n, 2] positions, ``scale`` [n] px of an observation. Blunders may be most, and all of
+    them off to one side, as long as they agree less with each other than the others do. Shifts by
+    one observation each and planes through three each are tried, and the one of the greatest
+    likelihood is taken, blunders of any size being as probable as good observations.
+    """
+    count = len(at)
+    basis = np.column_stack([np.ones(count), (at - at.mean(axis=0)) / max(np.ptp(at), 1.0)])
+    rng = np.random.default_rng(count)
+    planes = [np.stack([o, np.zeros(2), np.zeros(2)]) for o in observed[:: 1 + count // STARTS]]
+    for _ in range(STARTS):
+        chosen = rng.choice(count, 3, replace=False)
+        if abs(np.linalg.det(basis[chosen])) > 0.02:
+            planes.append(np.linalg.solve(basis[chosen], observed[chosen]))
+
+    def likelihood(plane: Floats) -> float:
+        squared = np.sum((observed - basis @ plane) ** 2, axis=1) / scale**2
+        return float(np.log1p(BLUNDER_ODDS * np.exp(-squared / 2) / scale**2).sum())
+
+    best = max(planes, key=likelihood)
+    for _ in range(20):
+        squared = np.sum((observed - basis @ best) ** 2, axis=1) / scale**2
+        odds = BLUNDER_ODDS * np.exp(-squared / 2) / scale**2
+        root = np.sqrt(odds / (1.0 + odds))[:, None] / scale[:, None]
+        best = np.linalg.lstsq(
+            np.vstack([basis * root, np.diag([0.0, 1e-3, 1e-3])]),
+            np.vstack([observed * root, np.zeros((3, 2))]),
+            rcond=None,
+        )[0]
+    return observed - basis @ best
+
+
 def estimate(
-    design: Floats, observed: Floats, own: Floats, sites: NDArray[np.int64], prior: Floats
+    design: Floats,
+    observed: Floats,
+    own: Floats,
+    sites: NDArray[np.int64],
+    prior: Floats,
+    at: Floats,
+    common_px: float = 0.0,
 ) -> Estimate:
     """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
+
+    ``at`` [n, 2] px: where in the left image. ``common_px``: standard deviation of an error
+    that all observations have in common and that no residual shows.
 
     ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
     poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
@@ -163,8 +209,8 @@ def estimate(
     expected = np.hypot(own, MATCHING)[:, None]
     inner = design @ root
     rank = root.shape[1]
-    used = np.ones(len(observed), bool)
-    residuals = observed - np.median(observed, axis=0)
+    residuals = _agreement(at, observed, np.hypot(expected[:, 0], START_PX))
+    used = np.hypot(*residuals.T) < 3.0 * np.hypot(expected[:, 0], START_PX)
     z = np.zeros(rank)
     sigma, site_sigma = np.ones(2), np.zeros(2)
     weights = np.ones(len(observed))
@@ -172,15 +218,12 @@ def estimate(
         relative = residuals / expected
         sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
         length = np.hypot(*(relative / sigma).T)
-        if step < 8:  # first a convex one: Huber's, which any start leads to its minimum
-            weights = np.minimum(1.0, 2.0 / np.maximum(length, 1e-12))
-        else:
-            weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
-            used = weights > 0.0
-            sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
-            site_sigma = np.array(
-                [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
-            )
+        weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
+        used = weights > 0.0
+        sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+        site_sigma = np.array(
+            [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
+        )
         variance = expected**2 * (sigma**2 + counts[:, None] * site_sigma**2)
         information = weights[:, None] / variance
         weighted = inner * information[:, :, None]
@@ -204,6 +247,7 @@ def estimate(
     values, squares = values[seen], (vectors[:, seen].T @ right) ** 2
     own = expected[:, 0]
     common = np.array([_shared_sigma(residuals[:, k], information[:, k], own) for k in (0, 1)])
+    common = np.hypot(common, common_px)
     # That of the right side, by errors of the observations that have this in common:
     floor = SYSTEMATIC**-2.0
     single -= (shared * (total + floor - (common * floor) ** 2) / total**2) @ shared.T
@@ -224,6 +268,31 @@ def estimate(
         normal,
         root @ alone,
     )
+
+
+def agreement_of_halves(
+    design: Floats,
+    observed: Floats,
+    own: Floats,
+    sites: NDArray[np.int64],
+    prior: Floats,
+    at: Floats,
+) -> tuple[float, float]:
+    """Mean misfit of one half of the sites, in deviations: as they came, and by the other half.
+
+    A misfit counts TUKEY deviations at most, so that blunders say nothing. Arguments as in
+    :func:`estimate`.
+    """
+    halves = np.unique(sites, return_inverse=True)[1] % 2
+    before, after = 0.0, 0.0
+    for half in (0, 1):
+        told, asked = halves != half, halves == half
+        found = estimate(design[told], observed[told], own[told], sites[told], prior, at[told])
+        scale = np.hypot(own[asked], MATCHING)[:, None] * found.ratio
+        left = observed[asked] - design[asked] @ found.parameters
+        before += float(np.minimum(np.hypot(*(observed[asked] / scale).T), TUKEY).sum())
+        after += float(np.minimum(np.hypot(*(left / scale).T), TUKEY).sum())
+    return before / len(observed), after / len(observed)
 
 
 def linearised_at(

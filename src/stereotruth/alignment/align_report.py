@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..products.files import replacing
+from ..products.files import as_text, replacing
 from ..products.pictures import round_length
 from .aligned_pair import Alignment
 
@@ -35,7 +35,13 @@ def _write_table(alignment: Alignment, path: Path) -> None:
                 numbers = [f"{v:.4f}" for name in pairs for v in getattr(g, name)]
                 ground = [f"{g.lon:.10f}", f"{g.lat:.10f}", f"{g.height:.4f}"]
                 writer.writerow(
-                    [fit.view, g.id, "yes" if g.used else "no", *ground, *numbers, g.reason]
+                    [
+                        fit.view,
+                        as_text(g.id),
+                        "yes" if g.used else "no",
+                        *(*ground, *numbers),
+                        as_text(g.reason),
+                    ]
                 )
 
 

@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
+from ..products.files import of_text
 
 Floats = NDArray[np.float64]
 
 
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
+MOST_POINTS = 20_000  # nobody measures as many in two images
+MOST_BYTES = 20_000_000  # of their file
 LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
 
@@ -72,7 +75,7 @@ def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
     rows = _rows(file, fail)
     points: dict[str, tuple[int, list[float]]] = {}
     for line, cells in rows:
-        name = cells["id"]
+        name = of_text(cells["id"])
         if not name:
             raise fail(f"line {line}: the id is empty", "give every point an id of its own")
         if name in points:
@@ -122,6 +125,11 @@ def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
 def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
     """(line number, stripped cells by column) of each line that holds anything."""
     try:
+        if file.stat().st_size > MOST_BYTES:
+            raise fail(
+                f"{file.stat().st_size / 1e6:.0f} MB are no table of control points",
+                f"name the file of the points; at most {MOST_POINTS} are used",
+            )
         text = file.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise fail("no such file", "correct the path in column gcps of the scenes sheet") from None
@@ -154,6 +162,12 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
                 "write one cell per column, empty ones too, and decimal points",
             )
         rows.append((reader.line_num, dict(zip(header, cells))))
+        if len(rows) > MOST_POINTS:
+            raise fail(
+                f"more than {MOST_POINTS} points",
+                "give those that are measured in the images; points of LiDAR belong to column "
+                "lidar",
+            )
     if header is None:
         raise fail("the file is empty", expected)
     return rows

@@ -7,15 +7,16 @@ from numpy.typing import NDArray
 
 from ..epipolar.resampling import RADIUS, sample, tap_weights
 from ..kernels import inner, kernel
-from .window_fit import gain_and_correlation, shift, weighted_mean
+from .window_fit import gain_and_correlation, mean_slopes, misfit, shift, weighted_mean
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 
-HALF = 10  # px: windows of 21 x 21
-ITERATIONS = 12
+ITERATIONS = 20
 CONVERGED = 0.003  # px
+TUKEY = 4.685  # deviations at which a pixel has lost all weight
+PARTS = 3  # along each side of a window, whose shifts are compared
 
 
 @kernel
@@ -51,40 +52,140 @@ def _inner(picture: Picture, window: Floats) -> None:
             k += 1
 
 
+@inner
+def _weigh(
+    left: Floats,
+    right: Floats,
+    clear: Floats,
+    means: tuple[float, float],
+    gain: float,
+    weight: Floats,
+    scratch: Floats,
+) -> float:
+    """Fill ``weight`` [n] of the pixels; standard deviation of their misfits, robust.
+
+    No pixel counts for more than its neighbours because it stands out: the weight falls with the
+    slope of the grey values, and so does what the pixel tells about the shift from where the slope
+    is the usual one. Pixels that do not fit (moved, shaded) lose theirs (Tukey's biweight).
+    """
+    n = 0
+    for k in range(clear.size):
+        if clear[k] > 0.0:
+            gx, gy = mean_slopes(left, right, gain, k)
+            scratch[n] = gx * gx + gy * gy
+            n += 1
+    usual = np.median(scratch[:n])
+    n = 0
+    for k in range(clear.size):
+        if clear[k] > 0.0:
+            gx, gy = mean_slopes(left, right, gain, k)
+            weight[k] = usual / (usual + gx * gx + gy * gy)
+            miss = misfit(left, right, means[0], means[1], gain, k)
+            scratch[n] = abs(miss) * np.sqrt(weight[k])
+            n += 1
+    scale = max(1.4826 * np.median(scratch[:n]), 1e-6 * np.sqrt(usual))
+    n = 0
+    for k in range(clear.size):
+        if clear[k] > 0.0:
+            t = scratch[n] / (TUKEY * scale)
+            weight[k] *= (1.0 - t * t) ** 2 if t < 1.0 else 0.0
+            n += 1
+    return scale
+
+
+@inner
+def _discord(
+    left: Floats,
+    right: Floats,
+    weight: Floats,
+    means: tuple[float, float],
+    gain: float,
+    along: Floats,
+) -> float:
+    """Standard deviation px of the mean shift, by how much the parts of a window differ.
+
+    Along the direction ``along`` [2] in which heights move a point, each of PARTS² parts has a
+    shift of its own; their variance beyond what the misfits explain is that between studies of a
+    meta-analysis (DerSimonian & Laird 1986).
+    """
+    side = int(np.sqrt(weight.size))
+    told, wanted = np.zeros(PARTS * PARTS), np.zeros(PARTS * PARTS)
+    squared, total = 0.0, 0.0
+    for k in range(weight.size):
+        part = (k // side) * PARTS // side * PARTS + (k % side) * PARTS // side
+        gx, gy = mean_slopes(left, right, gain, k)
+        slope = gx * along[0] + gy * along[1]
+        miss = misfit(left, right, means[0], means[1], gain, k)
+        told[part] += weight[k] * slope * slope
+        wanted[part] += weight[k] * slope * miss
+        squared += weight[k] * miss * miss
+        total += weight[k]
+    variance = squared / total  # of a misfit of unit weight
+    whole, squares, scatter, parts = 0.0, 0.0, 0.0, 0
+    for p in range(told.size):
+        if told[p] > 0.0:
+            whole += told[p]
+            squares += told[p] ** 2
+            scatter += wanted[p] ** 2 / told[p] / variance
+            parts += 1
+    if parts < 3 or not whole > squares / whole:
+        return np.inf
+    between = max(scatter - (parts - 1.0), 0.0) * variance / (whole - squares / whole)
+    return np.sqrt(between * squares) / whole
+
+
 @kernel
 def least_squares_match(
     template: Picture,
+    clear: Floats,
     source: Picture,
     col: float,
     row: float,
     carry: Floats,
     scale: tuple[float, float],
+    along: Floats,
     start: Floats,
     result: Floats,
 ) -> None:
-    """Fill ``result`` with the shift (x, y) in template px, its sigma, and the correlation.
+    """Fill ``result`` [6] with the match of a window: a robust least-squares match.
 
-    ``template`` has a margin of one px for the slopes. Unknowns are the shift, gain and offset;
-    the slopes are the mean of both windows', so that noise does not draw the shift. NaN where the
-    match leaves the picture or does not converge.
+    Shift (x, y) in template px; its sigma by the misfits; the correlation; the sigma by how much
+    the window's parts disagree along ``along`` [2]; the share of the clear pixels' weight that was
+    lost to misfits. ``template`` has a margin of one px for the slopes; ``clear`` [n] is 1 for the
+    pixels that take part. Unknowns are the shift, gain and offset; the slopes are the mean of both
+    windows', so that noise does not draw the shift. NaN where the match leaves the picture or does
+    not converge.
     """
     count = (template.shape[0] - 2) ** 2
     warped = np.empty(template.shape, np.float32)
-    left, right, weight = np.empty((count, 3)), np.empty((count, 3)), np.ones(count)
+    left, right = np.empty((count, 3)), np.empty((count, 3))
+    weight, scratch = clear.copy(), np.empty(count)
     result[:] = np.nan
     _inner(template, left)
-    mean_left = weighted_mean(left, weight)
+    for k in range(count):
+        if clear[k] == 0.0:  # whatever lies there, nodata too, takes no part
+            left[k] = 0.0
     x, y = start[0], start[1]
     for _ in range(ITERATIONS):
         c = col + carry[0, 0] * x + carry[0, 1] * y
         r = row + carry[1, 0] * x + carry[1, 1] * y
         warp_patch(source, c, r, carry, scale, warped)
         _inner(warped, right)
-        mean_right = weighted_mean(right, weight)
-        gain, correlation = gain_and_correlation(left, right, weight, mean_left, mean_right)
+        for k in range(count):
+            if clear[k] == 0.0:
+                right[k] = 0.0
+        means = weighted_mean(left, weight), weighted_mean(right, weight)
+        gain, correlation = gain_and_correlation(left, right, weight, means[0], means[1])
         if np.isnan(gain):
             return
-        dx, dy, sigma = shift(left, right, weight, mean_left, mean_right, gain, False)
+        usual = _weigh(left, right, clear, means, gain, weight, scratch)
+        if np.isnan(usual):
+            return
+        means = weighted_mean(left, weight), weighted_mean(right, weight)
+        gain, correlation = gain_and_correlation(left, right, weight, means[0], means[1])
+        if np.isnan(gain):
+            return
+        dx, dy, sigma = shift(left, right, weight, means[0], means[1], gain, False)
         if np.isnan(dx):
             return
         x += dx
@@ -95,4 +196,17 @@ def least_squares_match(
             result[0], result[1] = x, y
             result[2] = sigma
             result[3] = correlation
+            result[4] = _discord(left, right, weight, means, gain, along)
+            result[5] = _lost(left, right, gain, clear, weight)
             return
+
+
+@inner
+def _lost(left: Floats, right: Floats, gain: float, clear: Floats, weight: Floats) -> float:
+    """Share of the clear pixels that the misfits have left without weight."""
+    total, gone = 0, 0
+    for k in range(clear.size):
+        if clear[k] > 0.0:
+            total += 1
+            gone += weight[k] == 0.0
+    return gone / total

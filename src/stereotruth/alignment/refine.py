@@ -7,11 +7,12 @@ heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the t
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
 settle the relative part, and the rest as far as they see it.
 
-Blunders (moved or built since, vegetation, water, repetition) get no weight (Tukey's biweight).
-Thousands of matches do not pretend thousandths of a pixel: neighbours share errors, by an amount
-that is estimated from the scatter between sites, and all share one, that is estimated from how much
-good and poor matches differ. If the tie points do not contradict the alignment, it is left exactly
-as it is.
+The adjustment starts from what most tie points agree on, and blunders (moved or built since,
+vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
+by an amount that is estimated from the scatter between sites. All share one, that is estimated
+from how much good and poor matches differ. The alignment is left exactly as it is if the tie
+points do not contradict it, or if the corrections from one half of the sites do not improve the
+other half.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from ..lidar.point_store import PointStore, open_stores
 from .adjustment import (
     Estimate,
     Observations,
+    agreement_of_halves,
     epipolar_model,
     estimate,
     linearised_at,
@@ -156,8 +158,8 @@ def _search(
     sources: tuple[Source, Source],
     stores: Sequence[PointStore],
     prior: Floats,
-) -> tuple[Observations, Estimate, Alignment] | str:
-    """Tie points, estimate and refined alignment; or why there is none."""
+) -> tuple[Observations, Estimate, Alignment, tuple[float, float]] | str:
+    """Tie points, estimate, refined alignment and :func:`agreement_of_halves`; or why not."""
     sizes = sources[0].size, sources[1].size
     parameters = np.zeros(12)
     places, found_at = None, parameters
@@ -194,7 +196,15 @@ def _search(
             return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
-        found = estimate(design, observed + design @ parameters, ties.sigma, ties.site, prior)
+        found = estimate(
+            design,
+            observed + design @ parameters,
+            ties.sigma,
+            ties.site,
+            prior,
+            ties.left,
+            places.guard.common_px,
+        )
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
         last, parameters = parameters, found.parameters
@@ -216,7 +226,11 @@ def _search(
             f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
             "blunders): LiDAR and images do not show the same ground, or not at the same height"
         )
-    return observations, found, current
+    halves = agreement_of_halves(
+        design, observations.before, ties.sigma, ties.site, prior, ties.left
+    )
+    log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
+    return observations, found, current, halves
 
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
@@ -309,16 +323,26 @@ def refine(
             replace(alignment, warnings=warnings, refinement=record, provenance=record_of),
             None,
         )
-    observations, found, refined = result
-    insignificant = _chance(found) > SIGNIFICANT
-    reason = "the tie points do not contradict the alignment" if insignificant else ""
+    observations, found, refined, (before, after) = result
+    reason = ""
+    if _chance(found) > SIGNIFICANT:
+        reason = "the tie points do not contradict the alignment"
+    elif after >= before and gcps:
+        reason = (
+            "the tie points of one half of the scene fit the other half's less well than the "
+            f"control points do ({after:.2f} deviations, {before:.2f} before)"
+        )
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
-    if insignificant:  # what is not applied adds to the uncertainty
+    record["misfit_of_one_half_by_the_other"] = {
+        "before": round(before, 3),
+        "after": round(after, 3),
+    }
+    if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
         observations = replace(observations, after=observations.before)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
 
 from ..products.files import replacing
-from ..products.pictures import save_figure
+from ..products.pictures import DIFFERENCES, save_figure, stretch
+from ..products.rasters import open_raster
 from .adjustment import Observations
 from .aligned_pair import Alignment
 
+PICTURE_PX = 1024  # of the left image, in the figure
 COLUMNS = (
     "site",
     "left_col_px",
@@ -36,15 +42,17 @@ def write_refinement(
     json_file: str | Path,
     csv_file: str | Path,
     png_file: str | Path,
+    left_image: str | Path,
 ) -> None:
     """Write a refined alignment (JSON), its tie points (CSV) and their figure (PNG).
 
-    Without observations the table is empty and the figure says why.
+    The figure has the tie points over the left image, coloured by their residuals. Without
+    observations the table is empty and the figure says why.
     """
     with replacing(csv_file) as scratch:
         _write_table(observations, scratch)
     with replacing(png_file) as scratch:
-        _draw(alignment, observations, scratch)
+        _draw(alignment, observations, scratch, left_image)
     alignment.save(json_file)
 
 
@@ -64,16 +72,44 @@ def _write_table(observations: Observations | None, path: Path) -> None:
             writer.writerow([ties.site[k], *row])
 
 
-def _draw(alignment: Alignment, observations: Observations | None, path: Path) -> None:
-    """Medians of the sites as vectors on the epipolar grid, and histograms of both components."""
+def _reduced(left_image: str | Path) -> NDArray[np.uint8]:
+    """The first band of an image as a grey picture of PICTURE_PX at most on its longer side."""
+    with open_raster(left_image) as source:
+        step = max(1.0, max(source.shape) / PICTURE_PX)
+        shape = tuple(max(int(n / step), 1) for n in source.shape)
+        return stretch(source.read(1, out_shape=shape, resampling=Resampling.average))
+
+
+def _draw_over_image(axes: Sequence[Axes], o: Observations, left_image: str | Path) -> None:
+    """Tie points over the left image, coloured by the residual of the disparity."""
+    picture = _reduced(left_image)
+    with open_raster(left_image) as source:
+        rows, cols = source.shape
+    limit = max(float(np.percentile(np.abs(o.before[:, 0]), 90)), 0.05)
+    for ax, word, values in zip(axes, ("before", "after"), (o.before[:, 0], o.after[:, 0])):
+        extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
+        ax.imshow(picture, cmap="gray", extent=extent)
+        shown = ax.scatter(
+            *o.ties.left.T, c=values, cmap=DIFFERENCES, vmin=-limit, vmax=limit, s=9, linewidths=0
+        )
+        ax.set_title(f"{word}: over the left image", loc="left", fontsize=10)
+        ax.set(xlabel="column in px of the left image", ylabel="row in px")
+        ax.figure.colorbar(shown, ax=ax, label="disparity of LiDAR − that of the images, px")
+
+
+def _draw(
+    alignment: Alignment, observations: Observations | None, path: Path, left_image: str | Path
+) -> None:
+    """Medians of the sites as vectors, tie points over the image, histograms of the residuals."""
     record = alignment.refinement
     word = "applied" if record["applied"] else f"not applied: {record['reason']}"
-    figure = Figure(figsize=(11.5, 10.0), layout="constrained")
+    figure = Figure(figsize=(11.5, 15.0), layout="constrained")
     figure.suptitle(f"{alignment.scene or 'alignment'}: refinement {word}")
     if observations is None:
         save_figure(path, figure)
         return
-    axes = figure.subplots(2, 2, height_ratios=(3, 2))
+    axes = figure.subplots(3, 2, height_ratios=(3, 3, 2))
+    _draw_over_image(axes[1], observations, left_image)
     used, ties = observations.used, observations.ties
     states = {"before": observations.before, "after": observations.after}
     sites = np.unique(ties.site[used])
@@ -94,7 +130,7 @@ def _draw(alignment: Alignment, observations: Observations | None, path: Path) -
             scale_units="xy",
             scale=longest * 10 / side,
             color="C0",
-            width=0.004,
+            width=0.005,
         )
         ax.quiverkey(arrows, 0.85, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
         ax.plot(*observations.at[~used].T, "x", color="C3", markersize=3, alpha=0.6)
@@ -102,7 +138,7 @@ def _draw(alignment: Alignment, observations: Observations | None, path: Path) -
         ax.set(xlabel="x in px of the epipolar grid", ylabel="y in px", aspect="equal")
         ax.invert_yaxis()
     names = ("disparity of LiDAR − that of the images", "y-parallax")
-    for k, (ax, name, figures) in enumerate(zip(axes[1], names, ("disparity", "y_parallax"))):
+    for k, (ax, name, figures) in enumerate(zip(axes[2], names, ("disparity", "y_parallax"))):
         values = [state[used, k] for state in states.values()]
         bins = np.linspace(*np.percentile(np.concatenate(values), (0.5, 99.5)), 61)
         for (state, _), v, colour in zip(states.items(), values, ("0.7", "C0")):

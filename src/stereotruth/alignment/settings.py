@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated, Literal
 
-from ..settings import Flag, Text, Unit, settings
+from ..settings import FilePath, Flag, Unit, settings
 
 
 @settings
@@ -23,7 +23,7 @@ class Settings:
     `results/refine/<city>/<scene>/` says what was seen and changed, and doubts heights of the LiDAR
     that do not fit the control points, the images or the RPCs; with false nothing checks them"""
 
-    fixed: Annotated[dict[str, Text], Unit("scene: path")] = field(default_factory=dict)
+    fixed: Annotated[dict[str, FilePath], Unit("scene: path")] = field(default_factory=dict)
     """an `alignment.json` that a scene is made with as it is (a published one, or
     `results/refine/<city>/<scene>/alignment.json` put aside): neither control points nor LiDAR have
     a say any more, so that one more LiDAR file leaves all labels that it does not touch as they

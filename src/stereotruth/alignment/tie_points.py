@@ -1,10 +1,10 @@
 """Places where LiDAR and both images show one smooth surface, and by how much they disagree.
 
 The scene is sampled at a fixed number of sites, spread evenly over the ground that both images and
-the LiDAR cover, whatever its size. In a site, places are taken where the points lie on one plane
-(no roof edge, no crown, nothing hidden behind it) and the left image has texture. The plane maps
-the left window to the right image, and least-squares matching (Gruen 1985) finds by how much the
-right image shows the same elsewhere: the tie point's shift.
+the LiDAR cover, whatever its size. In a site, places are windows on a plane of the points, whose
+pixels take part if nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the
+left window to the right image, and robust least-squares matching finds by how much the right image
+shows the same elsewhere (:mod:`.least_squares_matching`): the tie point's shift.
 
 On a plane a right image position depends on the left one by ``carry``, so that the shift is, to
 first order, (error of the right image's model) − carry · (error of the left's): what both have in
@@ -23,16 +23,17 @@ from numpy.typing import NDArray
 from ..epipolar.image_reader import Source
 from ..epipolar.resampling import ANTIALIAS, RADIUS
 from ..epipolar.rpc import SensorModel
-from .least_squares_matching import HALF, least_squares_match, warp_patch
-from .tie_sites import SITE, Places
+from .least_squares_matching import least_squares_match, warp_patch
+from .tie_planes import HALF
+from .tie_sites import MIN_CLEAR, SITE, Places
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 
 STEEPEST = 3.0  # ratio of scales between the images along any direction
-MIN_CORRELATION = 0.6
-POOR_SIGMA = 0.2  # px: a match that is worse by its own residuals is none
+MIN_CORRELATION = 0.5
+POOR_SIGMA = 0.25  # px: a match that is worse by its own residuals is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,7 @@ class _Windows:
 
     index: int
     template: Picture
+    clear: Floats
     pixels: Picture
     at: Floats
     carry: Floats
@@ -101,12 +103,17 @@ class _Windows:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the sensor models put places: ``left`` [n, 2] whole px, and as in TiePoints."""
+    """Where the sensor models put places: ``left`` [n, 2] whole px, and as in TiePoints.
+
+    ``along`` [n, 2]: direction in the left image in which a height above the plane displaces a
+    point of the right image.
+    """
 
     left: Floats
     height: Floats
     right: Floats
     carry: Floats
+    along: Floats
 
     @classmethod
     def of(cls, places: Places, left: SensorModel, right: SensorModel) -> Geometry:
@@ -114,7 +121,30 @@ class Geometry:
         exact = np.stack(left.project(places.lon, places.lat, places.height), axis=1)
         where = np.rint(exact)
         height = places.height + np.sum((where - exact) * places.slope, axis=1)
-        return cls(where, height, *_carry(left, right, where, height, places.slope))
+        at, carry = _carry(left, right, where, height, places.slope)
+        ends = [
+            right.project(*left.localize(*where.T, height + z), height + z) for z in (-5.0, 5.0)
+        ]
+        moved = np.stack(ends[1], axis=-1) - np.stack(ends[0], axis=-1)
+        known = np.isfinite(carry).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
+        along = np.zeros_like(moved)
+        along[known] = np.linalg.solve(carry[known], moved[known, :, None])[:, :, 0]
+        along /= np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+        return cls(where, height, at, carry, along)
+
+
+def _even(picture: Picture) -> Picture:
+    """A picture without the brightness of its surroundings, and no pixel above the usual contrast.
+
+    So that an edge that stands out has no more say than the texture around it; 0 where the picture
+    has no value.
+    """
+    known = np.isfinite(picture)
+    level = float(picture[known].mean())
+    filled = np.where(known, picture - level, np.float32(0))
+    detail = filled - cv2.GaussianBlur(filled, (0, 0), 3.0)
+    usual = 1.4826 * float(np.median(np.abs(detail[known]))) + 1e-6
+    return np.where(known, np.clip(detail / usual, -1.5, 1.5), 0.0).astype(np.float32)
 
 
 def _prepared(
@@ -143,22 +173,26 @@ def _prepared(
             template = picture[
                 max(j - HALF - 1, 0) : j + HALF + 2, max(i - HALF - 1, 0) : i + HALF + 2
             ]
-            if template.shape != (2 * HALF + 3,) * 2 or not np.isfinite(template).all():
+            if template.shape != (2 * HALF + 3,) * 2:
+                continue
+            holes = cv2.dilate((~np.isfinite(template)).astype(np.uint8), np.ones((3, 3), np.uint8))
+            clear = (places.clear[k] & (holes[1:-1, 1:-1] == 0)).astype(np.float32)
+            if clear.sum() < MIN_CLEAR:
                 continue
             carry, scale = geometry.carry[k], _widening(geometry.carry[k])
             at = geometry.right[k] - origin
             warp_patch(pixels, *at, carry, scale, big)
-            known = np.isfinite(big)
-            if known.mean() < 0.5:
+            if np.isfinite(big).mean() < 0.5:
                 continue
-            inner = template[1:-1, 1:-1]
-            scores = cv2.matchTemplate(
-                np.where(known, big - big[known].mean(), np.float32(0)),
-                inner - inner.mean(),
-                cv2.TM_CCOEFF_NORMED,
+            inner = _even(template)[1:-1, 1:-1]
+            mean = float((inner * clear).sum() / clear.sum())
+            scores = cv2.matchTemplate(_even(big), (inner - mean) * clear, cv2.TM_CCORR)
+            energy = cv2.matchTemplate(_even(big) ** 2, clear, cv2.TM_CCORR)
+            energy = energy * float((((inner - mean) * clear) ** 2).sum())
+            scores = scores / np.sqrt(np.maximum(energy, 1e-6))
+            yield _Windows(
+                k, template, clear.ravel().astype(np.float64), pixels, at, carry, scale, scores
             )
-            scores = np.where(np.abs(scores) <= 1.0, scores, np.float32(0))  # of flat windows: inf
-            yield _Windows(k, template, pixels, at, carry, scale, scores)
 
 
 def common_shift(
@@ -190,14 +224,16 @@ def match(
     radius: int,
 ) -> TiePoints:
     """Match every place within ``radius`` px (of the left image); places that fail are left out."""
-    results = np.full((len(places), 4), np.nan)
+    results = np.full((len(places), 6), np.nan)
     for w in _prepared(places, geometry, sources, radius):
         y, x = np.unravel_index(int(np.argmax(w.scores)), w.scores.shape)
         if 0 < x < 2 * radius and 0 < y < 2 * radius:
             start = np.array([x - radius, y - radius], dtype=np.float64)
+            along = geometry.along[w.index]
             least_squares_match(
-                w.template, w.pixels, *w.at, w.carry, w.scale, start, results[w.index]
-            )
+                w.template, w.clear, w.pixels, *w.at, w.carry, w.scale, along, start,
+                results[w.index],
+            )  # fmt: skip
     good = (
         np.isfinite(results).all(axis=1)
         & (results[:, 3] >= MIN_CORRELATION)
@@ -211,6 +247,6 @@ def match(
         right=geometry.right[good],
         carry=geometry.carry[good],
         shift=shift[good],
-        sigma=results[good, 2],
+        sigma=np.hypot(results[good, 2], results[good, 4]),
         correlation=results[good, 3],
     )

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from ..epipolar.image_reader import Source
 from ..epipolar.rpc import SensorModel
 from ..lidar.point_store import PointStore, query_points
-from .least_squares_matching import HALF
+from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Site = tuple[int, int, float, float]  # upper-left col, row px; lowest, highest point in m
 Picture = NDArray[np.float32]
 
@@ -23,18 +24,22 @@ Picture = NDArray[np.float32]
 SITES = 120  # about; each is read by itself
 SITE = 168  # px of the left image, side of a site
 PER_SIDE = 3  # places per side of a site, at most
-STEP = 3  # px between the candidates for a place
-FLAT_PX = 0.3  # rms distance of a place's points from their plane, as disparity
-MIN_POINTS = 24  # of a place
-CENTRED = 0.15  # of the window: how far the points' centroid may be off
-SPREAD = 0.7  # of an even distribution's variance: less, and the points leave part of it empty
+STEP = 4  # px between the candidates for a place
+FLAT_PX = 0.3  # standard deviation of a place's points about their plane, as disparity
+MARGIN = 24  # px around a site whose points are looked at
+TRIED = 24  # windows of each part of a site that are looked at pixel by pixel
+MIN_CLEAR = 90  # pixels of a window, a fifth
+MIN_TOLD = 12.0  # smaller eigenvalue of what they tell, in pixels of the usual slope
+ENOUGH = 120  # places of a scene
+NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
     """n places on smooth textured ground: ``site`` int[n], ``lon``, ``lat`` degrees, ``height`` m.
 
-    ``slope`` [n, 2]: change of the plane's height along col and row of the left image, m/px.
+    ``slope`` [n, 2]: change of the plane's height along col and row of the left image, m/px;
+    ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone, by ``guard``.
     """
 
     site: NDArray[np.int64]
@@ -42,6 +47,8 @@ class Places:
     lat: Floats
     height: Floats
     slope: Floats
+    clear: Bools
+    guard: Guard
 
     def __len__(self) -> int:
         return self.site.size
@@ -123,87 +130,75 @@ def choose_sites(
     return grid(max(coarse * np.sqrt(max(len(grid(coarse)), 1) / SITES), SITE))
 
 
-def _planes(
-    col: Floats, row: Floats, height: Floats, size: int
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Planes through the points of the windows around the candidates of a site.
+def _saturated(picture: Picture) -> tuple[Floats, Floats, Floats]:
+    """What each pixel [k, k] tells of a shift: products xx, xy, yy of its slopes, saturated.
 
-    ``col``, ``row`` px from the site's upper-left pixel. Returns the planes [k, k, 3] (height at
-    the candidate, slopes along col and row in m/px), the rms distance [k, k] m, and whether the
-    points fill the window; candidates are every STEP px from HALF on.
-    """
-    middle = float(np.median(height))
-    u, v, h = (col - size / 2) / HALF, (row - size / 2) / HALF, height - middle
-    index = np.rint(row).astype(int) * size + np.rint(col).astype(int)
-    sums = []
-    for value in (np.ones_like(h), u, v, u * u, u * v, v * v, h, u * h, v * h, h * h):
-        cell = np.bincount(index, value, minlength=size * size).reshape(size, size)
-        box = cv2.boxFilter(
-            cell, -1, (2 * HALF + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
-        )
-        sums.append(box[HALF:-HALF:STEP, HALF:-HALF:STEP])
-    n, su, sv, suu, suv, svv, sh, suh, svh, shh = sums
-    enough = n >= MIN_POINTS
-    n = np.where(enough, n, 1.0)
-    at = np.arange(HALF, size - HALF, STEP, dtype=float)
-    here_v, here_u = np.meshgrid((at - size / 2) / HALF, (at - size / 2) / HALF, indexing="ij")
-    mu, mv, mh = su / n, sv / n, sh / n
-    cuu, cuv, cvv = suu / n - mu * mu, suv / n - mu * mv, svv / n - mv * mv
-    cuh, cvh, chh = suh / n - mu * mh, svh / n - mv * mh, shh / n - mh * mh
-    det = cuu * cvv - cuv * cuv
-    even = 1.0 / 3.0  # variance of an even distribution over [-1, 1]
-    filled = (
-        enough
-        & (np.abs(mu - here_u) < CENTRED)
-        & (np.abs(mv - here_v) < CENTRED)
-        & (cuu > SPREAD * even)
-        & (cvv > SPREAD * even)
-        & (det > 0.25 * even * even)
-    )
-    det = np.where(filled, det, 1.0)
-    a, b = (cvv * cuh - cuv * cvh) / det, (cuu * cvh - cuv * cuh) / det
-    rms = np.sqrt(np.maximum(chh - a * cuh - b * cvh, 0.0))
-    level = middle + mh + a * (here_u - mu) + b * (here_v - mv)
-    return np.stack([level, a / HALF, b / HALF], axis=-1), rms, filled
-
-
-def _texture(picture: Picture) -> Floats:
-    """Smaller eigenvalue [k, k] of the summed squares of the slopes around the candidates.
-
-    NaN where a window of the picture [size, size] has no value.
+    A pixel of the usual slope of its surroundings counts a half, none more than one: texture is
+    wanted, and an edge that stands out is not preferred. NaN where a slope is unknown.
     """
     gy, gx = np.gradient(picture.astype(np.float64))
-    sums = []
-    for value in (gx * gx, gx * gy, gy * gy):
-        box = cv2.boxFilter(
-            np.nan_to_num(value), -1, (2 * HALF + 1,) * 2, borderType=cv2.BORDER_CONSTANT
-        )
-        sums.append(box[HALF:-HALF:STEP, HALF:-HALF:STEP])
-    holes = cv2.dilate(np.isnan(gx + gy).astype(np.uint8), np.ones((2 * HALF + 3,) * 2, np.uint8))[
-        HALF:-HALF:STEP, HALF:-HALF:STEP
-    ]
-    xx, xy, yy = sums
-    smaller = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    return np.where(holes > 0, np.nan, smaller)
+    squared = gx * gx + gy * gy
+    if not np.isfinite(squared).any():
+        return squared, squared, squared
+    usual = float(np.nanmedian(squared))
+    weight = 1.0 / np.maximum(usual + squared, 1e-12)
+    return weight * gx * gx, weight * gx * gy, weight * gy * gy
 
 
-def _best(score: Floats) -> NDArray[np.int64]:
-    """(row, col) [n, 2] of the best finite score in each of PER_SIDE² parts of a grid."""
+def _smaller_eigenvalue(xx: Floats, xy: Floats, yy: Floats) -> Floats:
+    return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+
+
+def _window_sums(values: Floats) -> Floats:
+    return cv2.boxFilter(values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+
+def _candidates(told: tuple[Floats, Floats, Floats], share: Floats, at: NDArray[np.int64]) -> list:
+    """For each of PER_SIDE² parts of a site, indices [≤ TRIED] of the most promising windows.
+
+    By what their pixels tell, and by the share of the points that lie on the plane. ``share``
+    [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
+    """
+    score = np.maximum(_smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in told)), 0.0)
+    score = score[np.ix_(at, at)] * share**4
     found = []
-    edges = np.linspace(0, len(score), PER_SIDE + 1).astype(int)
+    edges = np.linspace(0, len(at), PER_SIDE + 1).astype(int)
     for top, bottom in pairwise(edges):
         for start, end in pairwise(edges):
             part = score[top:bottom, start:end]
-            if np.isfinite(part).any():
-                j, i = np.unravel_index(np.nanargmax(part), part.shape)
-                found.append((top + j, start + i))
-    return np.array(found, dtype=np.int64).reshape(-1, 2)
+            best = np.argsort(-part, axis=None, kind="stable")[:TRIED]
+            best = best[part.ravel()[best] > 0.0]
+            rows, cols = np.unravel_index(best, part.shape)
+            found.append([(top + r) * len(at) + start + c for r, c in zip(rows, cols)])
+    return found
 
 
-def _px_per_m(left: SensorModel, right: SensorModel, col: float, row: float, h: float) -> float:
-    """How far a right image position moves per metre of height at a left position, px."""
-    ends = [np.array(right.project(*left.localize(col, row, z), z)) for z in (h - 5.0, h + 5.0)]
-    return float(np.hypot(*(ends[1] - ends[0])) / 10.0)
+def _parallax(left: SensorModel, right: SensorModel, col: float, row: float, h: float) -> Floats:
+    """[2] px/m: displacement of a point in the right image against a surface below it.
+
+    Per metre that it lies above the surface, in px of the left image, where (col, row) is.
+    """
+    c, r = col + np.array([0.0, 0.0, 0.0, 1.0, 0.0]), row + np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+    z = h + np.array([-5.0, 5.0, 0.0, 0.0, 0.0])
+    at = np.stack(right.project(*left.localize(c, r, z), z), axis=-1)
+    carry = np.stack([at[3] - at[2], at[4] - at[2]], axis=1)
+    return np.linalg.solve(carry, at[1] - at[0]) / 10.0
+
+
+def _query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
+    """(west, south, east, north) of all points that either image may show in a site, degrees."""
+    col0, row0, low, high = site
+    corner_cols, corner_rows = (
+        c.ravel() for c in np.meshgrid([-MARGIN, SITE + MARGIN], [-MARGIN, SITE + MARGIN])
+    )
+    middle = (low + high) / 2
+    ground = [left.localize(col0 + corner_cols, row0 + corner_rows, z) for z in (low, high)]
+    at_right = right.project(*left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle)
+    ground += [right.localize(*at_right, z) for z in (low, high)]
+    ground = np.hstack([np.stack(g) for g in ground])
+    if not np.isfinite(ground).all():
+        return None
+    return np.concatenate([ground.min(axis=1), ground.max(axis=1)])
 
 
 def _places_of(
@@ -212,33 +207,51 @@ def _places_of(
     source: Source,
     stores: Sequence[PointStore],
     site: Site,
-) -> tuple[Floats, Floats] | None:
-    """The places of a site: (col, row) px of the left image [n, 2] and planes [n, 3]."""
-    col0, row0, low, high = site
-    corner_cols, corner_rows = np.meshgrid([-1.0, SITE], [-1.0, SITE])
-    ground = np.hstack(
-        [
-            np.stack(left.localize(col0 + corner_cols.ravel(), row0 + corner_rows.ravel(), h))
-            for h in (low, high)
-        ]
-    )
-    if not np.isfinite(ground).all():
+    guard: Guard,
+) -> tuple[Floats, Floats, Bools] | None:
+    """The places of a site: (col, row) px of the left image [n, 2], planes [n, 3], clear pixels."""
+    col0, row0 = site[:2]
+    box = _query_box(left, right, site)
+    if box is None:
         return None
-    (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
-    points = query_points(stores, west, south, east, north)
+    points = query_points(stores, *box)
+    if len(points) < MIN_POINTS:
+        return None
     col, row = left.project(points.lon, points.lat, points.height)
-    col, row = col - col0, row - row0
-    inside = (col > -0.5) & (col < SITE - 0.5) & (row > -0.5) & (row < SITE - 0.5)
-    if inside.sum() < MIN_POINTS:
+    firm = ~np.isin(points.classification, NOT_FIRM)
+    several = points.number_of_returns > 1
+    if several.mean() < 0.5:  # else the pulses' returns tell nothing here
+        firm &= ~several
+    middle = float(np.median(points.height))
+    parallax = _parallax(left, right, col0 + SITE / 2, row0 + SITE / 2, middle)
+    wide = SITE + 2 * MARGIN
+    cloud = SitePoints.sorted(
+        col - col0 + MARGIN, row - row0 + MARGIN, points.height, firm, (wide, wide), parallax
+    )
+    at = np.arange(HALF + 1, SITE - HALF - 1, STEP)
+    centres = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) + MARGIN
+    planes, share = cloud.fit_planes(centres)
+    flat = planes[:, 3] * np.hypot(*parallax) <= FLAT_PX
+    share = np.where(flat, share, 0.0)
+    told = _saturated(source.read(col0, row0, SITE, SITE))
+    best, clear = [], []
+    for candidates in _candidates(told, share.reshape(len(at), len(at)), at):
+        scored = []
+        for k in candidates:
+            pixels = cloud.clear_pixels(centres[k], planes[k], guard)
+            i, j = centres[k] - MARGIN
+            own = [t[j - HALF : j + HALF + 1, i - HALF : i + HALF + 1] for t in told]
+            pixels &= np.isfinite(own[0])
+            if pixels.sum() >= MIN_CLEAR:
+                scored.append((_smaller_eigenvalue(*(o[pixels].sum() for o in own)), k, pixels))
+        if scored:
+            score, k, pixels = max(scored, key=lambda entry: entry[0])
+            if score >= MIN_TOLD:
+                best.append(k)
+                clear.append(pixels)
+    if not best:
         return None
-    height = points.height[inside]
-    planes, rms, good = _planes(col[inside], row[inside], height, SITE)
-    middle = float(np.median(height))
-    good &= rms * _px_per_m(left, right, col0 + SITE / 2, row0 + SITE / 2, middle) <= FLAT_PX
-    if not good.any():
-        return None
-    best = _best(np.where(good, _texture(source.read(col0, row0, SITE, SITE)), np.nan))
-    return best[:, ::-1] * STEP + HALF + np.array([col0, row0]), planes[best[:, 0], best[:, 1]]
+    return centres[best] - MARGIN + np.array([col0, row0]), planes[best, :3], np.array(clear)
 
 
 def find_places(
@@ -248,15 +261,24 @@ def find_places(
     stores: Sequence[PointStore],
     sites: Sequence[Site],
 ) -> Places:
-    """The best places of every site, seen by the left image (``source``); memory for one site."""
-    found = []
-    for number, site in enumerate(sites):
-        pair = _places_of(left, right, source, stores, site)
-        if pair is not None and len(pair[0]):
-            where, planes = pair
-            lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
-            found.append((np.full(len(where), number), lon, lat, planes[:, 0], planes[:, 1:]))
+    """The best places of every site, seen by the left image (``source``); memory for one site.
+
+    With a wide guard around all that stands off their planes; where that leaves too few places
+    (crowns in rows, dense woods), with the narrower ones.
+    """
+    for guard in GUARDS:
+        found = []
+        for number, site in enumerate(sites):
+            there = _places_of(left, right, source, stores, site, guard)
+            if there is not None:
+                where, planes, clear = there
+                lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
+                number_of = np.full(len(where), number)
+                found.append((number_of, lon, lat, planes[:, 0], planes[:, 1:], clear))
+        if sum(len(part[0]) for part in found) >= ENOUGH:
+            break
     if not found:
         empty = np.empty(0)
-        return Places(np.empty(0, np.int64), empty, empty, empty, np.empty((0, 2)))
-    return Places(*(np.concatenate(parts) for parts in zip(*found)))
+        none = np.empty((0, SIDE, SIDE), bool)
+        return Places(np.empty(0, np.int64), empty, empty, empty, np.empty((0, 2)), none, guard)
+    return Places(*(np.concatenate(parts) for parts in zip(*found)), guard)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from ..configuration import Configuration
@@ -13,6 +13,10 @@ from ..sheets import Scene
 from .check_scene import SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
+from .run_workflow import duration
+
+MANY = 10  # scenes whose check takes more than a moment
+SCENE_SECONDS = 2.5  # of one core: images of 100 MB, control points, headers of the LiDAR
 
 
 def chosen(
@@ -37,9 +41,14 @@ def chosen(
 
 
 def check_project(
-    configfiles: Sequence[Path] | None = None, names: Sequence[str] = ()
+    configfiles: Sequence[Path] | None = None,
+    names: Sequence[str] = (),
+    tell: Callable[[str], object] = lambda text: None,
 ) -> list[Findings]:
-    """Findings of the sheets, of each scene, and of what the run will take, in this order."""
+    """Findings of the sheets, of each scene, and of what the run will take, in this order.
+
+    ``tell`` is called before scenes are looked at, if that takes more than a moment.
+    """
     project = Findings("project")
     settings = scenes = None
     with project.of("configuration"):
@@ -62,6 +71,11 @@ def check_project(
         project.say("sheets", Level.FACT, _counted(scenes))
     if scenes is None:
         return [project]
+    if len(scenes) > MANY:
+        tell(
+            f"looking at {len(scenes)} scenes, about {duration(SCENE_SECONDS * len(scenes))}; "
+            "stereotruth check SCENE … looks at some"
+        )
     every, facts = [project], []
     for name, scene in scenes.items():
         found = Findings(name)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, in_words
 from ..lidar.survey import SurveyedFile, survey
 from ..sheets import Scene
 from .findings import Findings, Level
@@ -22,7 +22,8 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
 
     def look(file: Path) -> SurveyedFile | InputError:
         try:
-            return survey(file, lidar_crs=scene.lidar_crs or None, geoid=scene.geoid or None)
+            with in_words():
+                return survey(file, lidar_crs=scene.lidar_crs or None, geoid=scene.geoid or None)
         except InputError as error:
             return error
 
@@ -49,7 +50,7 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
         placed = [file.heights for file in surveyed if file.heights]
         reach = dense = ""
         if area := sum(file.area_m2 for file in surveyed):
-            dense = f", {points / area:.2g} points/m² by their headers"
+            dense = f", at least {points / area:.2g} points/m² (over the boxes of their headers)"
         if placed:
             reach = f", {min(h[0] for h in placed):.0f} to {max(h[1] for h in placed):.0f} m"
         found.say(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import rasterio
 from rasterio.errors import RasterioError
 
 from ..alignment.align import align, from_rpcs
@@ -16,7 +18,7 @@ from ..alignment.gcp_checks import open_view
 from ..configuration import Configuration
 from ..disparity.overlap_check import apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
-from ..epipolar.image_reader import Source
+from ..epipolar.image_reader import MAX_PIXELS, Source
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.survey import SurveyedFile
@@ -29,6 +31,10 @@ from .findings import Findings, Level
 
 STRIP_ROWS = 256
 WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
+WHOLE_PIXELS = 200_000_000  # likewise: of one that is compressed well, or has no blocks at all
+PLACES = 8  # along each side of a larger one that are looked at
+
+log = logging.getLogger("stereotruth")
 
 
 @dataclass
@@ -71,10 +77,13 @@ def _check_images(scene: Scene, found: Findings) -> bool:
     good = True
     for view in ("left", "right"):
         image = Path(getattr(scene, f"{view}_image"))
-        before = len(found)
-        if not image.is_file():
+        before, there = len(found), False
+        with found.of("files"):
+            there = image.is_file()
+        if not there:
             good = False
-            if not any(f"{view}_image" in finding.text for finding in found):  # said already
+            said = any(f.text.startswith(str(image)) for f in found[before:])
+            if not said and not any(f"{view}_image" in f.text for f in found):
                 found.say(
                     "files",
                     Level.ERROR,
@@ -92,21 +101,37 @@ def _check_images(scene: Scene, found: Findings) -> bool:
 
 def _check_pixels(image: Path) -> None:
     """Raise InputError as rule rectify does; what would take long to read is left to it."""
-    small = image.stat().st_size <= WHOLE_BYTES
-    if not small and _is_sampled(image):
+    try:
+        with open_raster(image) as dataset:
+            pixels, sampled = dataset.width * dataset.height, _is_sampled(dataset)
+    except RasterioError:
+        pixels, sampled = 0, False  # a source says what is wrong
+    small = image.stat().st_size <= WHOLE_BYTES and pixels <= WHOLE_PIXELS
+    if not small and pixels <= MAX_PIXELS and sampled:
         return
     with Source(image) as source:
-        if small:
-            source.check_blocks()
-        _refuse_empty(source)
+        source.check_blocks(whole=small)
+        _refuse_empty(source, whole=small)
 
 
-def _refuse_empty(source: Source) -> None:
-    """Raise InputError if no pixel has a value; reads on until one has."""
+def _refuse_empty(source: Source, *, whole: bool) -> None:
+    """Raise InputError if no pixel has a value; reads on until one has.
+
+    Not ``whole``: looks at some places only, and warns.
+    """
     cols, rows = source.size
-    for row in range(0, rows, STRIP_ROWS):
-        if np.isfinite(source.read(0, row, cols, min(STRIP_ROWS, rows - row))).any():
+    if whole:
+        places = ((row, 0, STRIP_ROWS, cols) for row in range(0, rows, STRIP_ROWS))
+    else:
+        steps = [np.linspace(0, max(n - STRIP_ROWS, 0), PLACES).astype(int) for n in (rows, cols)]
+        places = ((row, col, STRIP_ROWS, STRIP_ROWS) for row in steps[0] for col in steps[1])
+    for row, col, down, across in places:
+        here = min(across, cols - col), min(down, rows - row)
+        if np.isfinite(source.read(int(col), int(row), *map(int, here))).any():
             return
+    if not whole:
+        log.warning("%s: nodata at all of %d places", source.path, PLACES**2)
+        return
     raise InputError(
         f"no pixel but nodata ({source.nodata:g})",
         file=source.path,
@@ -114,13 +139,9 @@ def _refuse_empty(source: Source) -> None:
     )
 
 
-def _is_sampled(image: Path) -> bool:
-    """Whether opening the image as a source reads all over it, to scale its values."""
-    try:
-        with open_raster(image) as dataset:
-            dtype = dataset.dtypes[0]
-    except RasterioError:
-        return False
+def _is_sampled(dataset: rasterio.DatasetReader) -> bool:
+    """Whether opening an image as a source reads all over it, to scale its values."""
+    dtype = dataset.dtypes[0] if dataset.count else ""
     return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
 
 

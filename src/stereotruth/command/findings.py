@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 
-from ..errors import InputError
+from ..errors import InputError, told_by_system
 
 
 class Level(Enum):
@@ -49,7 +49,10 @@ class Findings(list[Finding]):
 
     @contextmanager
     def of(self, about: str) -> Iterator[None]:
-        """In the block, an InputError is a finding, after which the block ends; warnings too."""
+        """In the block, an InputError is a finding, after which the block ends; warnings too.
+
+        So is what the operating system refuses.
+        """
         heard: list[str] = []
         handler = _Listener(heard)
         log = logging.getLogger("stereotruth")
@@ -58,6 +61,10 @@ class Findings(list[Finding]):
             yield
         except InputError as error:
             self.error(about, error)
+        except OSError as error:  # no permission, or gone in this moment
+            if (told := told_by_system(error)) is None:
+                raise
+            self.error(about, told)
         finally:
             log.removeHandler(handler)
         for text in heard:

@@ -21,6 +21,7 @@ from ..alignment.control_points import COLUMNS, read_gcps
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 from ..lidar.geoid import GeoidGrid
+from ..products.files import as_text
 from ..products.ungeoreferenced import open_raster
 
 SAME_PLACE_M = 0.01  # points of two .points files within this are one
@@ -113,7 +114,9 @@ def _write(points: Sequence[Point], to: Path) -> None:
         writer.writerow(COLUMNS)
         for p in points:
             pixels = ["" if math.isnan(v) else f"{v:.4f}" for v in (*p.left, *p.right)]
-            writer.writerow([p.id, f"{p.lon:.10f}", f"{p.lat:.10f}", f"{p.height:.4f}", *pixels])
+            writer.writerow(
+                [as_text(p.id), f"{p.lon:.10f}", f"{p.lat:.10f}", f"{p.height:.4f}", *pixels]
+            )
 
 
 def _text(file: Path) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from .. import __version__
-from ..errors import InputError
+from ..errors import InputError, told_by_system
 
 
 def examples(*lines: str) -> str:
@@ -159,7 +160,7 @@ def check(
     from .check import check_project
     from .check_table import show
 
-    if show(check_project(configfile, scenes or [])):
+    if show(check_project(configfile, scenes or [], partial(typer.echo, err=True))):
         raise typer.Exit(1)
 
 
@@ -261,13 +262,18 @@ def open_pages(
 
 
 def main() -> None:
-    """Entry point: an error of the input is one line, and exit status 1."""
+    """Entry point: an error of the input, or of the system, is one line, and exit status 1."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # ? for what LC_ALL=C cannot show
         sys.stdout.reconfigure(errors="replace")
     try:
         app()
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
+        raise SystemExit(1) from None
+    except OSError as error:
+        if (told := told_by_system(error)) is None:
+            raise
+        sys.stderr.write(f"error: {told}\n")
         raise SystemExit(1) from None
 
 

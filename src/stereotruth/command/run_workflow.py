@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..project import CONFIG, FILES
+from ..project import CONFIG, FILES, read_mapping
 
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
 CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
@@ -48,6 +48,18 @@ def arguments_for(given: Sequence[str]) -> list[str]:
     if not any(map(CORES.match, given)):
         arguments += ["--cores", "all"]
     return arguments
+
+
+def config_files(arguments: Sequence[str]) -> list[Path]:
+    """The files that follow ``--configfile`` or ``--configfiles``, those that are there."""
+    found, inside = [], False
+    for word in arguments:
+        option, _, value = word.partition("=")
+        if word.startswith("-"):
+            inside = option in CONFIG_OPTIONS
+        if inside and (name := value if word.startswith("-") else word):
+            found.append(Path(name))
+    return [file for file in found if file.is_file()]
 
 
 @dataclass
@@ -125,7 +137,10 @@ def run_workflow(given: Sequence[str]) -> int:
     On a terminal its lines pass through here, with a status line below them; else this process
     becomes Snakemake's.
     """
-    command = [sys.executable, "-m", "snakemake", *arguments_for(given)]
+    arguments = arguments_for(given)
+    for file in config_files(arguments):  # Snakemake names no file that it cannot read
+        read_mapping(file)
+    command = [sys.executable, "-m", "snakemake", *arguments]
     if not sys.stderr.isatty() or {"--dry-run", "-n", "--dryrun"} & set(given):
         os.execv(sys.executable, command)
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}

@@ -37,6 +37,7 @@ from ..products.files import growing_table, replacing, whole_folder, write_table
 from ..products.provenance import describe, file_sha256, own_digest, source_digest
 from .footprints import FOOTPRINTS, feature, write_footprints
 from .ground_looks import write_ground_looks
+from .label_doubts import doubts, surface_figures
 from .orientation import save
 from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
@@ -76,10 +77,21 @@ def _refuse_empty(
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
             "project.fill: surface, the default, labels pixels between them"
         )
+    doubts = "; ".join(
+        f"the alignment of scene {source.scene} is in doubt: {doubt}"
+        for source in sources
+        for doubt in source.doubts
+    )
+    remedy = (
+        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
+        f"or LiDAR that covers the overlap of the two images{sparse}"
+    )
+    if doubts:
+        doubts = f". Labels are missing where LiDAR and images disagree: {doubts}"
+        remedy = f"first what the alignment's doubts say; else {remedy}"
     raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)})",
-        remedy=f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
-        f"{min_labelled:g}), or LiDAR that covers the overlap of the two images{sparse}",
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){doubts}",
+        remedy=remedy,
     )
 
 
@@ -206,7 +218,7 @@ def export_city(
                 written.append((row, ring))
                 if checks is None:
                     continue
-                scene_checks[row["scene"]].add(checks)
+                scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
                 if table is not None:
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
                     table.writerows(match_rows(head, checks.matches))
@@ -216,6 +228,8 @@ def export_city(
             )
             drawn.append(pool.submit(draw, rows))
             gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+            for source in sources:
+                gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             half = disparity_dtype == "float16"
             summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
             summary["quality"] = gates
@@ -274,20 +288,26 @@ def _split(
 
 def _gates(
     city: str,
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
     limits: Limits,
     strict: bool,
 ) -> dict[str, Any]:
-    """Figures and missed gates of scenes, flagged tiles; logs each miss, or ends a strict run."""
-    found, problems = {}, []
+    """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
+
+    Logs each miss and doubt, or ends a strict run.
+    """
+    found, problems, in_doubt = {}, [], {}
     for scene, checks in scenes.items():
         figures = checks.figures()
         misses = missed(figures, limits)
         found[scene] = figures | {"quality": flag(misses)}
+        in_doubt[scene] = doubts(checks.matches.biases, limits.min_agreement)
         problems += [f"scene {scene}: {miss}" for miss in misses]
+        problems += [f"scene {scene}: {doubt}" for doubt in in_doubt[scene] if not doubt.explained]
     labelled = [row for row in rows if row["complete"] == "yes"]
     for row in labelled:
+        row["doubt"] = "; ".join(map(str, in_doubt[row["scene"]]))
         figures = {name: float(row[name]) for name in CHECK_COLUMNS if row[name] != ""}
         problems += [
             f"tile {row['tile']} of scene {row['scene']}: {miss}"
@@ -300,10 +320,18 @@ def _gates(
             remedy="better control points, images or LiDAR for what is named, another limit "
             "(null: none) in quality of the configuration, or strict: false to have it flagged",
         )
-    for problem in problems:
+    remarks = [
+        f"scene {scene}: {doubt}"
+        for scene, of in in_doubt.items()
+        for doubt in of
+        if doubt.explained
+    ]
+    for problem in problems + remarks:
         log.warning("%s: %s", city, problem)
     return {
         "limits": asdict(limits),
         "scenes": found,
+        "surfaces": {s: surface_figures(of.matches.biases) for s, of in scenes.items()},
+        "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},
         "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
     }

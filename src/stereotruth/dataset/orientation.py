@@ -35,10 +35,15 @@ CONVENTIONS = {
     "right_offset_px": "the right tile is the right epipolar image from column "
     "col0 - right_offset_px on, so that the disparity of the scene is d + right_offset_px",
     "ground": "WGS 84 longitude and latitude in degrees, height above the WGS 84 ellipsoid in m",
-    "left": "backward view (reference); right: forward view",
     "polynomial": "t_k = (input_k - input_offset_k) / input_scale_k; output = output_offset + "
     "output_scale * sum over terms of coefficient * prod_k t_k ** exponent_k",
     "height": "of the surface that the label stands for (top of what the LiDAR saw in the pixel)",
+}
+
+VIEWS = {  # by the epipolar model's view_order
+    "left looks backward": "left: reference, the backward view; right: the forward view",
+    "left looks forward": "left: reference, the forward view; right: the backward view",
+    "across track": "left: reference; right: the other view, across the flight direction",
 }
 
 
@@ -175,7 +180,7 @@ def orientation(
     return {
         "window": {"row0": row0, "col0": col0, "size": size, "unit": "px of the epipolar grid"},
         "right_offset_px": offset,
-        "conventions": CONVENTIONS,
+        "conventions": CONVENTIONS | {"views": VIEWS[model.report["view_order"]]},
         "to_heights": _recipe(views, ground, offset, height, disparity),
         "ground": ground,
         **views,

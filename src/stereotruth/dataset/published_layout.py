@@ -33,9 +33,9 @@ README = """Stereo pairs with ground-truth disparity, in the folder layout of WH
 {counts}
 
 Conventions
-- left: backward view, the reference; right: forward view. uint16, nodata 0. Rows correspond:
-  the match of left pixel (x, y) is right pixel (x - d, y). (0, 0) is the centre of the
-  upper-left pixel.
+- left: the reference; right: the other view; which of them looks backward is said in orientation.
+  uint16, nodata 0. Rows correspond: the match of left pixel (x, y) is right pixel (x - d, y).
+  (0, 0) is the centre of the upper-left pixel.
 - disp: d = x_left - x_right in px; d increases with height; {nodata}: no label (tagged as nodata).
   {rounding}
 - The right image of each pair is shifted by a whole number of px (right_offset_px in

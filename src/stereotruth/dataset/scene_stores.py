@@ -34,7 +34,10 @@ class SceneFiles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneStores:
-    """Opened stores of a scene, its epipolar model, and the meaning of the status values."""
+    """Opened stores of a scene, its epipolar model, and the meaning of the status values.
+
+    ``doubts``: warnings of the alignment, a refinement that was refused among them.
+    """
 
     scene: str
     left: zarr.Array
@@ -45,12 +48,15 @@ class SceneStores:
     height: zarr.Array
     of_right: zarr.Group | None
     surface_class: zarr.Array | None
+    uncertainty: zarr.Array | None
     gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
     flags: Mapping[int, str]
     inputs: Mapping[str, str]
     points_per_px: float | None
+    points_per_m2: float | None
+    doubts: tuple[str, ...]
 
 
 def open_stores(item: SceneFiles) -> SceneStores:
@@ -84,6 +90,7 @@ def open_stores(item: SceneFiles) -> SceneStores:
         inputs[f"{item.scene}/disparity_of_right"] = found
     if item.alignment is not None:
         inputs[f"{item.scene}/alignment"] = file_sha256(item.alignment)
+    gcp_rms, doubts = (None, ()) if item.alignment is None else _told_by(item.alignment)
     return SceneStores(
         scene=item.scene,
         left=left["image"],
@@ -94,12 +101,15 @@ def open_stores(item: SceneFiles) -> SceneStores:
         height=disparity["height"],
         of_right=of_right,
         surface_class=disparity.get("surface_class"),
-        gcp_rms=None if item.alignment is None else _gcp_rms(item.alignment),
+        uncertainty=disparity.get("uncertainty"),
+        gcp_rms=gcp_rms,
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
         flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
         inputs=inputs,
         points_per_px=disparity.attrs.get("points_per_px"),
+        points_per_m2=disparity.attrs.get("points_per_m2"),
+        doubts=doubts,
     )
 
 
@@ -110,8 +120,11 @@ def _colours(*views: zarr.Group) -> tuple[tuple[zarr.Array, ...], ...] | None:
     return tuple(tuple(view[name] for name in COLOURS) for view in views)
 
 
-def _gcp_rms(alignment: Path) -> float | None:
-    """The larger of both views' residuals of the GCPs, px of the images; None without GCPs."""
+def _told_by(alignment: Path) -> tuple[float | None, tuple[str, ...]]:
+    """The larger of both views' residuals of the GCPs, px of the images (None without GCPs).
+
+    And the warnings of the alignment.
+    """
     record = json.loads(Path(alignment).read_text(encoding="utf-8"))
     found = [record[view]["rms"]["after"] for view in ("left", "right")]
-    return max((value for value in found if value is not None), default=None)
+    return max((v for v in found if v is not None), default=None), tuple(record["warnings"])

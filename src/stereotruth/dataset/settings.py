@@ -94,6 +94,11 @@ class Limits:
     min_warp_correlation: Annotated[Number, Field(ge=-1, le=1)] | None = 0.5
     """correlation of the left and the right image warped by the labels"""
 
+    min_agreement: Share | None = 0.01
+    """probability that chance alone has the SIFT matches of a scene disagree so with its labels, by
+    the standard errors of both: on open ground, on roofs, and of the rows. With less, the scene is
+    in doubt, whatever the amount; so many scenes without fault are, too. null: no doubts"""
+
 
 @settings
 class Settings(Evaluation, Tiles):

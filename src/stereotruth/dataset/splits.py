@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ..products.files import read_table
-from .manifest import Tile
+from .manifest import Tile, manifest_rows
 from .split_names import NONE, SPLITS
 
 # Footprints follow the heights on the tile's border; what leans across it by less than this many
@@ -217,7 +216,7 @@ def shared_ground(*manifests: str | Path) -> list[tuple[str, str]]:
     """
     names, split, places = [], [], []
     for manifest in map(Path, manifests):
-        for tile in map(Tile.of, read_table(manifest)):
+        for tile in map(Tile.of, manifest_rows(manifest)):
             if tile.split in SPLITS:
                 file = manifest.parent / tile.row["orientation"]
                 sidecar = json.loads(file.read_text("utf-8"))

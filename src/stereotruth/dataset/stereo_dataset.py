@@ -30,9 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..products.files import read_table
 from ..products.folders import files_below
+from ..products.names import plain_name
 from ..products.rasters import read_disparity
+from .manifest import manifest_rows
 from .split_names import NO_TRUTH, NONE, SPLITS
 from .stereo_dataset_settings import Settings
 
@@ -131,8 +132,10 @@ class StereoDataset:
 def find_pairs(root: str | Path, layout: str) -> list[Pair]:
     """All pairs below a folder, sorted by split and name.
 
+    Names and cities of pairs are plain names (:mod:`..products.names`), whoever made the dataset.
+
     Raises InputError if the folder or a file of a pair is missing, if nothing there has the
-    layout's names, or if two pairs of one split have one name.
+    layout's names, if two pairs of one split have one name, or if a name is no plain one.
     """
     root = Path(root)
     if layout not in LAYOUTS:
@@ -170,7 +173,7 @@ def match_inside(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _of_manifest(root: Path) -> Iterator[Pair]:
-    for row in read_table(root / "manifest.csv"):
+    for row in manifest_rows(root / "manifest.csv"):
         try:
             split = row["split"] if row["disp"] else NONE
             files = [root / row[kind] if row[kind] else None for kind in ("left", "right", "disp")]
@@ -277,6 +280,8 @@ def _unique(pairs: Sequence[Pair], root: Path) -> Iterator[Pair]:
     for pair in pairs:
         if count[pair.name] > 1:
             pair = replace(pair, name=f"{pair.split}_{pair.name}")
+        plain_name(pair.name, "the name of a pair,", pair.left)
+        plain_name(pair.city, f"the city of pair {pair.name},", pair.left)
         if pair.name in seen:
             raise InputError(
                 f"two pairs of split {pair.split!r} are named {pair.name}",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from ..settings import Flag, Number, Range, Text, Unit, settings
+from ..settings import FilePath, Flag, Number, Range, Text, Unit, settings
 
 
 @settings
 class Settings:
     """An entry of the configuration's benchmark.datasets."""
 
-    root: Annotated[Text, Unit("path")]
+    root: Annotated[FilePath, Unit("path")]
     """its folder"""
 
     layout: Literal["stereotruth", "whu", "kitti", "us3d"]

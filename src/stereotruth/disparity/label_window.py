@@ -326,10 +326,8 @@ def _layers(
     margin = scene.settings.margin
     inner = slice(margin, -margin), slice(margin, -margin)
     y, x = (np.arange(w.start + margin, w.stop - margin, dtype=np.float64) for w in wide)
-    sigma, sigma_x, sigma_y = scene.pair.uncertainty_at(x, y)
-    slope = labels.slope[:, *inner]
-    variance = labels.variance[inner] + sigma**2
-    variance = variance + (slope[0] * sigma_x) ** 2 + (slope[1] * sigma_y) ** 2
+    of_alignment = scene.pair.alignment_variance(x, y, labels.slope[:, *inner])
+    variance = labels.variance[inner] + of_alignment
     values = {
         "disparity": labels.disparity[inner],
         "height": pixels.highest[inner],

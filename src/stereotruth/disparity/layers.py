@@ -115,10 +115,11 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
                 "units": "px",
                 "long_name": "standard uncertainty of the disparity",
                 "nodata": "NaN",
-                "formula": "sqrt(v / n + p + a^2 + (gx ax)^2 + (gy ay)^2): v variance of the "
-                "points' disparities about their surface, pooled over 3 x 3 pixels; n point_count; "
-                "p variance of the plane to the centre; g slope of the disparity; a standard "
-                "uncertainty of disparity and of place (ax, ay) by the alignment",
+                "formula": "sqrt(v / n + p + var(ed - gx ex - gy ey)): v variance of the points' "
+                "disparities about their surface, pooled over 3 x 3 pixels; n point_count; p "
+                "variance of the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey)"
+                " errors of a ground point's disparity and place by the alignment, whose "
+                "covariance is that of alignment.json",
             },
         ),
         "surface_class": Layer(

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import block_progress
-from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from ..products.grids import Strip, blocks, require_complete
-from ..products.provenance import describe, digest
+from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, making
 from .image_patches import MaskedImage
 from .label_window import label_window
@@ -52,10 +51,10 @@ ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have
 
 def _tell_density(inputs: SceneInputs) -> None:
     """Log how dense the points are, and what that leaves without a label."""
-    per_px = inputs.scale.points_per_px
-    pixel = inputs.rays.cell[1] * LATTICE_DEG * DEGREE_M / CELL_PX
+    pixel = inputs.rays.cell_m / CELL_PX
+    per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
-    said = f"about {per_px / pixel**2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
+    said = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
     if inputs.settings.fills or share > ENOUGH:
         log.info("%s", said)
         return
@@ -130,6 +129,7 @@ def project_scene(
     settings: Settings,
     *,
     code: str,
+    alignment: str | Path | None = None,
     view: str = "left",
     workers: int = 1,
     scheduler: Any = "threads",
@@ -140,16 +140,19 @@ def project_scene(
     """Project the points of a scene and write its disparity grid; returns the summary.
 
     ``left_store``, ``right_store``: rectified images made by `rectify`; ``point_stores``: made by
-    `ingest`, in any order. ``view``: left, or right for the labels of the right image, on its own
-    grid of the same shape. ``code``: digest of the source, for the provenance. ``scheduler`` is
-    what Dask's compute takes; ``workers`` the number of its threads.
+    `ingest`, in any order. ``alignment``: the JSON file that the images were rectified with, whose
+    covariance enters the labels' uncertainty; without it, it counts as exact. ``view``: left, or
+    right for the labels of the right image, on its own grid of the same shape. ``code``: digest of
+    the source, for the provenance. ``scheduler`` is what Dask's compute takes; ``workers`` the
+    number of its threads.
 
     Blocks that an earlier call has left, made of the same, are taken over (see
     :mod:`stereotruth.products.resumable_grids`). ``strip``: make its blocks only, for a later call
     without it, and return None.
 
     The store [y, x] on the epipolar grid of the view: see :func:`.layers.layers`; attributes
-    ``epipolar`` (the model), ``view``, ``summary``, ``points_bounds``, ``provenance``. Summary:
+    ``epipolar`` (the model), ``view``, ``summary``, ``points_bounds``, ``alignment_sigma_px``
+    (standard uncertainty of a ground point's disparity, x and y: medians), ``provenance``. Summary:
     ``pixels`` by status, ``points`` (in the grid, in both frames, used), ``labelled_share`` of the
     pixels that have points.
 
@@ -160,7 +163,8 @@ def project_scene(
     paths = sorted(Path(path).absolute() for path in point_stores)
     if not paths:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
-    inputs = SceneInputs(left_store, right_store, tuple(paths), settings, view)
+    aligned = None if alignment is None else Path(alignment).absolute()
+    inputs = SceneInputs(left_store, right_store, tuple(paths), settings, view, aligned)
     shape, stores = inputs.pair.model.shape, inputs.stores
     corners = np.array([store.bounds for store in stores])
     bounds = [*corners[:, :2].min(0), *corners[:, 2:4].max(0)]
@@ -178,6 +182,8 @@ def project_scene(
     told = {"left": left_attrs, "right": right_attrs}
     told |= {f"points/{store.path.name}": store.attrs for store in stores}
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in told.items()}
+    if aligned is not None:
+        made_of |= checksums([aligned])
     parameters = {"view": view} | asdict(settings)
     attrs = {
         "kind": "disparity",
@@ -185,7 +191,9 @@ def project_scene(
         "view": view,
         "epipolar": dict(left_attrs["epipolar"]),
         "points_bounds": points_bounds,
-        "points_per_px": round(inputs.scale.points_per_px, 4),
+        "alignment_sigma_px": inputs.pair.uncertainty.sigma,
+        "points_per_m2": round(inputs.points_per_m2, 4),
+        "points_per_px": round(inputs.points_per_m2 * (inputs.rays.cell_m / CELL_PX) ** 2, 4),
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
         "settings": parameters,
@@ -196,7 +204,7 @@ def project_scene(
         {
             "images": [_identity(left_attrs), _identity(right_attrs)],
             "epipolar": left_attrs["epipolar"],
-            "uncertainty": inputs.pair.uncertainty.to_attrs(),
+            "uncertainty": inputs.pair.uncertainty.content,
             "parameters": parameters
             | ({"scale": asdict(inputs.scale)} if settings.uses_geometry else {}),
             "code": code,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lidar.lattice import LATTICE_DEG
+from ..lidar.lattice import DEGREE_M, LATTICE_DEG
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
@@ -81,6 +81,11 @@ class Rays:
         side = CELL_PX * np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
         cell = (max(round(side / shrink), 1), max(round(side), 1))
         return cls(track, cell, float(np.round(np.nanmedian(disparity) / rise, 9)))
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell on the ground, m."""
+        return self.cell[1] * LATTICE_DEG * DEGREE_M
 
     def reach(self, cols: slice, rows: slice) -> Floats:
         """[2, 2] (lon, lat; lowest, highest) degrees per metre that any ray from a window moves."""

@@ -87,7 +87,8 @@ def _mirrored_image(image: Array2D) -> Array2D:
 class Pair:
     """A pair whose left image gets labels.
 
-    ``images``: left, right, [y, x]; ``uncertainty``: what the alignment adds to the labels'.
+    ``images``: left, right, [y, x]; ``uncertainty``: what the alignment adds to that of the labels,
+    on the grid of the view that gets them.
     """
 
     images: tuple[Array2D, Array2D]
@@ -98,9 +99,9 @@ class Pair:
         """The columns here of a window of the view's own grid."""
         return cols
 
-    def uncertainty_at(self, x: Floats, y: Floats) -> Floats:
-        """[3, rows, cols] px at columns ``x`` and rows ``y``; see :meth:`LabelUncertainty.at`."""
-        return self.uncertainty.at(x, y)
+    def alignment_variance(self, x: Floats, y: Floats, slope: Floats) -> Floats:
+        """px² [rows, cols] at columns ``x`` and rows ``y``; see :class:`LabelUncertainty`."""
+        return self.uncertainty.variance(x, y, slope)
 
     def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
         """The layers [y, x] of a window here, as they are in the view's own grid."""
@@ -121,9 +122,10 @@ class MirroredPair(Pair):
         """See :class:`Pair`."""
         return mirrored(cols, self.model.shape[1])
 
-    def uncertainty_at(self, x: Floats, y: Floats) -> Floats:
-        """See :class:`Pair`."""
-        return self.uncertainty.at(self.model.shape[1] - 1 - x, y)
+    def alignment_variance(self, x: Floats, y: Floats, slope: Floats) -> Floats:
+        """See :class:`Pair`; slopes along x change sign with it."""
+        own = np.stack([-slope[0], slope[1]])
+        return self.uncertainty.variance(self.model.shape[1] - 1 - x, y, own)
 
     def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
         """See :class:`Pair`; what the mirrored pair calls left is right in the view's grid."""

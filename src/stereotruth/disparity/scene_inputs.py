@@ -7,10 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
+from ..lidar.density import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
 from .image_patches import MaskedImage
@@ -27,7 +27,8 @@ class SceneInputs:
     """The rectified images and point stores of a scene, and how to judge and condense the points.
 
     Plain values, so that it can go to another process; what they stand for is opened when it is
-    asked for. ``view``: left, or right for the labels of the right image.
+    asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
+    file whose corrections the images were rectified with; without it, it counts as exact.
     """
 
     left_store: Path
@@ -35,6 +36,7 @@ class SceneInputs:
     point_stores: tuple[Path, ...]
     settings: Settings
     view: str = "left"
+    alignment: Path | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
@@ -43,6 +45,10 @@ class SceneInputs:
     def pair(self) -> Pair:
         """The images with their geometry; its left image is the one that gets labels."""
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
+        model = EpipolarModel.from_dict(left.attrs["epipolar"])
+        uncertainty = LabelUncertainty.none()
+        if self.alignment is not None:
+            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
         return seen_from(
             self.view,
             Pair(
@@ -52,8 +58,8 @@ class SceneInputs:
                     else group["image"]
                     for group in (left, right)
                 ),
-                EpipolarModel.from_dict(left.attrs["epipolar"]),
-                LabelUncertainty.from_attrs(left.attrs),
+                model,
+                uncertainty,
             ),
         )
 
@@ -80,10 +86,12 @@ class SceneInputs:
     @cached_property
     def scale(self) -> Scale:
         """Of the triangles between the points."""
-        cells = np.concatenate([(s.cell_row << 32) + s.cell_col for s in self.stores])
-        counts = np.concatenate([s.cell_counts for s in self.stores])
-        _, which = np.unique(cells, return_inverse=True)
-        return Scale.of(np.bincount(which, weights=counts), self.rays.cell)
+        return Scale.of(self.points_per_m2, self.rays.cell_m)
+
+    @cached_property
+    def points_per_m2(self) -> float:
+        """Over the ground that the points cover."""
+        return points_per_m2(self.stores)
 
     @property
     def halo(self) -> int:

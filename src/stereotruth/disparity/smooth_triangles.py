@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inner, kernel
-from ..lidar.lattice import CELL_BITS, LATTICE_M
+from ..lidar.lattice import LATTICE_M
 from .even_squares import REACH as EVEN_REACH
 from .ground_in_view import GroundInView
 from .outlines import REACH, Pieces, cut_at_outlines
@@ -101,15 +101,13 @@ class Scale:
         return min(1.0, NOTICED_PX / self.distance_px)
 
     @classmethod
-    def of(cls, counts: Ints, cell: tuple[int, int]) -> Scale:
-        """From the points in each square of 2**CELL_BITS lattice steps that holds any, and the
-        (lon, lat) size of a cell in lattice steps.
+    def of(cls, points_per_m2: float, cell_m: float) -> Scale:
+        """From the points over the ground that they cover, and the side of a cell in m.
 
         Density counts in steps of a factor of 1.4, so that one more file leaves the rest of a scene
         as it is.
         """
-        per_cell = float(np.median(counts)) * cell[0] * cell[1] / float(1 << (2 * CELL_BITS))
-        per_cell = 2.0 ** (round(2.0 * np.log2(per_cell)) / 2.0)
+        per_cell = 2.0 ** (round(2.0 * np.log2(points_per_m2 * cell_m**2)) / 2.0)
         distance = PART * max(
             1.0 / float(np.sqrt(per_cell)), 1.0
         )  # vertices are no denser than cells

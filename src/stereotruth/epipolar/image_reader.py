@@ -28,6 +28,7 @@ CACHE_MB = 256  # of decoded source; 1024 rows of a scene 34 000 px wide take 70
 
 
 MAX_SIDE = 1_000_000  # px; no sensor's image is as long
+MAX_PIXELS = 30_000_000_000  # a strip of WorldView, 13 km x 112 km, has 16 thousand million
 MAX_BLOCK_BYTES = 1 << 30  # of a block of the file, which is decoded as a whole
 OUTLIER = 10.0  # of the largest value above all but a thousandth of the others: a hot pixel
 BELOW = 0.1  # of the largest value below zero: a fill value; noise of reflectances is above
@@ -91,7 +92,8 @@ class Source:
             self._lowest = 0.0
 
     def _refuse_shape(self, dataset: rasterio.DatasetReader) -> None:
-        if dataset.count == 0 or max(self.size) > MAX_SIDE:
+        too_large = max(self.size) > MAX_SIDE or self.size[0] * self.size[1] > MAX_PIXELS
+        if dataset.count == 0 or too_large:
             raise InputError(
                 f"{dataset.count} bands of {self.size[0]} x {self.size[1]} pixels are no image of "
                 "a satellite",
@@ -255,9 +257,12 @@ class Source:
             values = np.stack([mixed, *(place[band] for band in self.colour)])
         return values if self.gain == 1.0 else values * np.float32(self.gain)
 
-    def check_blocks(self, workers: int = 1) -> None:
-        """Refuse a TIFF of which GDAL would read damaged blocks in silence; reads all of it."""
-        if problem := damaged_block(self.path, workers):
+    def check_blocks(self, workers: int = 1, *, whole: bool = True) -> None:
+        """Refuse a TIFF of which GDAL would read damaged blocks in silence; reads all of it.
+
+        Not ``whole``: only the places of its blocks are held against the file.
+        """
+        if problem := damaged_block(self.path, workers, whole=whole):
             raise InputError(
                 problem, file=self.path, remedy="the file is damaged or cut short: get it again"
             )

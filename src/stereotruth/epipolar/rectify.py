@@ -197,7 +197,6 @@ def rectify(
     right_store: str | Path,
     *,
     workers: int = 1,
-    left_attrs: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
     strip: Strip | None = None,
 ) -> None:
@@ -205,9 +204,8 @@ def rectify(
 
     Grids hold ``image`` uint16 [y, x], 0 where there is no value; of images in colour ``red``,
     ``green`` and ``blue`` likewise, and of images with a mask ``mask`` uint8 [y, x], 1 where it
-    hides the image; their attributes carry the model
-    and ``provenance``, those of the left one ``left_attrs`` too. ``epipolar_json``: where the model
-    goes. All three products appear when they are whole, or not at all.
+    hides the image; their attributes carry the model and ``provenance``. ``epipolar_json``: where
+    the model goes. All three products appear when they are whole, or not at all.
 
     Blocks that an earlier call has left, made of the same images by the same model and code, are
     taken over (see :mod:`stereotruth.products.resumable_grids`). ``strip``: make its blocks only,
@@ -244,8 +242,6 @@ def rectify(
                 "epipolar": model.to_dict(),
                 "provenance": dict(provenance or {}),
             }
-            if view == "left":
-                attrs |= left_attrs or {}
             source.check_blocks(workers)
             grid = stack.enter_context(
                 making(

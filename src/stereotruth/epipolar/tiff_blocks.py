@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,6 +23,9 @@ WIDTH, HEIGHT, BITS, COMPRESSION, SAMPLES, STRIP_ROWS = 256, 257, 258, 259, 277,
 PLANAR, TILE_WIDTH, TILE_HEIGHT = 284, 322, 323
 DEFAULTS = {BITS: 1, COMPRESSION: 1, SAMPLES: 1, PLANAR: 1, STRIP_ROWS: (1 << 32) - 1}
 WANTED = {*OFFSETS, *COUNTS, *DEFAULTS, WIDTH, HEIGHT, TILE_WIDTH, TILE_HEIGHT}
+BATCH, BATCH_BYTES = 64, 64 << 20  # blocks that are in memory at once
+PART_BYTES = 1 << 20  # that are inflated at once
+MOST_BYTES = 1 << 30  # of a block of which the tags do not say its size
 PLAIN, DEFLATE = 1, (8, 32946)
 TYPES = {1: "u1", 3: "u2", 4: "u4", 16: "u8", 13: "u4", 18: "u8"}
 
@@ -73,18 +78,51 @@ def _plain_bytes(tags: dict[int, np.ndarray], blocks: int) -> np.ndarray | None:
     return np.minimum(rows, one[HEIGHT] - at * rows) * -(-one[WIDTH] * bits // 8)
 
 
-def _inflates(block: bytes) -> bool:
-    """Whether a block of deflate is whole; its checksum is compared."""
-    inflating = zlib.decompressobj()
+def _inflates(block: bytes, most: int) -> bool:
+    """Whether a block of deflate is whole; its checksum is compared.
+
+    ``most``: bytes that come out of it at most; one that holds more is as good as damaged.
+    """
+    inflating, rest, held = zlib.decompressobj(), block, 0
     try:
-        inflating.decompress(block)
+        while not inflating.eof:
+            before, out = len(rest), len(inflating.decompress(rest, PART_BYTES))
+            rest, held = inflating.unconsumed_tail, held + out
+            if held > most or (not out and len(rest) == before):
+                return False
     except zlib.error:
         return False
     return inflating.eof
 
 
-def damaged_block(path: Path, workers: int = 1) -> str:
-    """What is wrong with the first strip or tile that is damaged; empty if none is, or no TIFF."""
+def _shared(offsets: np.ndarray, counts: np.ndarray) -> str:
+    """Which two blocks have bytes in common; empty if none have."""
+    used = np.flatnonzero(counts > 0)
+    used = used[np.argsort(offsets[used], kind="stable")]
+    ends = offsets[used] + counts[used]
+    over = np.flatnonzero(ends[:-1] > offsets[used[1:]])
+    if not over.size:
+        return ""
+    first, second = sorted((int(used[over[0]]) + 1, int(used[over[0] + 1]) + 1))
+    return f"blocks {first} and {second} of {offsets.size} share bytes"
+
+
+def _batches(counts: np.ndarray) -> Iterator[range]:
+    """Blocks that are read at once: few, and of few bytes."""
+    first, held = 0, 0
+    for k, count in enumerate(counts):
+        if k > first and (k - first == BATCH or held + count > BATCH_BYTES):
+            yield range(first, k)
+            first, held = k, 0
+        held += int(count)
+    yield range(first, len(counts))
+
+
+def damaged_block(path: Path, workers: int = 1, *, whole: bool = True) -> str:
+    """What is wrong with the first strip or tile that is damaged; empty if none is, or no TIFF.
+
+    ``whole``: checksums too, for which all of the file is read.
+    """
     size = size_of(path)
     with open_file(path) as stream:
         if stream.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
@@ -98,29 +136,43 @@ def damaged_block(path: Path, workers: int = 1) -> str:
         counts = next((tags[tag] for tag in COUNTS if tag in tags), np.empty(0, np.int64))
         if offsets.size != counts.size:  # files of one strip may leave its size out
             return ""
-        past = np.flatnonzero((offsets < 0) | (counts < 0) | (offsets + counts > size))
-        if past.size:
-            return f"block {past[0] + 1} of {offsets.size} reaches past the end of the file"
-        halves = np.flatnonzero((offsets == 0) != (counts == 0))  # empty ones have neither
-        if halves.size:
-            return f"block {halves[0] + 1} of {offsets.size} has a place or a size, but not both"
+        wanted = _plain_bytes(tags, offsets.size)
         compression = int(tags.get(COMPRESSION, [PLAIN])[0])
-        if compression == PLAIN and (wanted := _plain_bytes(tags, offsets.size)) is not None:
-            most = 2 * wanted.max()  # some programs pad, or write the last strip in full
-            wrong = np.flatnonzero((counts > 0) & ((counts < wanted) | (counts > most)))
-            if wrong.size:
-                k = wrong[0]
-                return f"block {k + 1} has {counts[k]} bytes, its pixels take {wanted[k]}"
-        if compression not in DEFLATE:
+        if problem := _misplaced(offsets, counts, size, wanted if compression == PLAIN else None):
+            return problem
+        if compression not in DEFLATE or not whole:
             return ""
-
+        most = MOST_BYTES if wanted is None else 2 * int(wanted.max(initial=0)) + PART_BYTES
         with ThreadPoolExecutor(workers) as pool:
-            for first in range(0, offsets.size, 64):  # few at a time: memory
+            for batch in _batches(counts):
                 data = []
-                for k in range(first, min(first + 64, offsets.size)):
+                for k in batch:
                     stream.seek(int(offsets[k]))
                     data.append(stream.read(int(counts[k])))
-                for k, whole in enumerate(pool.map(_inflates, data)):
-                    if data[k] and not whole:  # blocks without bytes are empty ones
-                        return f"block {first + k + 1} of {offsets.size} is damaged"
+                whole = pool.map(_inflates, data, repeat(most))
+                for k, block, good in zip(batch, data, whole):
+                    if block and not good:  # blocks without bytes are empty ones
+                        return f"block {k + 1} of {offsets.size} is damaged"
     return ""
+
+
+def _misplaced(
+    offsets: np.ndarray, counts: np.ndarray, size: int, wanted: np.ndarray | None
+) -> str:
+    """What is wrong with the places of blocks in a file of ``size`` bytes; empty if nothing is.
+
+    ``wanted``: bytes of each block, if they are not compressed.
+    """
+    past = np.flatnonzero((offsets < 0) | (counts < 0) | (counts > size - offsets))
+    if past.size:
+        return f"block {past[0] + 1} of {offsets.size} reaches past the end of the file"
+    halves = np.flatnonzero((offsets == 0) != (counts == 0))  # empty ones have neither
+    if halves.size:
+        return f"block {halves[0] + 1} of {offsets.size} has a place or a size, but not both"
+    if wanted is not None and wanted.size:
+        most = 2 * wanted.max()  # some programs pad, or write the last strip in full
+        wrong = np.flatnonzero((counts > 0) & ((counts < wanted) | (counts > most)))
+        if wrong.size:
+            k = wrong[0]
+            return f"block {k + 1} has {counts[k]} bytes, its pixels take {wanted[k]}"
+    return _shared(offsets, counts)

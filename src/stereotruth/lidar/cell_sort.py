@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from .lattice import CELL_BITS, cell_key
-from .point_store import CELL, CELLS, POINT_BYTES, POINTS, WORDS
+from .point_store import CELL, CELLS, POINT_BYTES, POINTS, SQUARES, WORDS
 
 Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
@@ -72,6 +72,14 @@ def _sort(
             run[at + k, 2] = height
             low, high = min(low, height), max(high, height)
         limits[c, 0], limits[c, 1] = low, high
+
+
+@kernel
+def _count_squares(points: Words, counts: Integers) -> None:
+    """Add stored points [n, 3] of a cell to the counts [SQUARES, SQUARES] of its squares."""
+    inside, size = (1 << CELL_BITS) - 1, (1 << CELL_BITS) // SQUARES
+    for i in range(len(points)):
+        counts[(points[i, 1] & inside) // size, (points[i, 0] & inside) // size] += 1
 
 
 def _cells(lattice: Integers) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -152,10 +160,12 @@ class SortedRuns:
         with (folder / POINTS).open("wb") as file:
             np.lib.format.write_array_header_1_0(file, described)
             for cell, of in enumerate(np.split(segments, first[1:])):
-                found = 0
+                found, squares = 0, np.zeros((SQUARES, SQUARES), np.int64)
                 for points in self._take(of):
                     found = zlib.crc32(points, found)
+                    _count_squares(points, squares)
                     file.write(points)
                 table["crc32"][cell] = found
+                table["squares"][cell] = np.minimum(squares, 65535)
         np.save(folder / CELLS, table)
         return zlib.crc32((folder / CELLS).read_bytes())

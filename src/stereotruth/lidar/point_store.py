@@ -47,8 +47,9 @@ Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-FORMAT = 1  # of the files
+FORMAT = 2  # of the files
 POINTS, CELLS, ATTRIBUTES = "points.npy", "cells.npy", "store.json"
+SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
 POINT_BYTES = 4 * WORDS
 CELL = np.dtype(
@@ -59,6 +60,7 @@ CELL = np.dtype(
         ("lowest", "<i4"),
         ("highest", "<i4"),
         ("crc32", "<u4"),
+        ("squares", "<u2", (SQUARES, SQUARES)),
     ]
 )
 ARRAYS = {  # what the files' attributes would say if they had any
@@ -75,7 +77,8 @@ ARRAYS = {  # what the files' attributes would say if they had any
     CELLS: {
         "units": "row, col: cell size; lowest, highest: 1e-4 m",
         "long_name": "south-west corner, first point, lowest and highest height of each cell, "
-        "CRC-32 of its points",
+        "CRC-32 of its points; squares: points in each of its 16 x 16 squares, from south and west "
+        "(65535 stands for more, too)",
     },
 }
 _PIECE = 1 << 16  # points that are read at once, so that they stay in the cache
@@ -164,12 +167,15 @@ class PointStore:
         try:
             self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
             self.count = int(self.attrs["points"]["kept"])
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            cells = self._cell_table()
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
             raise self._damaged(ATTRIBUTES) from error
-        cells = self._cell_table()
         self.cell_row = cells["row"].astype(np.int64)
         self.cell_col = cells["col"].astype(np.int64)
         self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
+        self._squares = cells["squares"]
         self._crc32 = cells["crc32"].tolist()
         self._start = np.append(cells["first"], self.count)
         self._key = cell_key(self.cell_row, self.cell_col)
@@ -184,7 +190,7 @@ class PointStore:
             raise InputError(
                 "no such point store", file=self.path, remedy="run the stage that makes it"
             ) from error
-        except (OSError, ValueError, RecursionError) as error:
+        except ValueError as error:
             raise self._damaged(ATTRIBUTES) from error
         if not isinstance(attrs, dict) or attrs.get("kind") != "points":
             raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
@@ -201,7 +207,7 @@ class PointStore:
             data = (self.path / CELLS).read_bytes()
         except OSError as error:
             raise self._damaged(CELLS) from error
-        if zlib.crc32(data) != self.attrs.get("cells_crc32"):
+        if zlib.crc32(data) != self.attrs["cells_crc32"]:
             raise self._damaged(CELLS)
         return np.load(BytesIO(data))
 
@@ -215,7 +221,7 @@ class PointStore:
                 right = (shape, dtype) == ((self.count, WORDS), np.dtype("<u4"))
                 if right and file.stat().st_size - stream.tell() == self.count * POINT_BYTES:
                     return stream.tell()
-        except Exception as error:  # whatever a damaged header makes of its parser
+        except Exception as error:  # NumPy reads the header as Python, which fails in many ways
             raise self._damaged(POINTS) from error
         raise self._damaged(POINTS)
 
@@ -230,6 +236,11 @@ class PointStore:
     def cell_counts(self) -> Integers:
         """Points in each cell."""
         return np.diff(self._start)
+
+    @property
+    def square_counts(self) -> NDArray[np.uint16]:
+        """Points in each square of each cell [cells, SQUARES, SQUARES], from south and west."""
+        return self._squares
 
     def _cells(self, box: tuple[int, int, int, int]) -> list[tuple[int, int]]:
         """Ranges [first, end) of cells that a lattice box touches, in order."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..settings import PATTERN
 from .imported_files import imported_files
 
 FOLDER = "folder"
@@ -189,6 +190,9 @@ KINDS = {
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)
 
 
+PATHS = ("weights", "folder", "pipeline", "function")  # settings that name a file
+
+
 def kind_of(name: str, settings: Mapping[str, Any]) -> Kind:
     """The kind of a method's entry. Raises InputError for an unknown one, or an unknown setting."""
     kind = settings.get("kind")
@@ -203,6 +207,14 @@ def kind_of(name: str, settings: Mapping[str, Any]) -> Kind:
             raise InputError(
                 f"method {name!r} is of kind {kind!r}, which has no setting {key!r}",
                 remedy=f"take it away, or one of {', '.join(known)} (config/README.md)",
+            )
+    listed = settings.get("files") or ()
+    for value in (*(settings.get(key) for key in PATHS), *listed):
+        if isinstance(value, str) and PATTERN.search(value):
+            raise InputError(
+                f"method {name!r}: {value} has a name in {{ }}, which stands for something else in "
+                "the workflow",
+                remedy="rename it",
             )
     return KINDS[kind]
 

@@ -24,6 +24,7 @@ of those that it started, looked at every ``POLL_SECONDS``; programs in containe
 from __future__ import annotations
 
 import csv
+import re
 import shlex
 import subprocess
 import time
@@ -251,9 +252,8 @@ class _Program:
 
 
 def _filled(word: str, values: Mapping[str, Any]) -> str:
-    for key, value in values.items():
-        word = word.replace(f"{{{key}}}", str(value))
-    return word
+    """A word of the command with what its placeholders stand for; a value is not read again."""
+    return re.sub(r"\{(\w+)\}", lambda found: str(values.get(found[1], found[0])), word)
 
 
 def _finished(outs: Sequence[Sequence[Path]], index: int, status: int | None) -> bool:

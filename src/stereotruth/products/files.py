@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -67,13 +68,46 @@ def link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
+RUN = re.compile(r"'*[=+\-@\t\r]")  # begins what spreadsheets take for a formula
+MARK = "'"  # before such texts
+
+
+def as_text(value: Any) -> Any:
+    """A cell that no spreadsheet runs: texts get an apostrophe, numbers stay numbers."""
+    if isinstance(value, str) and RUN.match(value):
+        try:
+            float(value)
+        except ValueError:
+            return MARK + value
+    return value
+
+
+def of_text(cell: str | None) -> str | None:
+    """What :func:`as_text` was given."""
+    marked = isinstance(cell, str) and cell.startswith(MARK) and RUN.match(cell)
+    return cell[1:] if marked else cell
+
+
+class TableWriter(csv.DictWriter):
+    """Writes rows whose texts no spreadsheet takes for formulas."""
+
+    def writerow(self, rowdict: Mapping[str, Any]) -> Any:
+        """Write one row."""
+        return super().writerow({key: as_text(value) for key, value in rowdict.items()})
+
+    def writerows(self, rowdicts: Iterable[Mapping[str, Any]]) -> None:
+        """Write several rows."""
+        for row in rowdicts:
+            self.writerow(row)
+
+
 @contextmanager
 def growing_table(
     path: str | Path, columns: Iterable[str], line_end: str = "\n"
-) -> Iterator[csv.DictWriter]:
+) -> Iterator[TableWriter]:
     """A CSV file with its header, whole when the block ends well; its rows go to what is given."""
     with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(columns), lineterminator=line_end)
+        writer = TableWriter(stream, list(columns), lineterminator=line_end)
         writer.writeheader()
         yield writer
 
@@ -95,7 +129,8 @@ def write_table(
 def read_table(path: str | Path) -> Iterator[dict[str, str]]:
     """Rows of a CSV file, one after the other. Raises FileNotFoundError if there is none."""
     with Path(path).open(newline="", encoding="utf-8") as stream:
-        yield from csv.DictReader(stream)
+        for row in csv.DictReader(stream):
+            yield {key: of_text(cell) for key, cell in row.items()}
 
 
 def write_json(path: str | Path, values: Mapping[str, Any]) -> None:

@@ -14,8 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axis import Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
 from .files import replacing
@@ -77,8 +79,14 @@ def round_length(value: float) -> float:
 
 
 def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
-    """Write a matplotlib figure without any global state; no time or version goes into the file."""
+    """Write a matplotlib figure without any global state; no time or version goes into the file.
+
+    Texts are shown as they are: a ``$`` in a name begins no formula.
+    """
     FigureCanvasAgg(figure)
+    ticks = {id(label) for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
+    for text in figure.findobj(Text):
+        text.set_parse_math(id(text) in ticks)  # powers of ten of logarithmic axes
     with replacing(path) as scratch:
         figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
 

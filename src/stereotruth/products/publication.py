@@ -82,6 +82,7 @@ def publication(
     begins.
     """
     global _job
+    inputs = list(map(str, inputs))
     with listed():
         job = _Job(inputs, outputs, settings)
         _job = job
@@ -89,6 +90,14 @@ def publication(
             with job.run.watched():
                 yield
                 job.end()
+        except (InputError, OSError):
+            raise
+        except Exception as error:
+            from .damaged_chunks import damage_behind  # few jobs fail, and not all need Zarr
+
+            if damage := damage_behind(error, inputs):
+                raise damage from error
+            raise
         finally:
             _job = None
 

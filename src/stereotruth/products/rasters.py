@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
 
+MOST_VALUES = 1 << 28  # of an image that is read as a whole: 16384 x 16384 of one band
 KITTI_STEPS = 256  # in a px of disparity, of PNGs
 
 
@@ -118,8 +120,10 @@ def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
+    """An image that is read as a whole. Raises InputError if it cannot be, or is too large."""
     try:
         with open_raster(path) as dataset:
+            refuse_large((dataset.height, dataset.width, dataset.count), path)
             yield dataset
     except RasterioIOError as error:
         raise InputError(
@@ -127,9 +131,19 @@ def _opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
         ) from None
 
 
+def refuse_large(shape: Sequence[int], path: str | Path) -> None:
+    """Raise InputError if an image has more values than are read at once."""
+    if math.prod(shape) > MOST_VALUES:
+        raise InputError(
+            f"{' x '.join(map(str, shape))} values are more than are read at once",
+            file=path,
+            remedy=f"cut it into images of at most {MOST_VALUES / 1e6:.0f} million values",
+        )
+
+
 def read_tile(path: Path) -> Floats:
     """The band of an exported TIFF, or the mean of three, float64[h, w]; NaN where it is nodata."""
-    with open_raster(path) as dataset:
+    with _opened(path) as dataset:
         bands = dataset.read().astype(np.float64)
         missing = (bands == dataset.nodata).all(axis=0)
     values = bands[0] if len(bands) == 1 else bands.mean(axis=0)
@@ -139,7 +153,7 @@ def read_tile(path: Path) -> Floats:
 
 def read_labels(path: str | Path) -> tuple[NDArray[Any], float | None]:
     """The band of a label file as it is, and its nodata tag, or what stands for nodata in a PNG."""
-    with open_raster(path) as dataset:
+    with _opened(path) as dataset:
         return dataset.read(1), 0.0 if _is_kitti(dataset) else dataset.nodata
 
 
@@ -149,7 +163,7 @@ def _is_kitti(dataset: rasterio.DatasetReader) -> bool:
 
 def read_flags(path: str | Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
     """The band of a file of flags as :func:`write_tiff` writes it, and what its values mean."""
-    with open_raster(path) as dataset:
+    with _opened(path) as dataset:
         text = dataset.tags().get("TIFFTAG_IMAGEDESCRIPTION", "")
         return dataset.read(1), {int(v): n for v, n in re.findall(r"(\d+) (\w+)", text)}
 

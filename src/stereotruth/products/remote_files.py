@@ -28,6 +28,9 @@ FOLDER = Path("results", "remote")
 WEB = ("http", "https")
 SCHEMES = ("s3", *WEB)
 MAX_COPY_BYTES = 10_000_000  # of a file that is fetched; RPCs and control points have some kB
+LONGEST_PART = 200  # bytes between slashes, of which stand-ins have their names
+CLIENTS = ("aiohttp", "aiobotocore", "botocore", "fsspec", "s3fs")  # whose errors are a server's
+ABSENT = (404, 410)  # what web servers answer where there is no file
 READ_BYTES = 4 << 20  # of a LiDAR file at once
 _WAYS = "s3://bucket/path and https://host/path can be read"
 
@@ -39,18 +42,37 @@ def is_remote(text: str) -> bool:
 
 def place_of(url: str) -> Path:
     """Where the stand-in of a URL lies. Raises InputError for one that cannot be read."""
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:  # a port that is no number, brackets that do not close
+        parts, host, port = urlsplit(""), "", None
     path = parts.path.strip("/")
-    if parts.scheme not in SCHEMES or not parts.netloc or not path:
+    if parts.scheme not in SCHEMES or not host or not path:
         raise InputError("no such kind of URL", file=url, remedy=_WAYS)
-    if parts.query or parts.fragment or "@" in parts.netloc or ".." in path.split("/"):
+    names = path.split("/")
+    if parts.query or parts.fragment or "@" in parts.netloc or ".." in (host, *names):
         raise InputError(
             "a URL with a query, a password or '..'",
             file=url,
             remedy="name the file alone; credentials come from the environment (see "
             "docs/how-to/object_storage.md)",
         )
-    return FOLDER / parts.scheme / parts.netloc / path
+    netloc = parts.netloc if port is None else f"{parts.netloc.rpartition(':')[0]}:{port}"
+    place = FOLDER / parts.scheme / netloc / path
+    if f"{parts.scheme}://{netloc}/{path}" != url.rstrip("/") or place.parts[4:] != tuple(names):
+        raise InputError(
+            "a URL that no file can stand for (//, /./, or characters that no URL has)",
+            file=url,
+            remedy=_WAYS,
+        )
+    if max(len(os.fsencode(name)) for name in names) > LONGEST_PART or not url.isprintable():
+        raise InputError(
+            f"a URL with a part of more than {LONGEST_PART} bytes, or that cannot be printed",
+            file=url,
+            remedy="give the file a shorter name",
+        )
+    return place
 
 
 def url_of(path: str | Path) -> str | None:
@@ -104,18 +126,38 @@ def _state(info: dict[str, Any], url: str) -> str:
 def _look(url: str) -> str | None:
     """The state of a file; None if there is none. Raises InputError if nobody answers."""
     storage, name = bucket(url)
+    with _answering(url):
+        try:
+            info = storage.info(name)
+        except FileNotFoundError as error:
+            if _is_absent(error, url):
+                return None
+            raise
+        return None if info.get("type") == "directory" else _state(info, url)
+
+
+def _is_absent(error: FileNotFoundError, url: str) -> bool:
+    """Whether a server has said that there is no such file; fsspec takes all failures for that."""
+    status = getattr(error.__cause__, "status", None)
+    return status in ABSENT if urlsplit(url).scheme in WEB else True
+
+
+@contextmanager
+def _answering(url: str) -> Iterator[None]:
+    """In the block, what a server or its client fails with is an InputError."""
     try:
-        return _state(storage.info(name), url)
-    except FileNotFoundError:
-        return None
+        yield
     except InputError:
         raise
     except Exception as error:  # clients raise what they like
+        told = error.__cause__ if isinstance(error, FileNotFoundError) else None
+        told = told or error
         raise InputError(
-            f"its server does not answer as it should ({type(error).__name__}: {error})",
+            f"its server does not answer as it should ({type(told).__name__}: {told})",
             file=url,
-            remedy="check the URL, the credentials (AWS_ACCESS_KEY_ID …) and AWS_ENDPOINT_URL",
-        ) from error
+            remedy="try again later; check the URL, the credentials (AWS_ACCESS_KEY_ID …, with "
+            "the right to list) and AWS_ENDPOINT_URL",
+        ) from None
 
 
 def _put(place: Path, content: bytes) -> None:
@@ -155,7 +197,15 @@ def fetch(url: str) -> Path | None:
             f"larger than {MAX_COPY_BYTES / 1e6:g} MB", file=url, remedy="is it the right file?"
         )
     storage, name = bucket(url)
-    _put(place, storage.cat_file(name))
+    with _answering(url):
+        content = storage.cat_file(name)
+    if len(content) != json.loads(state)["size"]:
+        raise InputError(
+            f"{len(content)} bytes came of {json.loads(state)['size']}",
+            file=url,
+            remedy="run again, and leave it alone until the run has ended",
+        )
+    _put(place, content)
     return place
 
 
@@ -188,27 +238,32 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
         raise InputError(
             "web servers list no folders", file=url, remedy="name one file, or use object storage"
         )
-    storage, name = bucket(url)
-    try:
-        found = storage.glob(name if "*" in name else f"{name.rstrip('/')}/*", detail=True)
-    except Exception as error:
-        raise InputError(
-            f"cannot be listed ({type(error).__name__}: {error})",
-            file=url,
-            remedy="check the URL, the credentials (AWS_ACCESS_KEY_ID …) and AWS_ENDPOINT_URL",
-        ) from error
+    found = _listed(url)
     wanted = {
         place_of(f"s3://{path}"): _state(info, f"s3://{path}")
         for path, info in found.items()
-        if path.lower().endswith(suffixes)
+        if path.lower().endswith(suffixes) and info.get("type") != "directory"
     }
-    here = FOLDER.glob(str((place if "*" in name else place / "*").relative_to(FOLDER)))
+    here = FOLDER.glob(str(place.relative_to(FOLDER))) if "*" in url else place.glob("*")
     for file in set(here) - set(wanted):
         if file.is_file():
             file.unlink()
     for file, state in wanted.items():
         _put(file, state.encode())
     return place
+
+
+def _listed(url: str) -> dict[str, dict[str, Any]]:
+    """What object storage has in a folder, or by a glob, by name; nothing if there is no such."""
+    storage, name = bucket(url)
+    with _answering(url):
+        if "*" in name:
+            return storage.glob(name, detail=True)
+        try:
+            listed = storage.ls(name.rstrip("/"), detail=True)
+        except FileNotFoundError:
+            return {}
+        return {info["name"]: info for info in listed}
 
 
 def _held(path: Path) -> dict[str, Any]:
@@ -234,9 +289,15 @@ def open_file(path: str | Path) -> Iterator[BinaryIO]:
         return
     refuse_changed(path)
     storage, name = bucket(url)
-    size = _held(path)["size"]
-    with storage.open(name, "rb", block_size=READ_BYTES, cache_type="readahead", size=size) as file:
-        yield file
+    how = {"block_size": READ_BYTES, "cache_type": "readahead", "size": _held(path)["size"]}
+    try:
+        with storage.open(name, "rb", **how) as file:
+            yield file
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] not in CLIENTS:
+            raise
+        with _answering(url):
+            raise
 
 
 def refuse_changed(path: str | Path) -> None:

@@ -56,6 +56,9 @@ def headlines(
     found += _of_images(scenes, height_m_per_px)
     if alignments:
         found.append(_gcps(alignments, refined))
+    if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
+        text = f"{spread(dense, '.2g')} points/m²"
+        found.append(Headline("LiDAR density", text, "over the ground that it covers"))
     low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
     high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
     if low and high:
@@ -86,8 +89,11 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
+    doubted = list(quality.get("doubts", {}))
+    if doubted:
+        note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
-    return Headline("quality gates", text, note, bool(bad or scenes))
+    return Headline("quality gates", text, note, bool(bad or scenes or doubted))
 
 
 def _of_images(

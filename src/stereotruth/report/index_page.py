@@ -7,11 +7,11 @@ is in it.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..products.files import read_json
 from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
@@ -68,7 +68,12 @@ def _write(root: Path, out: Path) -> None:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    return read_json(file) if file.is_file() else {}
+    """What a record holds; nothing if it is missing or damaged: the page says what there is."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _link(out: Path, page: Path, text: str) -> Cell:

@@ -1,7 +1,7 @@
 """How bright a surface point looks: materials fixed to the surfaces, one sun, hard shadows.
 
-Brightness depends on the surface point only, not on who looks, so that both views of a pair show
-the same patterns.
+Brightness depends on the surface point, not on from where it is seen, so that both views of a pair
+show the same patterns. Shadows are those of the view's own sun and objects.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from ..kernels import inlined
 from .surfaces import CELL_M, GROUND, ROOF, TREE, WATER, in_shadow
 
 SKY = 0.34  # diffuse share of the light
+GROUND_MEAN = 0.2  # reflectance that the ground keeps whatever its contrast
+VEHICLE = 4  # kind of roof cover, beside those of buildings
 
 
 @inlined
@@ -135,14 +137,19 @@ def _ground(s, x, y, slope2):
 
 
 @inlined
-def reflectance(s, sun, x, y, z, kind, index, face, zx, zy):
-    """Light that comes back from a surface point, about 0 to 1; ``zx``, ``zy``: slope of ground.
+def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
+    """Light that comes back from a surface point, about 0 to 1.
 
-    ``sun``: the three values of ``s.sun``.
+    ``sun``: the three values of ``s.sun``. ``view``: bits of the objects that are there. ``slope``:
+    that of the ground along x and y.
     """
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == GROUND:
+        zx, zy = slope
         value = _ground(s, x, y, zx * zx + zy * zy)
+        if s.ground_look[1] != 1.0:
+            value = GROUND_MEAN + s.ground_look[1] * (value - GROUND_MEAN)
+        value *= s.ground_look[0]
         n = 1 / math.sqrt(1 + zx * zx + zy * zy)
         nx, ny, nz = -zx * n, -zy * n, n
     elif kind == WATER:
@@ -157,6 +164,7 @@ def reflectance(s, sun, x, y, z, kind, index, face, zx, zy):
         value = (
             0.15 + 0.05 * (s.trees[index, 3] - math.floor(s.trees[index, 3]) - 0.5) + 0.062 * leaf
         )
+        value *= s.tree_style[index, 0]
     else:
         u = (x - s.boxes[index, 0]) * s.boxes[index, 2] + (y - s.boxes[index, 1]) * s.boxes[
             index, 3
@@ -184,7 +192,7 @@ def reflectance(s, sun, x, y, z, kind, index, face, zx, zy):
             elif cover == 1:
                 value *= 1 + 0.09 * fine
             rim = min(s.boxes[index, 4] - abs(u), s.boxes[index, 5] - abs(v))
-            if s.boxes[index, 7] == 0:
+            if s.boxes[index, 7] == 0 and cover != VEHICLE:
                 if rim < 0.55:  # parapet
                     value = value * 0.6 + 0.18
                 elif cover == 0 and s.boxes[index, 4] > 5:  # sheets of bitumen, plants, tanks
@@ -206,7 +214,7 @@ def reflectance(s, sun, x, y, z, kind, index, face, zx, zy):
                 glass = _hash(int(np.floor(along / 3.4)), int(np.floor(z / 3.0)), index + face)
                 value = 0.07 + 0.16 * glass * glass
     light = nx * sun[0] + ny * sun[1] + nz * sun[2]
-    if light > 0 and in_shadow(s, sun, x, y, z):
+    if light > 0 and in_shadow(s, sun, x, y, z, view):
         light = 0.0
     sky = SKY * (0.55 + 0.45 * nz)
     return max(value, 0.02) * (sky + max(light, 0.0) * ((1 - SKY) / sun[2]))

@@ -29,6 +29,7 @@ class _Builder:
         self.style: list[tuple[float, ...]] = []
         self.group: list[int] = []
         self.groups = 0
+        self.chance = np.random.default_rng([city.world_seed, 3])  # of what is not built
 
     def _near(self, x: float, y: float) -> bool:
         """:func:`.layout.near_scenes` of one position, without arrays: most buildings end here."""
@@ -65,6 +66,10 @@ class _Builder:
         ])  # fmt: skip
         if zone >= 0 and (self.sites.query(corners)[1] != zone).any():
             return False
+        if self.chance.random() >= self.city.character.buildings:
+            return False
+        if self.city.character.flat_roofs:
+            rise = 0.0
         z = terrain_heights(self.s, corners)[:, 0]
         if z.min() < self.s.water + 0.6 or z.max() - z.min() > steepest:
             return False

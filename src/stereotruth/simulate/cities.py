@@ -34,6 +34,39 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class ViewSpec:
+    """What one image of a pair has of its own.
+
+    ``sun_deg``: azimuth and elevation of the sun, degrees; None is the city's. ``bare``: the crowns
+    of the canopy have no leaves, so that most rays pass them.
+    """
+
+    sun_deg: tuple[float, float] | None = None
+    bare: bool = False
+
+
+@dataclass(frozen=True)
+class Canopy:
+    """Crowns with rough tops, besides the trees that the land use has.
+
+    ``arrangement``: "single" (anywhere), "rows" or "forest". ``ground_m2``: ground per crown.
+    ``radius_m``: least and greatest radius. ``lobes``: ellipsoids that stand out of a crown's top.
+    ``brightness``: factor on the reflectance of leaves. ``porosity``: share of the LiDAR pulses
+    that the top of a crown lets pass. ``trunk_m``: least and greatest height of a crown's lower
+    end; ``slimness``: of its height over its width.
+    """
+
+    arrangement: str = "single"
+    ground_m2: float = 250.0
+    radius_m: tuple[float, float] = (1.5, 4.5)
+    lobes: int = 8
+    brightness: float = 0.4
+    porosity: float = 0.35
+    trunk_m: tuple[float, float] = (0.4, 2.2)
+    slimness: tuple[float, float] = (0.75, 1.1)
+
+
+@dataclass(frozen=True)
 class Character:
     """What a city looks like.
 
@@ -42,7 +75,10 @@ class Character:
     ``river_m``: width of the river, 0 for none; ``lakes``: depth of depressions below the water
     level, 0 for none. ``zones``: weight of each land use, see ``zones.ZONE_KINDS``. ``towers_m``:
     range of heights of high buildings. ``trees``: factor on the number of trees. ``zone_m``: mean
-    distance between the centres of zones.
+    distance between the centres of zones. ``canopy``: crowns besides these trees.
+    ``ground_look``: factors on the ground's reflectance and on its contrast. ``buildings``: share
+    of the buildings that are built; ``flat_roofs``: none has a gable. ``vehicles``: per hectare,
+    which move between the views and are others in the LiDAR.
     """
 
     relief_m: float
@@ -55,6 +91,11 @@ class Character:
     towers_m: tuple[float, float]
     trees: float
     zone_m: float = 330.0
+    canopy: Canopy | None = None
+    ground_look: tuple[float, float] = (1.0, 1.0)
+    buildings: float = 1.0
+    flat_roofs: bool = False
+    vehicles: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +104,8 @@ class CitySpec:
 
     ``lon``, ``lat`` in degrees; ``epsg``: the UTM zone of its LiDAR; ``base_height_m``: ellipsoidal
     height of its lowest ground; ``world_seed`` draws everything that is built.
-    ``margin_m``: ground built around the scenes, more than any ray leans.
+    ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
+    the images have of their own.
     """
 
     name: str
@@ -79,6 +121,8 @@ class CitySpec:
     sun_elevation_deg: float = 54.0
     margin_m: float = 160.0
     single_box: tuple[float, float, float, float, float] | None = field(default=None)
+    left: ViewSpec = ViewSpec()
+    right: ViewSpec = ViewSpec()
 
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""

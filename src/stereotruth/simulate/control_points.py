@@ -14,7 +14,15 @@ from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .layout import scene_coordinates
 from .render import ImagedScene, prepare
-from .surfaces import IN_IMAGES, IN_LIDAR, cast, terrain_heights
+from .surfaces import (
+    ANY_VIEW,
+    IN_IMAGES,
+    IN_LIDAR,
+    LEFT_VIEW,
+    RIGHT_VIEW,
+    cast,
+    terrain_heights,
+)
 from .truth import seen_from
 
 log = logging.getLogger("stereotruth")
@@ -34,9 +42,9 @@ def _see(s, above_left, above_right, left, right, size, xyz, tolerance, image, s
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
         lc, lr = project_point(left, x, y, z, 0.5 * size[1], line)
-        free = seen_from(s, above_left, x, y, z, line, IN_IMAGES, tolerance)
+        free = seen_from(s, above_left, x, y, z, line, LEFT_VIEW, tolerance)
         rc, rr = project_point(right, x, y, z, 0.5 * size[3], line)
-        both = seen_from(s, above_right, x, y, z, line, IN_IMAGES, tolerance)
+        both = seen_from(s, above_right, x, y, z, line, RIGHT_VIEW, tolerance)
         image[n, 0], image[n, 1], image[n, 2], image[n, 3] = lc, lr, rc, rr
         m = FRAME_MARGIN_PX
         seen[n] = (
@@ -167,7 +175,7 @@ def make_points(
 def _open(s, xyz, out):
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        a, kind_a, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, IN_IMAGES, True, z)
+        a, kind_a, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, ANY_VIEW, True, z)
         b, kind_b, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, IN_LIDAR, True, z)
         out[n] = kind_a != 0 and kind_b != 0 and a < z + 0.005 and b < z + 0.005
 

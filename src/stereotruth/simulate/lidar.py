@@ -13,7 +13,7 @@ import numpy as np
 import pyproj
 
 from ..errors import InputError
-from ..kernels import kernel
+from ..kernels import inlined, kernel
 from ..products.files import replacing
 from .built_city import surfaces_of
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
@@ -31,6 +31,7 @@ NOISE_M = 0.03
 NOISE_SHARE = 1.5e-4
 WATER_RETURNS = 0.15
 SECOND_RETURNS = 0.45
+INSIDE = 0.3  # share of the pulses through a crown's top that end in the crown
 PULSES_A_CHUNK = 50_000  # so many stay in the cache
 
 
@@ -46,6 +47,16 @@ def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[
     step = size / scene.lidar_grid
     start = low + step * index
     return (*start, *(start + step))
+
+
+@inlined
+def _through_the_top(s, ax, ay, bx, by, top, index, ground, rng):
+    """z and kind of what a pulse meets below the top of a crown: leaves, or what stands there."""
+    low, kind, _, _ = above_ground(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, False, ground)
+    if rng.random() < INSIDE:
+        bottom = max(s.trees[index, 2] - s.trees[index, 4], low)
+        return top - rng.random() * max(top - bottom, 0.0), TREE
+    return low, kind
 
 
 @kernel
@@ -74,13 +85,17 @@ def _fly(s, cover, box, spacing, strip, first, last, rng, xyz, info):
             bx, by = (slant, 0.0) if strip == 0 else (0.0, slant)
             ax, ay = x - bx * ground, y - by * ground
             # the pulse meets the ground where it is aimed
-            z, kind, _, _ = above_ground(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
+            z, kind, index, _ = above_ground(s, s.lidar_top, ax, ay, bx, by, IN_LIDAR, True, ground)
             if kind == 0:
                 continue
             chance = rng.random()
             if kind == WATER and chance > WATER_RETURNS:
                 continue
             returns = 2 if kind == TREE and chance < SECOND_RETURNS else 1
+            passing = s.tree_style[index, 1] if kind == TREE else 0.0
+            if passing > 0.0 and rng.random() < passing:
+                returns = 1
+                z, kind = _through_the_top(s, ax, ay, bx, by, z, index, ground, rng)
             for k in range(returns):
                 if k == 1:
                     z, kind, _, _ = above_ground(

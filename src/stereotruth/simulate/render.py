@@ -19,16 +19,18 @@ from ..products.files import replacing
 from .appearance import reflectance
 from .built_city import surfaces_of
 from .camera import aim, direction, pose, rays
-from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
+from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
 from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import (
     CLOSE_M,
-    IN_IMAGES,
+    LEFT_VIEW,
     NONE,
+    RIGHT_VIEW,
     Surfaces,
     above_ground,
+    direction_of_sun,
     ground_hit,
     horizon,
     spline,
@@ -46,11 +48,15 @@ LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a
 AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
 PSF_SIGMA_PX = 0.42
 RPC_MARGIN_M = 130.0
+SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
 
 
 class Camera(NamedTuple):
-    """One view of a scene: packed camera, image size, biased RPCs, horizon of its rays."""
+    """One view of a scene: packed camera, image size, biased RPCs, horizon of its rays.
+
+    ``surfaces``: the city's by the sun of the view; ``shown``: bits of the objects in the view.
+    """
 
     view: str
     cam: np.ndarray
@@ -58,6 +64,8 @@ class Camera(NamedTuple):
     rows: int
     rpc: FittedRPC
     horizon: np.ndarray
+    surfaces: Surfaces
+    shown: int
 
 
 class ImagedScene(NamedTuple):
@@ -124,8 +132,18 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
             raise RuntimeError(f"{scene.name} {view}: RPCs miss the camera by {rpc.rms_px:.3f} px")
         _, toward = rays(cam, [[(cols - 1) / 2, (rows - 1) / 2]])
         above = horizon(surfaces.cell_top, toward[0, 0], toward[0, 1])
-        cameras.append(Camera(view, cam, cols, rows, rpc, above))
+        own = by_sun_of(surfaces, getattr(city, view))
+        cameras.append(Camera(view, cam, cols, rows, rpc, above, own, SHOWN[view]))
     return ImagedScene(city, scene, frame, surfaces, *cameras)
+
+
+def by_sun_of(surfaces: Surfaces, view: ViewSpec) -> Surfaces:
+    """A city's surfaces by the sun of a view."""
+    if view.sun_deg is None:
+        return surfaces
+    sun = direction_of_sun(*view.sun_deg)
+    top = horizon(surfaces.cell_top, sun[0] / sun[2], sun[1] / sun[2])
+    return surfaces._replace(sun=sun, sun_top=top)
 
 
 @inlined
@@ -192,12 +210,13 @@ def _ground_below(s, cam, lines, col, first, ground, before, work):
 
 
 @kernel
-def _shade_rows(s, above, cam, first_row, out):
+def _shade_rows(s, above, shown, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
 
-    ``first_row`` is the image row of out's row 0; out's column 0 is image column −2. Where the
-    ground is follows from where it was a column before. Several rows go side by side, so that the
-    processor need not wait for one to end before it begins with another.
+    ``shown``: bits of the objects seen. ``first_row`` is the image row of out's row 0; out's column
+    0 is image column −2. Where the ground is follows from where it was a column before. Several
+    rows go side by side, so that the processor need not wait for one to end before it begins with
+    another.
     """
     lines = np.empty((LANES, 12))
     ground, before = np.zeros(LANES), np.zeros(LANES)
@@ -220,12 +239,12 @@ def _shade_rows(s, above, cam, first_row, out):
                 for n in range(columns):
                     ax, ay, bx, by, ground_z, zx, zy = hits[k, n]
                     z, kind, index, face = above_ground(
-                        s, above, ax, ay, bx, by, IN_IMAGES, True, ground_z
+                        s, above, ax, ay, bx, by, shown, True, ground_z
                     )
                     value = 0.1
                     if kind != NONE:
                         value = reflectance(
-                            s, sun, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy
+                            s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
                         )
                     out[r0 + k, c0 + n] = value
 
@@ -293,7 +312,9 @@ def simulate_image(
         for first in progress(strips, len(strips), f"{scene.name} {view}"):
             count = min(STRIP_ROWS, rows - first)
             half = np.empty((2 * (count + 4), 2 * (cols + 4)), np.float32)
-            _shade_rows(ready.surfaces, camera.horizon, camera.cam, first - 2.0, half)
+            _shade_rows(
+                camera.surfaces, camera.horizon, camera.shown, camera.cam, first - 2.0, half
+            )
             signal = dark + gain * _decimate(half)
             rng = np.random.default_rng([seed, view == "left", first])
             noise = rng.standard_normal(signal.shape, dtype=np.float32)

@@ -17,7 +17,9 @@ import numpy as np
 from ..kernels import inlined, kernel
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
-IN_IMAGES, IN_LIDAR = 1, 2
+IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
+LEFT_VIEW, RIGHT_VIEW = IN_IMAGES | IN_LEFT, IN_IMAGES | IN_RIGHT  # bits that an image shows
+ANY_VIEW = LEFT_VIEW | RIGHT_VIEW
 CELL_M = 8.0
 REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
 CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
@@ -29,9 +31,12 @@ class Surfaces(NamedTuple):
 
     ``x0``, ``y0``: lower corner of terrain and cells (m). ``terrain`` float64[ny, nx]: spline
     coefficients, ``step`` m apart. ``boxes`` float64[n, 8]: centre x, y, long axis ux, uy, half
-    length, half width, z of the eaves, rise of the ridge. ``box_view`` uint8[n]: IN_IMAGES |
-    IN_LIDAR. ``box_style`` float64[n, 4]: albedo of roof, of walls, kind of roof cover, phase.
-    ``trees`` float64[n, 6]: x, y, z of the centre, radius, half height, square of their ratio.
+    length, half width, z of the eaves, rise of the ridge. ``box_view``, ``tree_view`` uint8[n]:
+    bits of IN_IMAGES (both), IN_LIDAR, IN_LEFT, IN_RIGHT. ``box_style`` float64[n, 4]: albedo of
+    roof, of walls, kind of roof cover, phase. ``trees`` float64[n, 6]: x, y, z of the centre,
+    radius, half height, square of their ratio.
+    ``tree_style`` float64[n, 2]: factor on the reflectance, share of the pulses that pass.
+    ``ground_look`` float64[2]: factors on the ground's reflectance and on its contrast.
     ``*_first``/``*_list``: objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object
     in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
     ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`.
@@ -46,6 +51,9 @@ class Surfaces(NamedTuple):
     box_view: np.ndarray
     box_style: np.ndarray
     trees: np.ndarray
+    tree_view: np.ndarray
+    tree_style: np.ndarray
+    ground_look: np.ndarray
     box_first: np.ndarray
     box_list: np.ndarray
     tree_first: np.ndarray
@@ -59,6 +67,15 @@ class Surfaces(NamedTuple):
     fine: np.ndarray
     broad: np.ndarray
     sun: np.ndarray
+
+
+def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    """Unit vector [3] toward the sun: east, north, up."""
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    return np.array([
+        math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth),
+        math.sin(elevation),
+    ])  # fmt: skip
 
 
 @inlined
@@ -194,9 +211,9 @@ def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
 
     Returns z, kind, object, face, and of the ground below z and its derivatives along x and y.
 
-    ``view``: objects seen, IN_IMAGES or IN_LIDAR. ``trees``: whether crowns stop the ray.
-    ``horizon``: what :func:`horizon` gives for such rays. ``guess``: z near which the ground is
-    sought.
+    ``view``: bits of the objects seen, as LEFT_VIEW or IN_LIDAR. ``trees``: whether crowns stop
+    the ray. ``horizon``: what :func:`horizon` gives for such rays. ``guess``: z near which the
+    ground is sought.
     """
     ground, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
     best, kind, index, face = above_ground(s, horizon, ax, ay, bx, by, view, trees, ground)
@@ -241,7 +258,7 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
             if trees:
                 for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
                     k = s.tree_list[n]
-                    if s.trees[k, 2] + s.trees[k, 4] > best:
+                    if s.tree_view[k] & view and s.trees[k, 2] + s.trees[k, 4] > best:
                         high = tree_top(s.trees, k, ax, ay, bx, by)
                         if high > best:
                             best, kind, index, face = high, TREE, k, 0
@@ -259,8 +276,18 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
 
 
 @inlined
-def in_shadow(s, sun, x, y, z):
-    """Whether a building or tree stands between a surface point and the sun.
+def stands_in(s, kind, index, view):
+    """Whether the object of a surface point is in a view, where something may hide it."""
+    if kind == TREE:
+        return s.tree_view[index] & view != 0
+    if kind in (ROOF, WALL):
+        return s.box_view[index] & view != 0
+    return True
+
+
+@inlined
+def in_shadow(s, sun, x, y, z, view):
+    """Whether a building or tree of a view stands between a surface point and the sun.
 
     ``sun``: the three values of ``s.sun``, which as a tuple are divided once for all points.
     """
@@ -284,14 +311,15 @@ def in_shadow(s, sun, x, y, z):
             cell = j * nx + i
             for n in range(s.box_first[cell], s.box_first[cell + 1]):
                 k = s.box_list[n]
-                if s.box_view[k] & IN_IMAGES and s.boxes[k, 6] + s.boxes[k, 7] > clear:
+                if s.box_view[k] & view and s.boxes[k, 6] + s.boxes[k, 7] > clear:
                     low, high, _ = box_span(s.boxes, k, ax, ay, bx, by)
                     if high >= low and high > clear:
                         return True
             for n in range(s.tree_first[cell], s.tree_first[cell + 1]):
                 k = s.tree_list[n]
                 if (
-                    s.trees[k, 2] + s.trees[k, 4] > clear
+                    s.tree_view[k] & view
+                    and s.trees[k, 2] + s.trees[k, 4] > clear
                     and tree_top(s.trees, k, ax, ay, bx, by) > clear + 0.1
                 ):
                     return True

@@ -55,10 +55,15 @@ def place_trees(
     trees = np.column_stack(
         [xy, ground + trunk + half, radius, half, radius * radius / (half * half)]
     )
-    if len(boxes) and len(trees):  # no crown through a wall
+    return trees[clear_of_walls(trees, boxes)]
+
+
+def clear_of_walls(trees: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Which crowns [n, 6] stand in no wall, bool[n]."""
+    free = np.ones(len(trees), bool)
+    if len(boxes) and len(trees):
         near = cKDTree(boxes[:, :2])
         biggest = np.hypot(boxes[:, 4], boxes[:, 5])
-        free = np.ones(len(trees), bool)
         order = np.argsort(-biggest)
         split = [order[biggest[order] > 25], order[biggest[order] <= 25]]
         for part in split:
@@ -77,5 +82,4 @@ def place_trees(
             v = np.abs(dy * b[:, 2] - dx * b[:, 3]) - b[:, 5]
             gap = np.hypot(np.maximum(u, 0), np.maximum(v, 0))
             free[which[gap < trees[which, 3] * 0.95 + 0.3]] = False
-        trees = trees[free]
-    return trees
+    return free

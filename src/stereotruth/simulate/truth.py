@@ -18,7 +18,7 @@ from .cities import CitySpec, SceneSpec
 from .geodesy import world_to_geodetic_point
 from .lidar_coverage import coverage, covered
 from .render import in_collar, prepare
-from .surfaces import IN_IMAGES, IN_LIDAR, NONE, above_ground, cast
+from .surfaces import IN_LIDAR, LEFT_VIEW, NONE, RIGHT_VIEW, above_ground, cast, stands_in
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -88,6 +88,7 @@ def _truth_points(
     ``is_left``, the image of the positions is the right one, and what is called right the left.
     """
     line, other = np.empty(12), np.empty(12)
+    shown, shown_there = (LEFT_VIEW, RIGHT_VIEW) if is_left else (RIGHT_VIEW, LEFT_VIEW)
     guess = 0.0
     right_row = 0.5 * size[3]
     posed = np.nan
@@ -105,12 +106,12 @@ def _truth_points(
         dx, dy, dz = direction(left, line, c)
         bx, by = dx / dz, dy / dz
         ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-        z, kind, _, _, ground, _, _ = cast(s, above_left, ax, ay, bx, by, IN_IMAGES, True, guess)
+        z, kind, index, _, ground, _, _ = cast(s, above_left, ax, ay, bx, by, shown, True, guess)
         guess = ground
         x, y = ax + bx * z, ay + by * z
         lon, lat, height = world_to_geodetic_point(frame, x, y, z)
         col, right_row = project_point(right, x, y, z, right_row, other)
-        free = seen_from(s, above_right, x, y, z, other, IN_IMAGES, SEEN_TOLERANCE_M)
+        free = seen_from(s, above_right, x, y, z, other, shown_there, SEEN_TOLERANCE_M)
         inside = (
             col >= 0
             and right_row >= 0
@@ -118,12 +119,13 @@ def _truth_points(
             and right_row <= size[3] - 1
             and not in_collar(not is_left, col, right_row, size[2], size[3])
         )
+        there = inside and stands_in(s, kind, index, shown_there)
         scanned, _, _, _ = above_ground(s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground)
         changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
         real[0, k], real[1, k], real[2, k] = lon, lat, height
         real[3, k], real[4, k] = col, right_row
-        flags[0, k] = free and inside
-        flags[1, k] = inside and not free
+        flags[0, k] = free and there
+        flags[1, k] = there and not free
         flags[2, k] = kind
         flags[3, k] = changed
         flags[4, k] = (

@@ -7,15 +7,24 @@ separate jobs.
 from __future__ import annotations
 
 import logging
-import math
 
 import numpy as np
 
 from ..kernels import kernel
 from .buildings import FLAT, choose_changed, place_buildings
+from .canopy import place_canopy
 from .cities import CitySpec
 from .layout import extent
-from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, horizon, lidar_horizon, terrain_heights
+from .surfaces import (
+    CELL_M,
+    IN_IMAGES,
+    IN_LIDAR,
+    Surfaces,
+    direction_of_sun,
+    horizon,
+    lidar_horizon,
+    terrain_heights,
+)
 from .terrain import (
     BROAD_STEP_M,
     FINE_STEP_M,
@@ -25,6 +34,7 @@ from .terrain import (
     spectral_noise,
 )
 from .trees import place_trees
+from .vehicles import place_vehicles
 from .zones import draw_zones
 
 log = logging.getLogger("stereotruth")
@@ -71,16 +81,14 @@ def build_surfaces(city: CitySpec) -> Surfaces:
     textures = np.random.default_rng([city.world_seed, 1])
     fine = spectral_noise(textures, size, FINE_STEP_M, (0.7, 40), 0.75)
     broad = spectral_noise(textures, size, BROAD_STEP_M, (6, 500), 1.0)
-    azimuth, elevation = math.radians(city.sun_azimuth_deg), math.radians(city.sun_elevation_deg)
-    sun = np.array([
-        math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth),
-        math.sin(elevation),
-    ])  # fmt: skip
+    sun = direction_of_sun(city.sun_azimuth_deg, city.sun_elevation_deg)
     none = np.zeros(1, np.int64), np.zeros(0, np.int32)
     s = Surfaces(
         x0=box[0], y0=box[1], step=TERRAIN_STEP_M, terrain=terrain, water=water,
         boxes=np.zeros((0, 8)), box_view=np.zeros(0, np.uint8), box_style=np.zeros((0, 4)),
-        trees=np.zeros((0, 6)), box_first=none[0], box_list=none[1], tree_first=none[0],
+        trees=np.zeros((0, 6)), tree_view=np.zeros(0, np.uint8), tree_style=np.zeros((0, 2)),
+        ground_look=np.array(city.character.ground_look),
+        box_first=none[0], box_list=none[1], tree_first=none[0],
         tree_list=none[1], cell_top=np.full((ny, nx), -1e9, np.float32),
         sun_top=np.zeros((ny, nx), np.float32), lidar_top=np.zeros((ny, nx), np.float32),
         zones=np.zeros((0, 9)),
@@ -103,6 +111,17 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         style = np.array(build.style, dtype=np.float64).reshape(-1, 4)
         view = choose_changed(city, rng, build, boxes)
         trees = place_trees(city, rng, s, sites, boxes)
+        vehicles = place_vehicles(city, s, sites)
+        boxes = np.concatenate([boxes, vehicles.boxes])
+        style = np.concatenate([style, vehicles.style])
+        view = np.concatenate([view, vehicles.view])
+    tree_view = np.full(len(trees), IN_IMAGES | IN_LIDAR, np.uint8)
+    tree_style = np.tile([1.0, 0.0], (len(trees), 1))
+    if city.character.canopy is not None:
+        canopy = place_canopy(city, city.character.canopy, s, sites, boxes)
+        trees = np.concatenate([trees, canopy.crowns])
+        tree_view = np.concatenate([tree_view, canopy.view])
+        tree_style = np.concatenate([tree_style, canopy.style])
     half = np.column_stack([
         np.abs(boxes[:, 2]) * boxes[:, 4] + np.abs(boxes[:, 3]) * boxes[:, 5],
         np.abs(boxes[:, 3]) * boxes[:, 4] + np.abs(boxes[:, 2]) * boxes[:, 5],
@@ -119,7 +138,8 @@ def build_surfaces(city: CitySpec) -> Surfaces:
     top = top.reshape(ny, nx)
     top = np.nextafter(top.astype(np.float32), np.float32(np.inf))
     s = s._replace(
-        boxes=boxes, box_view=view, box_style=style, trees=trees, box_first=box_first,
+        boxes=boxes, box_view=view, box_style=style, trees=trees, tree_view=tree_view,
+        tree_style=tree_style, box_first=box_first,
         box_list=box_list, tree_first=tree_first, tree_list=tree_list,
         cell_top=top, sun_top=horizon(top, sun[0] / sun[2], sun[1] / sun[2]),
         lidar_top=lidar_horizon(top),

@@ -11,14 +11,14 @@ from stereotruth.alignment.adjustment import estimate
 
 
 def system(rng: np.random.Generator, n: int = 600):
-    """Design [n, 2, 12] of places on a plane, and the sites that they belong to."""
+    """Design [n, 2, 12] of places on a plane, their sites and their positions [n, 2]."""
     u, v = rng.uniform(-1, 1, (2, n))
     basis = np.column_stack([u, v, np.ones(n)])
     design = np.zeros((n, 2, 12))
     design[:, 0, :3] = design[:, 1, 3:6] = -basis
     design[:, 0, 6:9] = design[:, 1, 9:] = basis
     sites = (np.floor(u * 4) * 100 + np.floor(v * 4)).astype(int)
-    return design, sites
+    return design, sites, np.column_stack([u, v])
 
 
 @pytest.mark.parametrize("of_class", [0.0, 0.02])
@@ -32,7 +32,7 @@ def test_uncertainty_of_the_estimate_is_honest(of_class):
     ratios, chances, shared = [], [], []
     prior = np.eye(12) * 0.2**2
     for _ in range(60):
-        design, sites = system(rng)
+        design, sites, where = system(rng)
         truth = rng.normal(0, 0.2, 12)
         own = rng.uniform(0.02, 0.08, len(design))
         index = np.unique(sites, return_inverse=True)[1]
@@ -42,12 +42,12 @@ def test_uncertainty_of_the_estimate_is_honest(of_class):
         errors += rng.normal(0, of_class, (5, 2))[fifth]
         bad = rng.random(len(design)) < 0.2
         errors[bad] += rng.uniform(-3, 3, (bad.sum(), 2))
-        found = estimate(design, design @ truth + errors, own, sites, prior)
+        found = estimate(design, design @ truth + errors, own, sites, prior, where)
         at = design[:5].reshape(-1, 12)
         sigma = np.sqrt(np.einsum("na,ab,nb->n", at, found.covariance, at))
         ratios.append(at @ (found.parameters - truth) / sigma)
         shared.append(found.shared)
-        nothing = estimate(design, errors, own, sites, prior)
+        nothing = estimate(design, errors, own, sites, prior, where)
         chances.append(nothing.statistic / nothing.freedom)
     ratios = np.abs(ratios)
     assert 0.6 < (ratios < 1).mean() < 0.76

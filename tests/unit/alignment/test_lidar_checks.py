@@ -129,7 +129,8 @@ def estimated(shifts: np.ndarray, sigma: float, rng: np.random.Generator, noise:
     truth[[2, 5, 8, 11]] = shifts
     observed = design @ truth + rng.normal(0, noise, (n, 2))
     prior = np.eye(12) * sigma**2
-    return estimate(design, observed, np.full(n, noise), np.arange(n) // 9, prior)
+    where = np.column_stack([u, v])
+    return estimate(design, observed, np.full(n, noise), np.arange(n) // 9, prior, where)
 
 
 def test_a_fault_of_height_is_measured_with_an_honest_deviation():

@@ -140,7 +140,14 @@ def test_changed_ground_does_not_draw_the_result(images, points, tmp_path):
     store = write_points(tmp_path, cloud)
     refined, observations = refine(start(NONE, PLANTED, 0.5), images[0], right, [store])
     assert max(relative_error(refined)) < 0.03
-    assert (~observations.used).mean() > 0.1
+    # Well inside what has moved, and where the LiDAR is too high, no tie point has a say.
+    found = observations.ties.right + observations.ties.shift
+    moved = (found[:, 0] > SIZE[0] / 2 + 24) & (found[:, 1] < SIZE[1] / 4 - 24)
+    left, used = observations.ties.left, observations.used
+    lat = refined.left.localize(*left.T, observations.ties.height)[1]
+    raised = (lat - LAT) * METRES[1] < -190.0
+    assert raised.sum() > 5
+    assert not used[moved].any() and not used[raised].any()
 
 
 def test_what_both_images_share_stays_as_the_gcps_say(images, points):
@@ -258,10 +265,10 @@ def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
     assert one.to_dict() == other.to_dict()
 
 
-def test_json_keeps_the_refinement(found, tmp_path):
+def test_json_keeps_the_refinement(found, images, tmp_path):
     refined, observations = found
     files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]
-    write_refinement(refined, observations, *files)
+    write_refinement(refined, observations, *files, images[0])
     again = Alignment.load(files[0])
     assert again.to_dict() == refined.to_dict()
     assert (again.covariance == refined.covariance).all()
@@ -270,10 +277,15 @@ def test_json_keeps_the_refinement(found, tmp_path):
     assert len(rows) == refined.refinement["tie_points"]
     assert sum(row["used"] == "yes" for row in rows) == refined.refinement["used"]
     picture = read_picture(files[2])
-    assert picture.shape[:2] == pytest.approx((10.0 * 110, 11.5 * 110), rel=0.1)
-    upper = picture[: picture.shape[0] // 2]
+    assert picture.shape[:2] == pytest.approx((15.0 * 110, 11.5 * 110), rel=0.1)
+    upper, over_image, lower = np.split(
+        picture, (np.array([0.36, 0.72]) * len(picture)).astype(int)
+    )
     assert share_of(upper, "C0") > 1e-3  # arrows of the sites
-    assert colours_in(picture[picture.shape[0] // 2 :]) > 2e-3  # and histograms below
-    write_refinement(replace(refined, refinement={"applied": False, "reason": "x"}), None, *files)
+    assert colours_in(over_image) > 2e-3  # tie points over the image
+    assert colours_in(lower) > 2e-3  # and histograms below
+    write_refinement(
+        replace(refined, refinement={"applied": False, "reason": "x"}), None, *files, images[0]
+    )
     assert len(files[1].read_text().splitlines()) == 1
     assert colours_in(read_picture(files[2])) == 0  # nothing but its title

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
+import rasterio
 from rich.console import Console
 
 from stereotruth.command.check import check_project
@@ -55,6 +57,66 @@ def test_doubts_end_strict_runs(folder):
     DOUBTS[-1].plant(folder)
     write_settings(folder, strict=True)
     assert any("left out" in text for text in texts(Level.ERROR))
+
+
+@pytest.mark.parametrize(
+    ("side", "level", "words"),
+    [
+        (60_000, Level.DOUBT, "left.tif: nodata at all of 64 places"),
+        (1_000_000, Level.ERROR, "1000000 x 1000000 pixels are no image of a satellite"),
+    ],
+)
+def test_a_small_file_of_many_pixels_is_sized_and_not_read(folder, side, level, words):
+    """60000 x 60000 took 128 s, 10⁶ x 10⁶ all of the memory."""
+    with rasterio.open("left.tif") as image:
+        rpcs = image.rpcs
+    shape = {"width": side, "height": side, "count": 1, "dtype": "uint16"}
+    blocks = {"tiled": True, "blockxsize": 8192, "blockysize": 8192, "sparse_ok": True}
+    with rasterio.open(
+        "left.tif", "w", driver="GTiff", **shape, **blocks, BIGTIFF="YES", rpcs=rpcs
+    ):
+        pass
+    begun = time.process_time()
+    assert any(words in text for text in texts(level))
+    assert time.process_time() - begun < 5
+
+
+def test_files_without_permission_are_findings(folder, monkeypatch):
+    """Tests may run as a user who may do everything, so the system's answers are made up."""
+    usual = Path.iterdir, Path.read_text
+
+    def iterdir(path):
+        if path.name == "lidar":
+            raise PermissionError(13, "Permission denied", str(path))
+        return usual[0](path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert any("lidar: no permission" in text for text in texts(Level.ERROR))
+    monkeypatch.undo()
+
+    def read_text(path, *arguments, **more):
+        if path.name == "scenes.tsv":
+            raise PermissionError(13, "Permission denied", str(path))
+        return usual[1](path, *arguments, **more)
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(Path, "read_text", read_text)
+    assert any("scenes.tsv: no permission" in text for text in texts(Level.ERROR))
+
+
+def test_many_scenes_are_told_before(folder):
+    head, row = Path("scenes.tsv").read_text().splitlines()[:2]
+    rows = [row.replace("Good-1", f"Good-{k}", 1) for k in range(1, 1201)]
+    Path("scenes.tsv").write_text("\n".join([head, *rows]) + "\n")
+    said = []
+
+    def tell(text):
+        said.append(text)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        check_project(tell=tell)
+    assert said[0].startswith("looking at 1200 scenes, about 50 min")
 
 
 def test_one_fault_hides_no_other(folder):

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from stereotruth.command.run_workflow import TRUSTED, Progress, arguments_for, duration
+from stereotruth.command.run_workflow import (
+    TRUSTED,
+    Progress,
+    arguments_for,
+    config_files,
+    duration,
+    run_workflow,
+)
+from stereotruth.errors import InputError
 from stereotruth.project import FILES
 
 SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
@@ -72,3 +82,19 @@ def test_time_left_follows_from_the_jobs_that_are_done():
 @pytest.mark.parametrize(("seconds", "words"), [(5, "5 s"), (600, "10 min"), (7200, "2.0 h")])
 def test_durations(seconds, words):
     assert duration(seconds) == words
+
+
+def test_the_files_of_the_configuration_are_found_among_the_arguments(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.yaml", "b.yaml", "c.yaml"):
+        Path(name).touch()
+    given = ["--configfile", "a.yaml", "b.yaml", "--cores", "2", "--configfiles=c.yaml", "tiles/X"]
+    assert [file.name for file in config_files(given)] == ["a.yaml", "b.yaml", "c.yaml"]
+    assert config_files(["--cores", "a.yaml"]) == []
+
+
+def test_a_configuration_that_is_no_utf_8_is_named_before_the_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("seed: 1\n", encoding="utf-16")
+    with pytest.raises(InputError, match=r"config\.yaml: is no UTF-8"):
+        run_workflow(["--dry-run"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,14 @@ def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None
         run([scene], tmp_path / "T", min_labelled=0.99)
     assert "s1 0.42" in caught.value.remedy and "project.fill: surface" in caught.value.remedy
     del grid.attrs["points_per_px"]
+    refusal = "not refined: the tie points contradict each other (0.61 px, 40 % blunders)"
+    file = tmp_path / "alignment.json"
+    views = {view: {"rms": {"after": 0.2}} for view in ("left", "right")}
+    file.write_text(json.dumps(views | {"warnings": [refusal]}))
+    with pytest.raises(InputError, match="not one labelled") as caught:
+        run([scene._replace(alignment=file)], tmp_path / "T", min_labelled=0.99)
+    assert f"alignment of scene s1 is in doubt: {refusal}" in caught.value.problem
+    assert caught.value.remedy.startswith("first what the alignment's doubts say")
     with pytest.raises(InputError, match="grid smaller than a tile"):
         run([scene], tmp_path / "T", size=1024)
     with pytest.raises(InputError, match=r"tiles\.stride"):

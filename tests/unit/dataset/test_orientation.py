@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereotruth.dataset.orientation import orientation, sensor_record
 from stereotruth.dataset.polynomials import evaluate
 from stereotruth.dataset.scene_stores import SceneFiles
+from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rpc import RPC
 
+from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, camera
 from ...synthetic.tiled_scene import LAT, LON, SIZE, labels, rows_of, terrain
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -67,3 +70,27 @@ def test_height_from_stored_disparity(exported: tuple[Path, dict]) -> None:
     got = evaluate(record["ground"], x, y, disparity[y, x])
     error = got["height"] - terrain(got["lon"], got["lat"])
     assert np.abs(error).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        (BACKWARD, FORWARD, "left: reference, the backward view"),
+        (FORWARD, BACKWARD, "left: reference, the forward view"),
+        ((0.3, 0.0), (-0.3, 0.0), "across the flight direction"),
+    ],
+)
+def test_sidecar_says_which_view_looks_backward(left, right, said: str) -> None:
+    size = 300, 280
+    model = fit_epipolar(*(camera(look, size=size) for look in (left, right)), size, size, HEIGHT)
+    record = orientation(
+        model,
+        {"left": sensor_record(model.left), "right": sensor_record(model.right)},
+        row0=50,
+        col0=60,
+        size=SIZE,
+        offset=0,
+        height=np.full((SIZE, SIZE), HEIGHT),
+        disparity=np.full((SIZE, SIZE), np.nan),
+    )
+    assert said in record["conventions"]["views"]

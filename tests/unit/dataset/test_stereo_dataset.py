@@ -152,3 +152,19 @@ def test_the_published_pairs_are_found():
     assert 0.1 < np.isnan(labels).mean() < 0.3 and np.nanmin(labels) > -96
     (pair,) = find_pairs(PUBLISHED / "whu", "whu")
     assert (pair.name, pair.city, pair.disparity) == ("KM_253", "Kunming", None)
+
+
+def test_names_of_files_that_are_no_plain_names_are_refused(tmp_path):
+    """They become names of products, and of keys of tables."""
+    for layout, left, right in (
+        ("whu", "S\\G_left_1.tiff", "S\\G_right_1.tiff"),
+        ("us3d", "A\aB_LEFT_RGB.tif", "A\aB_RIGHT_RGB.tif"),
+        ("kitti", "image_2/.._10.png", "image_3/.._10.png"),
+        ("whu", f"{'x' * 110}_left_1.tiff", f"{'x' * 110}_right_1.tiff"),
+    ):
+        root = tmp_path / str(len(left)) / layout
+        for file in (left, right):
+            (root / file).parent.mkdir(parents=True, exist_ok=True)
+            (root / file).touch()
+        with pytest.raises(InputError, match="the name of a pair, "):
+            find_pairs(root, layout)

@@ -11,6 +11,7 @@ import pyproj
 import pytest
 import zarr
 
+from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.pixel_labels import RIDGE
 from stereotruth.disparity.scene_inputs import SceneInputs
@@ -26,6 +27,7 @@ from ...synthetic.box_scene import (
     ROOF,
     UTM,
     Scene,
+    alignment_of,
     dilated,
     hidden_truth,
     project_with,
@@ -397,23 +399,24 @@ def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box) -> None:
     assert (ratio < 2).mean() == pytest.approx(0.95, abs=0.03)
 
 
-def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path) -> None:
-    """Nodes in the left image's attributes, bilinear between them, added in squares."""
-    images = [
-        write_image(tmp_path / f"{name}.zarr", plane.model, zarr.open_group(path)["image"][:])
-        for name, path in zip(("left", "right"), plane.images)
-    ]
-    none = plane.project(method="none")["uncertainty"].values.astype(float)
-    flat = [[0.0, 0.0], [0.0, 0.0]]
-    nodes = {"step_px": 100, "disparity": [[0.1, 0.3], [0.1, 0.3]], "x": flat, "y": flat}
-    zarr.open_group(images[0], mode="r+").attrs["alignment_sigma"] = nodes
-    project_with(*images, [plane.store], tmp_path / "out.zarr", method="none")
-    sigma = open_grid(tmp_path / "out.zarr")["uncertainty"].values
-    col = np.broadcast_to(np.arange(sigma.shape[1]), sigma.shape)
-    expected = np.hypot(none, 0.1 + 0.2 * np.clip(col / 100.0, 0, 1))
-    known = np.isfinite(none)
-    assert known.sum() > 30_000
-    assert np.allclose(sigma[known], expected[known], atol=1e-5)
+@pytest.mark.parametrize("view", ["left", "right"])
+def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path, view) -> None:
+    """Added in squares to that of the points; nothing else of the labels follows from it."""
+    alignment = alignment_of(plane.model, 1.0, view)
+    alignment.save(tmp_path / "alignment.json")
+    plain, grid = (
+        plane.project(f"{view}-{k}.zarr", method="none", view=view, **options)
+        for k, options in enumerate([{}, {"alignment": tmp_path / "alignment.json"}])
+    )
+    none, sigma = (g["uncertainty"].values.astype(float) for g in (plain, grid))
+    y, x = np.nonzero(np.isfinite(none))
+    assert x.size > 30_000
+    variance = label_covariance(alignment, plane.model, x, y, view)[:, 0, 0]  # the plane is level
+    assert np.allclose(sigma[y, x] ** 2, none[y, x] ** 2 + variance, rtol=0.01)
+    for name in set(grid) - {"uncertainty"}:
+        assert np.array_equal(grid[name].values, plain[name].values, equal_nan=True), name
+    assert plain.attrs["alignment_sigma_px"] == {"disparity": 0.0, "x": 0.0, "y": 0.0}
+    assert grid.attrs["alignment_sigma_px"]["x"] > 0.01
 
 
 def refused(scene: Scene, store: Path, match: str) -> None:
@@ -443,6 +446,9 @@ def test_settings_are_checked(plane) -> None:
         project_with(*plane.images, [], plane.folder / "x.zarr")
 
 
-def test_store_bounds_are_kept(plane) -> None:
+def test_store_bounds_and_density_are_kept(plane) -> None:
+    """Points every 0.4 m over 230 m, in cells of 117 m."""
     grid = plane.project(method="none")
+    assert grid.attrs["points_per_m2"] == pytest.approx(0.4**-2, rel=0.02)
+    assert grid.attrs["points_per_px"] == pytest.approx((0.65 / 0.4) ** 2, rel=0.1)
     assert grid.attrs["points_bounds"] == list(PointStore(plane.store).bounds)

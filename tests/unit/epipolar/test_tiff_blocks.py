@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import struct
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-from stereotruth.epipolar.tiff_blocks import damaged_block
+from stereotruth.epipolar.tiff_blocks import _batches, damaged_block
 from stereotruth.products.ungeoreferenced import open_raster
 
 GREY = np.random.default_rng(0).integers(0, 900, (200, 300)).astype(np.uint16)
@@ -79,13 +81,59 @@ def test_what_gdal_passes_over_is_found(tmp_path) -> None:
 def test_sizes_that_do_not_go_together(tmp_path, compress, tag, value, match) -> None:
     path = write(tmp_path / "a.tif", compress=compress, blockysize=200)
     data = bytearray(path.read_bytes())
-    (start,) = struct.unpack_from("<I", data, 4)
-    for k in range(struct.unpack_from("<H", data, start)[0]):
-        at = start + 2 + 12 * k
-        if struct.unpack_from("<H", data, at)[0] == tag:
-            struct.pack_into("<I", data, at + 8, value)
+    struct.pack_into("<I", data, entry_of(data, tag) + 8, value)
     path.write_bytes(data)
     assert re.search(match, damaged_block(path))
+
+
+def entry_of(data: bytes, wanted: int) -> int:
+    """Where a tag stands in a small TIFF."""
+    (start,) = struct.unpack_from("<I", data, 4)
+    places = (start + 2 + 12 * k for k in range(struct.unpack_from("<H", data, start)[0]))
+    return next(at for at in places if struct.unpack_from("<H", data, at)[0] == wanted)
+
+
+@pytest.mark.parametrize("compress", ["none", "deflate", "lzw", "packbits"])
+def test_two_strips_at_one_place_are_found(tmp_path, compress) -> None:
+    """GDAL reads them in silence, the same rows twice."""
+    path = write(tmp_path / "a.tif", compress=compress, blockysize=50)
+    data = bytearray(path.read_bytes())
+    (places,) = struct.unpack_from("<I", data, entry_of(data, 273) + 8)
+    (sizes,) = struct.unpack_from("<I", data, entry_of(data, 279) + 8)
+    kind, width = ("<H", 2) if data[entry_of(data, 279) + 2] == 3 else ("<I", 4)
+    for table, code, step in ((places, "<I", 4), (sizes, kind, width)):
+        (first,) = struct.unpack_from(code, data, table)
+        struct.pack_into(code, data, table + 2 * step, first)
+    path.write_bytes(data)
+    with open_raster(path) as dataset:
+        values = dataset.read(1)
+    assert np.array_equal(values[:50], values[100:150])
+    assert damaged_block(path) == "blocks 1 and 3 of 4 share bytes"
+
+
+def test_a_block_that_holds_more_than_its_pixels_is_found_in_little_memory(tmp_path) -> None:
+    """A gigabyte of zeros in a megabyte of deflate."""
+    path = write(tmp_path / "a.tif", compress="deflate", blockysize=200)
+    packer = zlib.compressobj(9)
+    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1000)) + packer.flush()
+    data = bytearray(path.read_bytes()) + bomb
+    struct.pack_into("<I", data, entry_of(data, 273) + 8, len(data) - len(bomb))
+    struct.pack_into("<I", data, entry_of(data, 279) + 8, len(bomb))
+    path.write_bytes(data)
+    tracemalloc.start()
+    assert damaged_block(path) == "block 1 of 1 is damaged"
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 50e6
+
+
+def test_many_blocks_are_read_a_few_at_a_time(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", tiled=True, blockxsize=16, blockysize=16, compress="deflate")
+    assert damaged_block(path, workers=2) == ""
+    counts = np.array([10, 70 << 20, 0, 0, 5] + [1] * 70)
+    batches = list(_batches(counts))
+    assert [k for batch in batches for k in batch] == list(range(75))
+    assert all(len(b) <= 64 and (len(b) == 1 or counts[list(b)].sum() <= 64 << 20) for b in batches)
 
 
 def test_sparse_files_and_other_formats_pass(tmp_path) -> None:

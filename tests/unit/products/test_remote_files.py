@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 
 import pytest
 
@@ -38,11 +41,86 @@ def test_a_place_stands_for_its_url(url, tmp_path, monkeypatch):
         "https://host/left.tif?signature=1",
         "https://name:word@host/left.tif",
         "https://host/../../left.tif",
+        "s3://../left.tif",
+        "https://name:wo/rd@host/left.tif",
+        "https://host//left.tif",
+        "https://host/./left.tif",
+        "https://host/a\nb/left.tif",
+        "https://[host/left.tif",
+        f"s3://bucket/{'x' * 201}.tif",
     ],
 )
 def test_other_urls_are_refused(url):
-    with pytest.raises(InputError, match="URL"):
+    with pytest.raises(InputError, match="URL") as refused:
         place_of(url)
+    assert "signature" not in str(refused.value) and "word@" not in str(refused.value)
+
+
+@contextmanager
+def answering(status, content=b""):
+    """A web server that answers so whatever it is asked for; its URL."""
+
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(content)
+
+        do_HEAD = do_GET
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Answer)
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.parametrize("status", [404, 410])
+def test_what_is_not_there_is_absent(tmp_path, monkeypatch, status):
+    pytest.importorskip("aiohttp")
+    monkeypatch.chdir(tmp_path)
+    with answering(status) as url:
+        old = place_of(f"{url}/left_RPC.TXT")
+        old.parent.mkdir(parents=True)
+        old.write_text("of a run before")
+        assert remote_files.fetch(f"{url}/left_RPC.TXT") is None
+        assert not old.exists()
+        with pytest.raises(InputError, match="no such file there"):
+            remote_files.stand_in(f"{url}/left.tif")
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 429, 500, 502, 503])
+def test_a_server_that_fails_is_not_taken_for_a_missing_file(tmp_path, monkeypatch, status):
+    """As it was with RPC files beside an image: the image's own tag was used then."""
+    pytest.importorskip("aiohttp")
+    monkeypatch.chdir(tmp_path)
+    with answering(status) as url:
+        for bring in (remote_files.bring_image, remote_files.fetch, remote_files.stand_in):
+            with pytest.raises(InputError, match=rf"does not answer as it should .*{status}"):
+                bring(f"{url}/left.tif")
+
+
+def test_a_server_that_is_gone_is_not_taken_for_a_missing_file(tmp_path, monkeypatch):
+    pytest.importorskip("aiohttp")
+    monkeypatch.chdir(tmp_path)
+    with answering(200) as url:
+        pass
+    with pytest.raises(InputError, match="does not answer as it should"):
+        remote_files.fetch(f"{url}/left_RPC.TXT")
+
+
+def test_a_small_file_is_fetched(tmp_path, monkeypatch):
+    pytest.importorskip("aiohttp")
+    monkeypatch.chdir(tmp_path)
+    with answering(200, b"text") as url:
+        assert remote_files.fetch(f"{url}/left_RPC.TXT").read_bytes() == b"text"
 
 
 def test_what_lies_elsewhere_in_the_working_directory_is_a_file(tmp_path, monkeypatch):

@@ -80,3 +80,10 @@ def test_metres_stand_beside_px_where_the_geometry_is_known():
 def test_a_missed_gate_is_among_the_first_six():
     found = headlines([ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"scenes": {}})
     assert any(card.bad for card in found[:6])
+
+
+def test_density_is_that_of_the_scenes():
+    assert "LiDAR density" not in cards({"A-1": SCENE})
+    dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
+    assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
+    assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"

@@ -50,6 +50,6 @@ def test_a_row_is_the_same_whatever_rows_are_beside_it() -> None:
     camera = ready.left
     shown = [np.empty((rows, 2 * camera.cols), np.float32) for rows in (3 * LANES, LANES + 3)]
     for half, first in zip(shown, (100.0, 102.5)):
-        _shade_rows(ready.surfaces, camera.horizon, camera.cam, first, half)
+        _shade_rows(camera.surfaces, camera.horizon, camera.shown, camera.cam, first, half)
     np.testing.assert_array_equal(shown[1], shown[0][5 : 5 + len(shown[1])])
     assert shown[0].std() > 0.01

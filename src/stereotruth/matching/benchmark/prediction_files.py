@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...dataset.stereo_dataset import Pair
 from ...errors import InputError
+from ...products.names import plain_name
 from ...products.rasters import read_disparity
 
 RECORD = "predictions.json"
@@ -18,11 +19,22 @@ UNCERTAINTY = "uncertainty"  # folder in it
 
 
 def read_record(folder: str | Path) -> dict[str, Any]:
-    """The record of a folder of predictions. Raises InputError if there is none."""
+    """The record of a folder of predictions; the names of its pairs are plain names.
+
+    Raises InputError if there is none, or it is no record.
+    """
     file = Path(folder) / RECORD
     if not file.is_file():
         raise InputError("no predictions", file=file, remedy="run rule match")
-    return json.loads(file.read_text(encoding="utf-8"))
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        pairs = record["pairs"]
+        names = list(pairs.keys())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError("no record of predictions", file=file, remedy="run rule match") from None
+    for name in names:
+        plain_name(name, "the name of a pair,", file)
+    return record
 
 
 def read_prediction(folder: str | Path, pair: Pair) -> NDArray[np.float32]:

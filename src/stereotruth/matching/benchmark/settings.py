@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints
+from pydantic import AfterValidator, Field
 
 from ...dataset.stereo_dataset_settings import Settings as Dataset
-from ...settings import Number, Text, Unit, Whole, each_once, settings
+from ...settings import Number, Text, Unit, Whole, each_once, name_of, settings
 from ..kinds import KINDS
 from ..networks.training_settings import Training
 
-Name = Annotated[Text, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$")]
+Name = name_of("A-Za-z0-9_-")
 
 
 @settings(more=True)

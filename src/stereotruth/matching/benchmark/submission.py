@@ -18,12 +18,14 @@ from typing import Any
 
 from ...errors import InputError
 from ...products.files import whole_folder
+from ...products.names import plain_name
 from ...products.provenance import file_sha256
 from .prediction_files import UNCERTAINTY, read_record
 
 FILE = "submission.json"
 SUBMITTED = "submitted"  # of a record of predictions: the scores that its submission states
 TOLERANCE = 2e-6  # of figures that are rounded to 1e-6
+Figure = int | float | None
 KEPT = ("label", "dataset", "protocol", "identity", "machine", "device", "threads")
 
 
@@ -70,9 +72,16 @@ class Submission:
             return None
         try:
             packed = json.loads(file.read_text(encoding="utf-8"))
-            return cls(folder, packed["files"], packed["scores"])
-        except (ValueError, KeyError, TypeError):
+            names, scores = list(packed["files"].keys()), packed["scores"]
+            if wrong := [name for name, of in _figures(scores) if not isinstance(of, Figure)]:
+                raise TypeError(wrong)
+            protocol = scores["protocol"]["id"]
+        except (ValueError, KeyError, TypeError, AttributeError):
             raise InputError("no submission", file=file, remedy="take the file as it was") from None
+        for name in names:
+            plain_name(name, "the name of a result,", file)
+        plain_name(protocol, "the protocol's id", file)
+        return cls(folder, packed["files"], scores)
 
     def check(self, files: Iterable[Path]) -> None:
         """Raise InputError unless the files are as they were packed."""

@@ -14,51 +14,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from ...errors import InputError
 from ..kinds import NETWORKS
 from .image_scaling import SCALINGS
+from .keras_files import REMEDY, read_weights
 from .weights import SavedNetwork, save_weights
-
-Arrays = list[NDArray[np.float32]]
-
-
-def read_weights(path: str | Path) -> list[Arrays]:
-    """The weight arrays of each layer of the network that has any, in the file's order.
-
-    Raises InputError if h5py is missing or the file is none of Keras' weight files.
-    """
-    try:
-        import h5py
-    except ImportError as error:
-        raise InputError(
-            "h5py is needed to read Keras weights",
-            file=path,
-            remedy="pip install '.[networks]'",
-        ) from error
-    try:
-        with h5py.File(path) as file:
-            group = file.get("model_weights", file)
-            layers = [group[_text(name)] for name in group.attrs["layer_names"]]
-            return [
-                [np.asarray(layer[_text(name)]) for name in layer.attrs["weight_names"]]
-                for layer in layers
-                if len(layer.attrs["weight_names"])
-            ]
-    except (OSError, KeyError) as error:
-        raise InputError(
-            f"not a weight file of Keras ({error})", file=path, remedy="name an .h5 file"
-        ) from error
-
-
-def _text(name: Any) -> str:
-    return name.decode() if isinstance(name, bytes) else str(name)
 
 
 def _parts(network: nn.Module) -> Iterator[nn.Module]:
@@ -134,7 +99,9 @@ def read_keras(
     ``scaling``: None: that of US3D for three channels, else that of WHU-Stereo.
     Raises InputError as :func:`load_keras` does.
     """
-    first = read_weights(path)[0][0]
+    first = next((of[0] for of in read_weights(path)), None)
+    if first is None:
+        raise InputError("no weights", file=path, remedy=REMEDY)
     channels = first.shape[2] if first.ndim == 4 and first.shape[2] == 3 else 1
     scaling = scaling or ("us3d" if channels == 3 else "standardise")
     model = SavedNetwork(kind, disparity_range, channels, scaling)

@@ -20,6 +20,7 @@ from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
+from stereotruth.products.files import write_table
 from stereotruth.products.html_page import PAPER
 from stereotruth.products.html_tables import minus
 
@@ -256,3 +257,22 @@ def test_an_unreadable_file_is_named(tmp_path):
     (tmp_path / "test/left/KM_left_1.tiff").write_bytes(b"no image")
     with pytest.raises(InputError, match="KM_left_1"):
         audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_dataset_of_somebody_else_overwrites_nothing(tmp_path, absolute):
+    """Its manifest names a pair by a path to a file of the user."""
+    mine = tmp_path / "home/mine.npz"
+    mine.parent.mkdir()
+    mine.write_bytes(b"mine")
+    name = str(mine.with_suffix("")) if absolute else "../../home/mine"
+    add(tmp_path / "data", 1, make(3))
+    root = tmp_path / "data/test"
+    files = {kind: next((root / kind).iterdir()).relative_to(root) for kind in ("left", "right")}
+    row = {"tile": name, "city": "x", "split": "none", "disp": "", **files}
+    write_table(root / "manifest.csv", [row])
+    given = StereoDataset("mine", root, "stereotruth", (-64, 64))
+    with pytest.raises(InputError, match=r"manifest\.csv: line 2: tile"):
+        run.audit(given, tmp_path / "audit/x", LIMITS, work=tmp_path / "audit/.x.work")
+    assert mine.read_bytes() == b"mine"
+    assert not (tmp_path / "audit").exists()

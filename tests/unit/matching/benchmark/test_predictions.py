@@ -19,6 +19,7 @@ from stereotruth.matching.benchmark.prediction_files import (
     read_uncertainty,
 )
 from stereotruth.matching.benchmark.predictions import predict
+from stereotruth.products.files import write_table
 from stereotruth.products.rasters import read_disparity
 
 from ....synthetic.images import write
@@ -223,3 +224,27 @@ def test_a_folder_may_have_uncertainties(dataset):
     np.save("theirs/KM_2_uncertainty.npy", np.full((2, 2), 0.25))
     with pytest.raises(InputError, match=r"uncertainty of pair KM_2 is \(2, 2\)"):
         run(dataset, {"kind": "folder", "folder": "theirs"})
+
+
+def test_a_dataset_of_somebody_else_overwrites_nothing(dataset):
+    """Its manifest names a pair by a path to a file of the user."""
+    mine = Path("mine.tiff")
+    mine.write_bytes(b"mine")
+    root = dataset.root / "test"
+    row = {"tile": str(mine.absolute().with_suffix("")), "city": "x", "split": "test"}
+    files = {"left": "left/KM_left_1.tiff", "right": "right/KM_right_1.tiff", "disp": ""}
+    write_table(root / "manifest.csv", [row | files])
+    given = StereoDataset("toy", root, "stereotruth", (-8, 8))
+    with pytest.raises(InputError, match=r"manifest\.csv: line 2: tile"):
+        predict(given, None, "mine", METHOD, "out", work=".work")
+    assert mine.read_bytes() == b"mine" and not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"pairs": {"../../x": {}}}', '{"pairs": {"/home/u/x": {}}}', '{"pairs": []}', "[]", "{"],
+)
+def test_a_folder_of_predictions_of_somebody_else_names_no_other_place(tmp_path, text):
+    (tmp_path / "predictions.json").write_text(text)
+    with pytest.raises(InputError, match=r"predictions\.json: (the name of a pair|no record)"):
+        read_record(tmp_path)

@@ -86,3 +86,26 @@ def test_uncertainties_go_along_and_a_spoilt_submission_is_named(compared, tmp_p
         shutil.copyfile(file, match / "uncertainty" / file.name)
     pack(match, compared / "benchmark/half", tmp_path / "two")
     assert len(list((tmp_path / "two").glob("*_uncertainty.tif"))) == 6
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [("files", "../../x.tif"), ("files", "/home/u/x.tif"), ("protocol", "../x"), ("protocol", 7)],
+)
+def test_a_submission_names_no_other_place(compared, tmp_path, packed, place, value):
+    told = json.loads((packed / FILE).read_text())
+    if place == "files":
+        told["files"][value] = "0"
+    else:
+        told["scores"]["protocol"]["id"] = value
+    (packed / FILE).write_text(json.dumps(told))
+    with pytest.raises(InputError, match=r"submission\.json: the (name of a result|protocol)"):
+        scored(compared, tmp_path, packed)
+
+
+def test_a_submission_with_words_for_figures_is_refused(compared, tmp_path, packed):
+    told = json.loads((packed / FILE).read_text())
+    told["scores"]["cities"][0]["epe_px"] = "0.1"
+    (packed / FILE).write_text(json.dumps(told))
+    with pytest.raises(InputError, match=r"submission\.json: no submission"):
+        scored(compared, tmp_path, packed)

@@ -1,0 +1,258 @@
+"""Refinement among crowns: ever worse than its control points? See README.md beside this file.
+
+Scenes are drawn by seed, aligned by control points and refined, and what both make of exact places
+is compared. Rows are kept in the folder: a run that was stopped is carried on.
+
+python bench/refinement.py accuracy
+python bench/refinement.py any --scenes 60
+python bench/refinement.py any --scenes 60 --plant 0.15
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from label_tables import print_table
+from refinement_labels import asked_of_labels, label_figures, print_labels
+from wooded_scenes import HIGH, LOW, MIXED, Draw, LabelErrors, Scene
+
+from stereotruth.alignment.adjustment import epipolar_model, with_corrections
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.alignment.label_uncertainty import label_sigma
+from stereotruth.alignment.refine import refine
+from stereotruth.errors import InputError
+from stereotruth.products.files import replacing
+from stereotruth.products.provenance import source_digest
+
+SEEDS = {"accuracy": 2700, "any": 52700}  # of the first scene; nothing is tuned on them
+SIDE_PX = 1400
+DENSITIES = (0.25, 0.5, 1.0, 2.0, 4.0, 12.0)
+GCPS = (15, 15, 15, 4, 4, 0)
+WORSE_PX = 0.01
+Row = dict[str, Any]
+
+
+def accuracy_draws(count: int) -> Iterator[tuple[Draw, int]]:
+    """Wooded suburbs and parks in turn, each at 4 and at 1 points/m², with 15 control points."""
+    for number in range(count):
+        rng = np.random.default_rng([SEEDS["accuracy"], number])
+        draw = Draw(
+            SEEDS["accuracy"] + number,
+            zones=("suburb", "park")[number % 2],
+            ground_m2=float(rng.choice([60.0, 100.0, 170.0, 250.0])),
+            arrangement=str(rng.choice(["single", "rows", "forest"])),
+            brightness=float(rng.uniform(0.3, 0.9)),
+            ground_look=(float(rng.uniform(1.0, 1.8)), float(rng.uniform(0.3, 1.0))),
+            buildings=0.8,
+            relief_m=float(rng.uniform(6, 40)),
+            side_px=SIDE_PX,
+            **(LOW, HIGH, MIXED)[int(rng.integers(3))],
+        )
+        for density in (4.0, 1.0):
+            yield replace(draw, density=density), 15
+
+
+def any_draws(count: int) -> Iterator[tuple[Draw, int]]:
+    """Scenes of every density, crowns over 0 to 40 % of the ground, under every condition."""
+    for number in range(count):
+        rng = np.random.default_rng([SEEDS["any"], number])
+        crowns = float(rng.uniform(0, 0.4)) if rng.random() < 0.85 else 0.0
+        area = float(np.pi * (4.5**3 - 1.5**3) / 9.0)  # mean of a crown
+        yield (
+            Draw(
+                SEEDS["any"] + number,
+                zones=str(rng.choice(["suburb", "park", "town"])),
+                ground_m2=-area / float(np.log1p(-crowns)) if crowns > 0.01 else None,
+                arrangement=str(rng.choice(["single", "rows", "forest"])),
+                brightness=float(rng.uniform(0.3, 1.0)),
+                ground_look=(float(rng.uniform(0.9, 1.8)), float(rng.uniform(0.2, 1.0))),
+                density=float(rng.choice(DENSITIES)),
+                noise=bool(rng.random() < 0.3),
+                gain=bool(rng.random() < 0.3),
+                later=bool(rng.random() < 0.25),
+                bare=str(rng.choice(["", "", "", "left", "right"])),
+                vehicles=float(rng.choice([0.0, 5.0, 20.0])),
+                relief_m=float(np.exp(rng.uniform(np.log(5.0), np.log(220.0)))),
+                roofs=str(rng.choice(["mixed", "flat"])),
+                buildings=float(rng.uniform(0.4, 1.0)),
+                side_px=SIDE_PX,
+                **(LOW, HIGH, MIXED)[int(rng.integers(3))],
+            ),
+            GCPS[number % len(GCPS)],
+        )
+
+
+DRAWS = {"accuracy": accuracy_draws, "any": any_draws}
+
+
+def conditions(draw: Mapping[str, Any], gcps: int) -> str:
+    """What a scene has besides crowns, in words."""
+    found = [name for name in ("noise", "gain", "later") if draw[name]]
+    if draw["bare"]:
+        found.append(f"bare {draw['bare']}")
+    if draw["vehicles"]:
+        found.append(f"{draw['vehicles']:g} cars/ha")
+    if draw["roofs"] == "flat":
+        found.append("flat")
+    return ", ".join([draw["zones"], f"{draw['relief_m']:.0f} m", f"{gcps} GCPs", *found])
+
+
+def planted(alignment: Alignment, bias_px: float) -> Alignment:
+    """The alignment with a bias of every disparity: the right image's affine moves along rows."""
+    model = epipolar_model(alignment)
+    cols, rows = model.right_size
+    slopes = model.right_image.slopes(np.array([cols / 2]), np.array([rows / 2]))[0]
+    shift = np.linalg.solve(slopes, np.array([-bias_px, 0.0]))
+    parameters = np.zeros(12)
+    parameters[[8, 11]] = shift
+    return with_corrections(alignment, parameters)
+
+
+def doubts_of(alignment: Alignment, scene: Scene) -> list[str]:
+    """What the pipeline doubts about an alignment that was refined. Its doubts go in here."""
+    del scene
+    return list(alignment.warnings)
+
+
+def _of_errors(errors: LabelErrors, alignment: Alignment) -> dict[str, float]:
+    sigma = label_sigma(alignment, epipolar_model(alignment), *errors.at.T)[0]
+    size = np.abs(errors.disparity)
+    return {
+        "bias": errors.bias,
+        "mean_absolute": errors.mean_absolute,
+        "parallax_rms": errors.parallax_rms,
+        "sigma": float(np.mean(sigma)),
+        "within_1": float(np.mean(size < sigma)),
+        "within_2": float(np.mean(size < 2.0 * sigma)),
+    } | {f"mean_absolute_{name}": value for name, value in errors.by_surface().items()}
+
+
+def trial(draw: Draw, gcps: int, plant_px: float, with_labels: bool, folder: Path) -> Row:
+    """One scene: made, aligned, refined and compared with its truth."""
+    scene = Scene(draw, folder)
+    row: Row = {"draw": asdict(draw), "gcps": gcps, "crowns": scene.crown_share}
+    start = time.process_time()
+    alone = scene.align(gcps)
+    row["alone"] = _of_errors(scene.errors(alone), alone)
+    try:
+        refined, observations = refine(alone, *scene.images, scene.stores, provenance={})
+    except InputError as error:
+        return row | {"refused": str(error), "seconds": time.process_time() - start}
+    row["applied"] = bool(refined.refinement["applied"])
+    row["ties"] = 0 if observations is None else int(observations.used.sum())
+    row["refined"] = _of_errors(scene.errors(refined), refined)
+    row["doubts"] = doubts_of(refined, scene)
+    if plant_px:
+        off = planted(refined, plant_px)
+        row["planted"] = _of_errors(scene.errors(off), off)
+        row["planted_doubts"] = doubts_of(off, scene)
+    if with_labels:
+        row["labels"] = label_figures(scene, refined, folder)
+    return row | {"seconds": time.process_time() - start}
+
+
+def rows_of(options: argparse.Namespace) -> Iterator[Row]:
+    """All rows: those of an earlier run by the same code are read, the others made."""
+    code = source_digest("alignment.align", "alignment.refine")[:8]
+    if options.labels:
+        code = source_digest("alignment.refine", "disparity.project")[:8]
+    draws = list(DRAWS[options.what](options.scenes))
+    for number, (draw, gcps) in enumerate(draws):
+        name = f"{draw.key()}-{gcps}-{options.plant:g}-{code}.json"
+        file = options.folder / ("labels" if options.labels else "rows") / name
+        if not file.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            row = trial(draw, gcps, options.plant, options.labels, options.folder)
+            with replacing(file) as scratch:
+                scratch.write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
+        row = json.loads(file.read_text(encoding="utf-8"))
+        print(f"{number + 1} of {len(draws)}: {' '.join(cells(row))}", flush=True)
+        yield row
+
+
+COLUMNS = [
+    "crowns, %", "points/m²", "conditions", "control points alone: bias", "mean abs",
+    "refined: bias", "mean abs", "stated σ", "tie points", "doubts",
+]  # fmt: skip
+
+
+def cells(row: Row) -> list[str]:
+    """A row of the table."""
+    draw, alone = row["draw"], row["alone"]
+    first = [
+        f"{100 * row['crowns']:.0f}", f"{draw['density']:g}", conditions(draw, row["gcps"]),
+        f"{alone['bias']:+.3f}", f"{alone['mean_absolute']:.3f}",
+    ]  # fmt: skip
+    if "refused" in row:
+        return [*first, "refused", "–", "–", "–", row["refused"][:60]]
+    refined = row["refined"]
+    return [
+        *first, f"{refined['bias']:+.3f}", f"{refined['mean_absolute']:.3f}",
+        f"{refined['sigma']:.3f}", str(row["ties"]) + ("" if row["applied"] else " (not applied)"),
+        str(len(row["doubts"])),
+    ]  # fmt: skip
+
+
+def asked(what: str, rows: list[Row], plant_px: float) -> list[list[str]]:
+    """Measures: name, asked, reached."""
+    refined = [row for row in rows if "refined" in row]
+    size = np.array([row["refined"]["mean_absolute"] for row in refined])
+    found: list[list[str]] = []
+    if what == "accuracy" and refined:
+        found.append(["refined, mean abs px, mean of scenes", "≤ 0.03", f"{size.mean():.3f}"])
+        found.append(["the same, worst scene", "≤ 0.05", f"{size.max():.3f}"])
+    with_gcps = [row for row in refined if row["gcps"]]
+    worse = [
+        row for row in with_gcps
+        if row["refined"]["mean_absolute"] > row["alone"]["mean_absolute"] + WORSE_PX
+    ]  # fmt: skip
+    found.append([
+        f"refined worse than control points alone by more than {WORSE_PX:g} px", "0",
+        f"{len(worse)} of {len(with_gcps)}",
+    ])  # fmt: skip
+    none = [row["refined"]["mean_absolute"] for row in refined if not row["gcps"]]
+    if none:
+        found.append(["without control points, mean abs px, worst", "–", f"{max(none):.3f}"])
+    found.append(["refused", "–", f"{len(rows) - len(refined)} of {len(rows)}"])
+    for word, key, limit in (("none", "doubts", "≤ 1 %"), ("one", "planted_doubts", "≥ 95 %")):
+        of = [row for row in refined if key in row]
+        if of and (key == "doubts" or plant_px):
+            share = 100.0 * np.mean([len(row[key]) > 0 for row in of])
+            found.append([f"a doubt where a bias is planted in {word}", limit, f"{share:.0f} %"])
+    sigmas = [(row["refined"]["within_1"], row["refined"]["within_2"]) for row in refined]
+    if sigmas:
+        one, two = 100.0 * np.mean(sigmas, axis=0)
+        found.append(["places within 1 and 2 σ, %", "63–75, 92–97", f"{one:.0f}, {two:.0f}"])
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=list(DRAWS), help="suburbs and parks, or any scenes")
+    parser.add_argument("--scenes", type=int, default=10, help="how many are drawn")
+    parser.add_argument("--folder", type=Path, default=Path("results/refinement"))
+    parser.add_argument(
+        "--plant", type=float, default=0.0, metavar="PX", help="a bias of disparity besides"
+    )
+    parser.add_argument("--labels", action="store_true", help="also labels of the middle")
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.ERROR, format="%(message)s")
+    rows = list(rows_of(options))
+    print_table("Errors of alignments, px", COLUMNS, [cells(row) for row in rows])
+    measures = asked(options.what, rows, options.plant)
+    if options.labels:
+        print_labels(rows)
+        measures += asked_of_labels(rows)
+    print_table("Asked and reached", ["measure", "asked", "reached"], measures)
+
+
+if __name__ == "__main__":
+    main()

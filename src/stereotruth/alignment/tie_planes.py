@@ -1,0 +1,287 @@
+"""One surface alone: planes through the points of a window, and the pixels that show nothing else.
+
+A tie point compares the two images over a window on a plane. Anything that stands beside the plane
+moves between the images by its parallax, and a dark crown over a bright lawn outweighs all of the
+lawn's texture. So the plane is fitted robustly, and a pixel takes part only if no point off the
+plane lies within a guard distance of it, as either image sees that point.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+HALF = 10  # px: windows of 21 x 21
+SIDE = 2 * HALF + 1
+MIN_POINTS = 24  # of a window, on its plane
+MOST_POINTS = 240  # of a window, that a plane is fitted to
+SPREAD = 0.35  # of an even distribution's variance: less, and the points do not fix the plane
+OFF_SIGMAS = 4.0  # of the points about the plane: farther, and a point lies off it
+OFF_M = 0.1  # m, at least
+HOLE_SPACINGS = 2.0  # of the points: pixels farther from the plane's points may show anything
+ROUNDS = 5  # of each of the two robust fits of a plane
+NEAREST_M = 0.03  # m: points nearer to a plane do not count for more
+
+
+class Guard(NamedTuple):
+    """How far pixels stay from what stands off a plane: ``px`` plus ``spacings`` of the points.
+
+    The optics' blur and the interpolation reach that far, and so does what the points leave open.
+    ``common_px``: what matches behind such a guard have in common, rms over simulated scenes.
+    """
+
+    px: float
+    spacings: float
+    common_px: float
+
+
+GUARDS = (Guard(2.5, 1.0, 0.005), Guard(1.8, 0.75, 0.012), Guard(1.2, 0.5, 0.05))
+
+
+class SitePoints(NamedTuple):
+    """The points of a site, sorted by the pixel of the left image in which they lie.
+
+    ``col``, ``row`` px [n] from the upper-left pixel of the site's wide box, ``height`` m [n];
+    ``firm`` bool[n]: no vegetation or water by its class, and the only return of its pulse;
+    ``first`` int[rows * cols + 1]: index of the first point of each pixel; ``shape`` of the box;
+    ``parallax`` [2] px/m: by how much a point is displaced in the right image against the plane
+    per metre that it lies above the plane, in px of the left image.
+    """
+
+    col: Floats
+    row: Floats
+    height: Floats
+    firm: Bools
+    first: Integers
+    shape: tuple[int, int]
+    parallax: Floats
+
+    @classmethod
+    def sorted(
+        cls,
+        col: Floats,
+        row: Floats,
+        height: Floats,
+        firm: Bools,
+        shape: tuple[int, int],
+        parallax: Floats,
+    ) -> SitePoints:
+        """Points outside the box are left out of it."""
+        rows, cols = shape
+        inside = (col > -0.5) & (col < cols - 0.5) & (row > -0.5) & (row < rows - 0.5)
+        col, row, height, firm = (values[inside] for values in (col, row, height, firm))
+        pixel = np.rint(row).astype(np.int64) * cols + np.rint(col).astype(np.int64)
+        order = np.lexsort((height, pixel))  # whatever the order of files
+        first = np.zeros(rows * cols + 1, np.int64)
+        np.cumsum(np.bincount(pixel, minlength=rows * cols), out=first[1:])
+        return cls(col[order], row[order], height[order], firm[order], first, shape, parallax)
+
+    def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
+        """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
+        planes, share = np.empty((len(centres), 4)), np.empty(len(centres))
+        _fit_planes(self, centres, planes, share)
+        return planes, share
+
+    def clear_pixels(self, centre: Integers, plane: Floats, guard: Guard) -> Bools:
+        """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
+        clear = np.empty((SIDE, SIDE), bool)
+        heights = float(self.height.min()), float(self.height.max())
+        _clear_pixels(self, heights, guard, centre, plane, clear)
+        return clear
+
+
+@inner
+def _solve_plane(u: Floats, v: Floats, h: Floats, weight: Floats, plane: Floats) -> bool:
+    """Fill ``plane`` [3] (level at (0, 0), slopes) by weighted least squares; False if that fails.
+
+    ``u``, ``v`` in [-1, 1] over the window.
+    """
+    s, su, sv, suu, suv, svv, sh, suh, svh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(h.size):
+        w = weight[k]
+        s += w
+        su += w * u[k]
+        sv += w * v[k]
+        suu += w * u[k] * u[k]
+        suv += w * u[k] * v[k]
+        svv += w * v[k] * v[k]
+        sh += w * h[k]
+        suh += w * u[k] * h[k]
+        svh += w * v[k] * h[k]
+    if not s > 0.0:
+        return False
+    mu, mv, mh = su / s, sv / s, sh / s
+    cuu, cuv, cvv = suu / s - mu * mu, suv / s - mu * mv, svv / s - mv * mv
+    cuh, cvh = suh / s - mu * mh, svh / s - mv * mh
+    even = 1.0 / 3.0  # variance of an even distribution over [-1, 1]
+    det = cuu * cvv - cuv * cuv
+    if not (cuu > SPREAD * even and cvv > SPREAD * even and det > (SPREAD * even) ** 2):
+        return False
+    plane[1] = (cvv * cuh - cuv * cvh) / det
+    plane[2] = (cuu * cvh - cuv * cuh) / det
+    plane[0] = mh - plane[1] * mu - plane[2] * mv
+    return True
+
+
+@inner
+def _robust_plane(u: Floats, v: Floats, h: Floats, plane: Floats) -> float:
+    """Fill ``plane`` by what most points lie on; their robust standard deviation m, or NaN.
+
+    First the sum of the distances is made least, which a third of the points cannot mislead, then
+    Tukey's biweight leaves out what lies off the plane.
+    """
+    weight = np.ones(h.size)
+    distance = np.empty(h.size)
+    if not _solve_plane(u, v, h, weight, plane):
+        return np.nan
+    sigma = np.nan
+    for step in range(2 * ROUNDS):
+        for k in range(h.size):
+            distance[k] = abs(h[k] - plane[0] - plane[1] * u[k] - plane[2] * v[k])
+        if step >= ROUNDS:
+            sigma = max(1.4826 * np.median(distance), 0.01)
+        for k in range(h.size):
+            if step < ROUNDS:
+                weight[k] = 1.0 / max(distance[k], NEAREST_M)
+            else:
+                t = distance[k] / (4.685 * sigma)
+                weight[k] = (1.0 - t * t) ** 2 if t < 1.0 else 0.0
+        if not _solve_plane(u, v, h, weight, plane):
+            return np.nan
+    return sigma
+
+
+@kernel
+def _fit_planes(points: SitePoints, centres: Integers, planes: Floats, share: Floats) -> None:
+    """Robust planes through the points of windows around ``centres`` int[k, 2] (col, row) px.
+
+    Fills ``planes`` [k, 4]: height at the centre (m), slopes along columns and rows (m/px), robust
+    standard deviation of the points (m), NaN where none is determined; ``share`` [k]: of all points
+    of the window, those on the plane.
+    """
+    first, cols = points.first, points.shape[1]
+    for c in range(len(centres)):
+        planes[c] = np.nan
+        share[c] = 0.0
+        i, j = centres[c]
+        total = 0
+        for y in range(j - HALF, j + HALF + 1):
+            total += first[y * cols + i + HALF + 1] - first[y * cols + i - HALF]
+        every = max(1, total // MOST_POINTS)
+        size = total // every + 1
+        u, v, h = np.empty(size), np.empty(size), np.empty(size)
+        n, seen = 0, 0
+        for y in range(j - HALF, j + HALF + 1):
+            for k in range(first[y * cols + i - HALF], first[y * cols + i + HALF + 1]):
+                seen += 1
+                if seen % every == 0 and points.firm[k]:
+                    u[n], v[n] = (points.col[k] - i) / HALF, (points.row[k] - j) / HALF
+                    h[n] = points.height[k]
+                    n += 1
+        if n < MIN_POINTS:
+            continue
+        plane = np.empty(3)
+        middle = h[0]
+        sigma = _robust_plane(u[:n], v[:n], h[:n] - middle, plane)
+        if np.isnan(sigma):
+            continue
+        limit = max(OFF_SIGMAS * sigma, OFF_M)
+        on = 0
+        for k in range(n):
+            on += abs(h[k] - middle - plane[0] - plane[1] * u[k] - plane[2] * v[k]) <= limit
+        if on < MIN_POINTS:
+            continue
+        planes[c, 0] = plane[0] + middle
+        planes[c, 1], planes[c, 2] = plane[1] / HALF, plane[2] / HALF
+        planes[c, 3] = sigma
+        share[c] = on * every / total
+
+
+@inner
+def _mark(marked: Bools, x: float, y: float) -> None:
+    """Mark the pixel of a position, if there is one."""
+    i, j = int(np.rint(x)), int(np.rint(y))
+    if i >= 0 and j >= 0 and i < marked.shape[1] and j < marked.shape[0]:
+        marked[j, i] = True
+
+
+@inner
+def _near(marked: Bools, j: int, i: int, radius: float) -> bool:
+    """Whether a marked pixel lies within ``radius`` px of one."""
+    reach = int(radius)
+    for y in range(max(j - reach, 0), min(j + reach + 1, marked.shape[0])):
+        for x in range(max(i - reach, 0), min(i + reach + 1, marked.shape[1])):
+            if marked[y, x] and (y - j) ** 2 + (x - i) ** 2 <= radius * radius:
+                return True
+    return False
+
+
+@inner
+def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float:
+    """Height m of a point above a plane."""
+    col, row = points.col[k] - centre[0], points.row[k] - centre[1]
+    return points.height[k] - plane[0] - plane[1] * col - plane[2] * row
+
+
+@kernel
+def _clear_pixels(
+    points: SitePoints,
+    heights: tuple[float, float],
+    guard: Guard,
+    centre: Integers,
+    plane: Floats,
+    clear: Bools,
+) -> None:
+    """Fill ``clear`` [SIDE, SIDE]: the pixels of a window that show its plane and nothing else.
+
+    A point off the plane, by height or because it is not firm, is seen at its own pixel in the left
+    image, and in the right image displaced by its parallax; both places, what lies between them and
+    a guard around all are not clear. Neither is a pixel without points of the plane nearby.
+    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights`` of the lowest and the
+    highest point, m; ``guard``: one of GUARDS.
+    """
+    first, (rows, cols) = points.first, points.shape
+    parallax = points.parallax
+    limit = max(OFF_SIGMAS * plane[3], OFF_M)
+    on = 0
+    for y in range(centre[1] - HALF, centre[1] + HALF + 1):
+        for k in range(first[y * cols + centre[0] - HALF], first[y * cols + centre[0] + HALF + 1]):
+            on += points.firm[k] and abs(_above(points, plane, centre, k)) <= limit
+    spacing = SIDE / np.sqrt(max(on, 1))
+    away, hole = guard.px + guard.spacings * spacing, HOLE_SPACINGS * spacing + 1.0
+    margin = int(max(away, hole)) + 1
+    wide = SIDE + 2 * margin
+    off, held = np.zeros((wide, wide), np.bool_), np.zeros((wide, wide), np.bool_)
+    middle = HALF + margin
+    length = np.hypot(parallax[0], parallax[1])
+    # Points of other pixels are displaced into the window if they are high enough.
+    most = max(abs(heights[0] - plane[0]), abs(heights[1] - plane[0])) + np.hypot(
+        plane[1] * cols, plane[2] * rows
+    )
+    reach = middle + int(most * length) + 1
+    for y in range(max(centre[1] - reach, 0), min(centre[1] + reach + 1, rows)):
+        start = first[y * cols + max(centre[0] - reach, 0)]
+        for k in range(start, first[y * cols + min(centre[0] + reach + 1, cols)]):
+            above = _above(points, plane, centre, k)
+            x = points.col[k] - centre[0] + middle
+            v = points.row[k] - centre[1] + middle
+            if points.firm[k] and abs(above) <= limit:
+                _mark(held, x, v)
+                continue
+            steps = int(abs(above) * length / 1.5) + 1
+            for s in range(steps + 1):
+                t = above * s / steps
+                _mark(off, x + t * parallax[0], v + t * parallax[1])
+    for j in range(SIDE):
+        for i in range(SIDE):
+            near_off = _near(off, j + margin, i + margin, away)
+            clear[j, i] = not near_off and _near(held, j + margin, i + margin, hole)
