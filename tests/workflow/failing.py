@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import re
 import shutil
@@ -68,12 +69,12 @@ class Failures:
         found = re.findall(r"^(\w+)\s+\d+$", tables[-1], flags=re.MULTILINE)
         return {*found} - {"total", *NO_RULES} if len(tables) > 1 else set()
 
-    def prepare(self) -> None:
-        """Make all, and find out which rules an edit reaches."""
+    def prepare(self, edits: Sequence[str] = EDITS) -> None:
+        """Make all, and find out which rules edits reach."""
         status, rules = self.run()
         assert status == 0, self.said()[-4000:]
         self.rules = sorted(rules)
-        for edit in EDITS:
+        for edit in edits:
             file = self.folder / (edit if edit != "seed" else "my.yaml")
             before, seed = file.read_bytes(), self.seed
             self.edit(edit)
@@ -93,6 +94,8 @@ class Failures:
             file.write_text(f"{file.read_text().partition('#')[0]}# {self.version}\n")
         else:
             file.write_text(f"{self.version}\n")
+        then = time.time() + self.rng.uniform(-1e6, 1e6)  # as by clocks that are off
+        os.utime(file, (then, then))
 
     def damage(self) -> str:
         """Damage or delete a product or a record; returns which."""
@@ -120,7 +123,7 @@ class Failures:
             return ""
         if self.rng.random() < 0.2:
             return self.damage()
-        edit = self.rng.choice([e for e in EDITS if rule in self.reached[e]] or EDITS)
+        edit = self.rng.choice([e for e in EDITS if rule in self.reached.get(e, ())] or EDITS)
         self.edit(edit)
         return edit
 

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from ..synthetic.hollow_workflow import make_hollow
 from ..synthetic.project import Project
+from .failing import Failures
 from .killing import family, kill, start
 
 ARGUMENTS = ("tiles/Tiny", "--configfile", "tiny.yaml")
@@ -51,10 +53,24 @@ def writes(pid: int, file: Path) -> bool:
         return False
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+
+
+@linux
 def test_a_job_that_is_killed_after_an_edit_is_due_with_all_that_follows(made, tmp_path):
     other = made.copy(tmp_path / "other")
     raise_heights(other)
     kill_job(other, "logs/refine/Tiny/Tiny-1.log")
     assert not (other.folder / "results/refine/Tiny/Tiny-1/alignment.json").exists()
     assert set(other.plan(*ARGUMENTS)) == FOLLOWS
+
+
+@linux
+@pytest.mark.parametrize("rounds", [10, pytest.param(60, marks=pytest.mark.slow)])
+def test_failures_of_jobs_of_any_rule_leave_nothing_stale(tmp_path, rounds):
+    """Without the numerics, edits and damage before, between and after; see failing.py."""
+    failures = Failures(make_hollow(tmp_path / "project"), seed=rounds)
+    failures.prepare(edits=())
+    found = list(failures.rounds(rounds))
+    assert len(found) == rounds
+    assert [one for one in found if one["wrong"]] == []
