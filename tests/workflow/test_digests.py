@@ -148,4 +148,4 @@ def test_every_script_counts_by_its_content(name):
     rule = WITH_SCRIPT[name]
     assert f'script=content_of("../scripts/{rule.script}.py"),' in rule.directives["params"]
     profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())
-    assert profile["rerun-triggers"] == ["mtime", "params", "input", "software-env"]
+    assert profile["rerun-triggers"] == ["params", "software-env"]
