@@ -46,7 +46,7 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
         "share_of_pixels": {"labelled": 0.829, "no_points": 0.171},
         "disparity_px": {"min": -5.5, "max": 33.3},
         "disparity_rounding": {"largest_px": 0.0005},
-        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}},
+        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}, "doubts": {}},
     }
     said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
     found = cards({"A-1": SCENE})
