@@ -87,3 +87,10 @@ def test_density_is_that_of_the_scenes():
     dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
     assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
     assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"
+
+
+def test_a_doubt_stands_with_the_gates():
+    quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
+    (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "quality gates")
+    assert gates.bad
+    assert "images and labels disagree in A-1" in gates.note
