@@ -356,6 +356,13 @@ def _variances(
     return out
 
 
+def _around(corner: Steps, chosen: Bools, vertices: int) -> Bools:
+    """Which vertices the ``chosen`` triangles have."""
+    out = np.zeros(vertices, np.bool_)
+    out[corner[chosen].reshape(-1)] = True
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class GroundSurface:
     """The surface of a window's points, and where it steps.
@@ -365,7 +372,8 @@ class GroundSurface:
     ``bulge`` [m] (lattice steps) times the sum of the products of two barycentric coordinates, the
     form of a quadratic function between its values at the vertices; ``steps`` [k, 3] that may hold
     any surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
-    nobody knows which surfaces they hold, the others lie between two known ones.
+    nobody knows which surfaces they hold, the others lie between two known ones. ``uneven`` [n]:
+    which of the first vertices, those of points, share a triangle with one of a step.
     """
 
     vertices: Vertices
@@ -375,6 +383,7 @@ class GroundSurface:
     steps: Steps
     span: Ints
     rough: int
+    uneven: Bools
 
 
 def ground_surface(
@@ -409,6 +418,7 @@ def ground_surface(
     seen = np.ones(len(corner), np.bool_)
     if view is not None:
         seen = view.touching(vertices, corner)
+    uneven = _around(corner, _around(corner, ~smooth, x.size)[corner].any(axis=1), x.size)
     cut, pieces = cut_at_outlines(
         x, y, h, corner, radius, smooth, seen, plane, scale.distance, scale.smooth, step, *floors
     )
@@ -423,6 +433,7 @@ def ground_surface(
         np.concatenate([whole, strips]),
         np.concatenate([span, np.rint(pieces.heights).astype(np.int64)]),
         len(whole),
+        uneven,
     )
 
 
