@@ -45,9 +45,10 @@ class SureLabels:
         return values
 
 
-def tile_labels(
-    store: zarr.Group, flags: Mapping[int, str], limit: float
-) -> dict[str, zarr.Array | SureLabels]:
+Labels = zarr.Array | SureLabels
+
+
+def tile_labels(store: zarr.Group, flags: Mapping[int, str], limit: float) -> dict[str, Labels]:
     """``disparity`` and ``status`` of a store as its tiles have them; ``flags``: names of its
     status values."""
     crown = next((value for value, name in flags.items() if name == CROWN), None)
