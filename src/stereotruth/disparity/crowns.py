@@ -28,7 +28,7 @@ from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
 from .local_projection import LocalProjection
 from .point_triangles import triangulate
-from .smooth_triangles import STEP_PX, GroundSurface, Scale
+from .smooth_triangles import ROUGH_REACH, STEP_PX, GroundSurface, Scale
 from .status import WATER_CLASS
 from .surface_between import (
     STEP_IN_LEFT,
@@ -50,11 +50,11 @@ Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
 # A point went through the surface if points higher than it by PASSED_PX (disparity) lie in all
-# directions around it, no farther than PASSED_REACH mean distances of points, and are no fewer than
+# directions around it, no farther than ROUGH_REACH mean distances of points, and are no fewer than
 # the others there: a gap between crowns keeps its ground.
 PASSED_PX = 1.0
-PASSED_REACH = 2.2
 SECTORS = 12
+_ROOT_3 = np.sqrt(3.0)
 WIDEST_GAP = 4  # empty sectors in a row, which leave no half of the directions without a point
 STEEP_PX = 6.0  # a triangle that rises by more is the side of something
 # A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: an outline that
@@ -96,10 +96,13 @@ def _by_bucket(x: Ints, y: Ints, side: int, cols: int, rows: int) -> tuple[Steps
 
 
 @inner
-def _sector(dx: float, dy: float) -> int:
-    """One of SECTORS directions."""
-    turn = np.arctan2(dy, dx) / (2.0 * np.pi)
-    return min(int((turn - np.floor(turn)) * SECTORS), SECTORS - 1)
+def _sector(dx: int, dy: int) -> int:
+    """One of SECTORS directions of 30 degrees, counter-clockwise from east."""
+    across, along = float(abs(dx)), float(abs(dy))
+    part = 0 if along * _ROOT_3 < across else 1 if along < across * _ROOT_3 else 2
+    if dy >= 0:
+        return part if dx > 0 else 5 - part
+    return 6 + part if dx < 0 else 11 - part
 
 
 @kernel
@@ -122,8 +125,8 @@ def _passed(
             for a in range(max(i - 1, 0), min(i + 2, cols)):
                 for m in range(start[b * cols + a], start[b * cols + a + 1]):
                     v = members[m]
-                    dx, dy = float(x[v] - x[k]), float(y[v] - y[k])
-                    if v == k or dx * dx + dy * dy > radius * radius:
+                    dx, dy = x[v] - x[k], y[v] - y[k]
+                    if v == k or float(dx * dx + dy * dy) > radius * radius:
                         continue
                     if h[v] - h[k] > step:
                         higher += 1
@@ -233,7 +236,7 @@ class RoughSurface:
         """Of the points around the steps of a surface; ``px_per_m``: disparity of a m of height."""
         step = px_per_m * LATTICE_M
         points = _taken(surface.vertices, np.flatnonzero(surface.uneven))
-        radius = PASSED_REACH * scale.distance
+        radius = ROUGH_REACH * scale.distance
         side = int(np.ceil(radius))
         cols, rows = (int(v.max(initial=0)) // side + 1 for v in (points.x, points.y))
         buckets = _by_bucket(points.x, points.y, side, cols, rows)
@@ -335,8 +338,7 @@ def _hidden_in_right(
     out = np.zeros(row.size, np.bool_)
     if row.size == 0:
         return out
-    more = np.concatenate([smooth.corner, corner + np.int32(smooth.xy.shape[1])])
-    places = Places(np.concatenate([smooth.xy, xy], axis=1), more, smooth.first)
     order, where = by_right_column(row, col, disparity[row, col], smooth.first)
-    out[order] = places.hidden(where) | steps_in_right(surface, local, _known(surface), where)
+    hidden = smooth.hidden(where) | steps_in_right(surface, local, _known(surface), where)
+    out[order] = hidden | Places(xy, corner, smooth.first).hidden(where)
     return out
