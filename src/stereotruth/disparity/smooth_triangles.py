@@ -73,8 +73,8 @@ class Scale:
     (noise), the neighbours of these (support), the triangles that share a vertex with them
     (planes), and again (gradients): six steps of two radii. Where it is cut follows from the points
     up to REACH around it and the planes there (two radii more). Which points are of a rough surface
-    follows from six steps, and its labels from ``rough_halo`` around. Which vertices there are follows
-    from the squares around (:mod:`.even_squares`).
+    follows from six steps, and its labels from ``rough_halo`` around. Which vertices there are
+    follows from the squares around (:mod:`.even_squares`).
     """
 
     distance: float
