@@ -136,7 +136,7 @@ def export_city(
     step = cell_step(size, stride)
     sources, chosen, phases, outcomes, scans = [], [], {}, {}, {}
     for item in scenes:
-        source = open_stores(SceneFiles(*item))
+        source = open_stores(SceneFiles(*item), settings.max_uncertainty_px)
         cells = scan_scene(source, step, workers)
         windows, phase, outcome = choose_windows(
             cells, size, stride, settings.min_labelled, settings.right_offset
@@ -155,6 +155,7 @@ def export_city(
         "right_offset": settings.right_offset,
         "disparity_dtype": disparity_dtype,
         "nodata": nodata,
+        "max_uncertainty_px": settings.max_uncertainty_px,
         "split_counts": {"train": training, "val": validation, "test": testing},
         "seed": settings.seed,
         "quality": asdict(settings.quality),
