@@ -99,8 +99,7 @@ def test_points_that_went_through_are_left_out_but_not_the_ground_of_a_gap() -> 
         return np.where(gap | (rng.random(x.size) < 0.25), 0.0, top)
 
     surface = surface_of(height)
-    scale = Scale.of(1.0, CELL_M)
-    tops = RoughSurface.of(surface, scale, 1.0).vertices
+    tops = RoughSurface.of(surface, Scale.of(1.0, CELL_M), 1.0).vertices
     x, y = (q / 3000 * CELL_M for q in (tops.lon_q, tops.lat_q))
     low = tops.h_q * LATTICE_M < 4.0
     far = np.hypot(x - 25.0, y - 25.0)
