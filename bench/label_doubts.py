@@ -2,7 +2,8 @@
 
 Each scene is aligned, rectified and labelled once. Its matches are held against the exact disparity
 at the key points (what SIFT itself is off), and against the labels, with and without a bias along
-the rows. Scenes are drawn anew from the cells of each by bootstrap. See README.md beside this file.
+the rows. Scenes are drawn anew from the cells of each by bootstrap, which adds its scatter to that
+of the scene: what is named where nothing is planted is no less than in scenes. See README.md.
 """
 
 from __future__ import annotations

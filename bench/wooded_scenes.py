@@ -20,7 +20,9 @@ from synthetic_pairs import VIEWS, Change, gain, noise, sun_an_hour_later
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import open_stores
 from stereotruth.matching.image_faults import as_images
 from stereotruth.products.files import whole_folder
 from stereotruth.products.ungeoreferenced import open_raster
@@ -170,7 +172,7 @@ class Scene:
         """Point stores of the draw's density."""
         looks = "noise", "gain", "later", "brightness", "ground_look"
         made = self.folder / "lidar" / self.draw.key(*looks)
-        if not made.is_dir():
+        if not _readable(made):
             with whole_folder(made) as scratch:
                 for file in lidar_files(self.city, self.spec):
                     simulate_lidar_tile(
@@ -223,6 +225,16 @@ class Scene:
     def errors(self, alignment: Alignment) -> LabelErrors:
         """What an alignment makes of exact places of this scene."""
         return label_errors(alignment, self.city, self.spec)
+
+
+def _readable(folder: Path) -> bool:
+    """Whether a folder has point stores, in the format of this version."""
+    stores = list(folder.glob("*.points"))
+    try:
+        open_stores(stores)
+    except InputError:
+        return False
+    return bool(stores)
 
 
 def _spread(at: Floats, count: int) -> list[int]:

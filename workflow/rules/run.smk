@@ -85,10 +85,12 @@ def say(text):
 
 
 onsuccess:
+    keep_states()
     tidy_copies()
     say(made())
 
 
 onerror:
+    keep_states()
     list_pages()
     say(complaints(log))

@@ -77,7 +77,7 @@ def _refuse_empty(
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
             "project.fill: surface, the default, labels pixels between them"
         )
-    doubts = "; ".join(
+    told = "; ".join(
         f"the alignment of scene {source.scene} is in doubt: {doubt}"
         for source in sources
         for doubt in source.doubts
@@ -86,11 +86,11 @@ def _refuse_empty(
         f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
         f"or LiDAR that covers the overlap of the two images{sparse}"
     )
-    if doubts:
-        doubts = f". Labels are missing where LiDAR and images disagree: {doubts}"
+    if told:
+        told = f". Labels are missing where LiDAR and images disagree: {told}"
         remedy = f"first what the alignment's doubts say; else {remedy}"
     raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){doubts}",
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
         remedy=remedy,
     )
 
@@ -136,7 +136,7 @@ def export_city(
     step = cell_step(size, stride)
     sources, chosen, phases, outcomes, scans = [], [], {}, {}, {}
     for item in scenes:
-        source = open_stores(SceneFiles(*item))
+        source = open_stores(SceneFiles(*item), settings.max_uncertainty_px)
         cells = scan_scene(source, step, workers)
         windows, phase, outcome = choose_windows(
             cells, size, stride, settings.min_labelled, settings.right_offset
@@ -155,6 +155,7 @@ def export_city(
         "right_offset": settings.right_offset,
         "disparity_dtype": disparity_dtype,
         "nodata": nodata,
+        "max_uncertainty_px": settings.max_uncertainty_px,
         "split_counts": {"train": training, "val": validation, "test": testing},
         "seed": settings.seed,
         "quality": asdict(settings.quality),

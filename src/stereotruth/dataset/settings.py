@@ -36,6 +36,11 @@ class Tiles:
     nodata: Annotated[Number, Unit("px")] = -999
     """value of unlabelled pixels in the disparity files"""
 
+    max_uncertainty_px: Annotated[Number, Field(ge=0), Unit("px")] = 0.5
+    """of the labels of rough surfaces (`labelled_crown`, 12), those with a greater `uncertainty`
+    are in the disparity store alone: in the tiles they have no disparity and the status
+    `too_uncertain` (13). 0: none of them is in the tiles. All other labels are"""
+
 
 @settings
 class Dataset:

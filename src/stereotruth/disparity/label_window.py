@@ -5,7 +5,8 @@ centre shows and what hides it in either view (:mod:`.surface_between`); a pixel
 the surface that its centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured,
 others are between points (``fill``). Then (``both``): do the images agree with what the LiDAR has
 there, and is it no water (:class:`.image_agreement.Agreement`)? The images may tell the surface of
-pixels that stay open (:mod:`.open_pixels`).
+pixels that stay open (:mod:`.open_pixels`). Of rough surfaces the rest is labelled as far as both
+cameras must see it (:mod:`.crowns`).
 
 With ``correlation`` (the paper's filter, :func:`.paper_correlation.correlate`) and ``none`` a pixel
 has the status of that of its points that got furthest: does it lie in both frames; is it on the
@@ -23,9 +24,10 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from .crowns import Crowns, crowns
 from .ground_in_view import GroundInView
 from .image_agreement import Agreement, apart_from_steps, warp_to_left
-from .image_patches import Patch, read_patch
+from .image_patches import USABLE, Patch, read_patch
 from .local_projection import LocalProjection
 from .open_pixels import surfaces_by_images
 from .paper_correlation import correlate
@@ -43,6 +45,7 @@ from .surface_between import (
     Between,
     between_labels,
     surface_between,
+    usable_at,
 )
 from .vertices import VertexBuilder, Vertices
 
@@ -138,8 +141,60 @@ def _on_surface(
         agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
     if settings.asks_images:
         labels, pixels = _by_images(scene, between, labels, pixels, status, left, right, wide)
+    if settings.fills:
+        found = crowns(surface, between, local, first, scene.scale, px_per_m)
+        if settings.edge_margin_px > 0.0:
+            found = replace(found, shown=found.shown & ~edge)
+        labels, pixels, agreement = _with_crowns(
+            scene, found, labels, pixels, agreement, status, left, right, wide
+        )
     layers = _layers(scene, pixels, labels, agreement, status, wide)
     return layers, _counts(points, pixels, status, settings.margin)
+
+
+def _with_crowns(
+    scene: SceneInputs,
+    found: Crowns,
+    labels: Labels,
+    pixels: Pixels,
+    agreement: Floats,
+    status: NDArray[np.uint8],
+    left: Patch,
+    right: Patch,
+    wide: Window,
+) -> tuple[Labels, Pixels, Floats]:
+    """Labels, pixels and correlation with those of rough surfaces; sets these in ``status``.
+
+    Labels of other statuses stay as they are: crowns are held against the images by themselves.
+    """
+    row, col = np.nonzero(found.shown & (status == Status.EDGE_IN_PIXEL))
+    x = col + wide[1].start
+    match = np.floor(x - found.disparity[row, col]).astype(np.int64)
+    both = usable_at(left, row + wide[0].start, x) & usable_at(right, row + wide[0].start, match)
+    at = row[both == USABLE], col[both == USABLE]
+    new = np.zeros(status.shape, np.bool_)
+    new[at] = True
+    merged = Labels(
+        np.where(new, found.disparity, labels.disparity),
+        np.where(new, found.slope, labels.slope),
+        np.where(new, found.variance, labels.variance),
+    )
+    if scene.settings.method == "both" and at[0].size:
+        held = _agreement(scene, merged, left, right, wide)
+        agreement = np.where(new, held.correlation, agreement)
+        changed = new & held.outvoted()
+        status[changed] = Status.CHANGED
+        new &= ~changed
+    status[new] = Status.LABELLED_CROWN
+    return (
+        merged,
+        replace(
+            pixels,
+            highest=np.where(new, found.height, pixels.highest),
+            surface_class=np.where(new, found.surface_class, pixels.surface_class),
+        ),
+        agreement,
+    )
 
 
 def _by_images(
@@ -295,14 +350,7 @@ def _test_agreement(
     wide: Window,
 ) -> Floats:
     """Correlation of the images over each pixel's surface; sets what has changed in status."""
-    settings = scene.settings
-    warped = warp_to_left(right, *wide, labels.disparity)
-    top, side = wide[0].start - left.row, wide[1].start - left.col
-    shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
-    surface = labels.disparity, labels.slope
-    clear = apart_from_steps(labels.disparity)
-    found = surface_correlation(shown, warped, *surface, settings.window, clear)
-    agreement = Agreement(found, *surface, settings.correlation_threshold, scene.scale.trust)
+    agreement = _agreement(scene, labels, left, right, wide)
     changed = agreement.outvoted()
     rim = agreement.beside(changed)
     if scene.scale.points_per_px < DENSE:
@@ -311,7 +359,21 @@ def _test_agreement(
     changed |= is_labelled(status) & rim
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
-    return found
+    return agreement.correlation
+
+
+def _agreement(
+    scene: SceneInputs, labels: Labels, left: Patch, right: Patch, wide: Window
+) -> Agreement:
+    """Of the images, by the labels of a window."""
+    settings, (rows, cols) = scene.settings, labels.disparity.shape
+    warped = warp_to_left(right, *wide, labels.disparity)
+    top, side = wide[0].start - left.row, wide[1].start - left.col
+    shown = left.pixels[top : top + rows, side : side + cols]
+    surface = labels.disparity, labels.slope
+    clear = apart_from_steps(labels.disparity)
+    found = surface_correlation(shown, warped, *surface, settings.window, clear)
+    return Agreement(found, *surface, settings.correlation_threshold, scene.scale.trust)
 
 
 def _layers(

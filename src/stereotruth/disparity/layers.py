@@ -31,16 +31,23 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "both": f"correlation coefficient of {view} and warped {other} image over the pixels of "
         f"the same surface in {settings.window} x {settings.window} px",
     }
-    between, lonely = {}, {}
+    between, lonely, rough = {}, {}, {}
     if settings.fills:
         between = {
             "between": "where the status is labelled_between, or a point is less sure than those "
             "around it: linear in the triangle of points that the pixel's centre sees; where it is "
-            "labelled_by_images: on the plane of the label that both images tell"
+            "labelled_by_images: on the plane of the label that both images tell; where it is "
+            "labelled_crown: linear in the triangle of the tops of a rough surface"
         }
         lonely = {
+            "labelled_crown": "a rough surface that both views must show; its uncertainty follows "
+            "from the roughness of its points",
             "edge_in_pixel": "no smooth triangle of points, or a step between points may be "
             "nearer to one of the cameras",
+        }
+        rough = {
+            "labelled_crown": "v / n + p is what the roughness of the tops of the surface leaves "
+            "between them"
         }
     hidden = {}
     if masked:
@@ -120,7 +127,8 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
                 "variance of the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey)"
                 " errors of a ground point's disparity and place by the alignment, whose "
                 "covariance is that of alignment.json",
-            },
+            }
+            | rough,
         ),
         "surface_class": Layer(
             "uint8",

@@ -51,8 +51,11 @@ class Representative:
     as crowns do, give labels; those between two surfaces are cut at the outline that the points on
     both sides of it tell; all others are swept vertically as what may hide a pixel in either view.
     `surface`: all pixels on it have a label, those with points on it the status `labelled` (1),
-    those between points `labelled_between` (9) and an `uncertainty` of their own. Where a step lies
-    between points, pixels are `edge_in_pixel`. `none`: pixels with points alone.
+    those between points `labelled_between` (9) and an `uncertainty` of their own. Rough surfaces,
+    as crowns are, have labels where both views must see them, `labelled_crown` (12), with the
+    `uncertainty` that the roughness of their points leaves; which of these are in the tiles,
+    `tiles.max_uncertainty_px` says. Where a step lies between points, other pixels are
+    `edge_in_pixel`. `none`: pixels with points alone.
     `surface_and_images`: of the pixels that the surface leaves open, those that only one of the
     surfaces around explains in both images are on that surface, `labelled_by_images` (10): more
     labels in crowns and behind roofs, and more of the hidden pixels (with the method both alone). A
@@ -94,8 +97,8 @@ class Settings(Representative, Occlusion):
         return [
             s
             for s in Status
-            if s != Status.MASKED
-            and (self.fills or s != Status.LABELLED_BETWEEN)
+            if s not in (Status.MASKED, Status.TOO_UNCERTAIN)
+            and (self.fills or s not in (Status.LABELLED_BETWEEN, Status.LABELLED_CROWN))
             and (self.asks_images or s != Status.LABELLED_BY_IMAGES)
         ]
 
