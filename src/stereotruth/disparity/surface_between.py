@@ -397,17 +397,15 @@ def between_labels(
     left: Patch,
     right: Patch,
     first: tuple[int, int],
-    keep_own: bool = False,
     porous: bool = False,
 ) -> tuple[Labels, NDArray[np.uint8]]:
     """Labels of a window whose first pixel is (row, col) ``first``, and the status of its pixels.
 
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
     keep the label that these give if it is the surer one (one point is less than three around it,
-    and no plane bulges), or if ``keep_own``. Points of another surface tell of an edge in the
-    pixel. Only where points are so sparse that others show through between them (``porous``) those
-    behind are hidden, as the ground is that a tower leans over. ``left``, ``right``: patches that
-    tell the frames.
+    and no plane bulges). Points of another surface tell of an edge in the pixel. Only where points
+    are so sparse that others show through between them (``porous``) those behind are hidden, as the
+    ground is that a tower leans over. ``left``, ``right``: patches that tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN
@@ -425,7 +423,7 @@ def between_labels(
         other = lift > STEP_PX if porous else np.abs(lift) > STEP_PX
         status[between_points & other] = Status.EDGE_IN_PIXEL
     status[measured] = Status.LABELLED
-    surer = measured & (keep_own | ((own.variance <= between.variance) & ~between.bulging))
+    surer = measured & (own.variance <= between.variance) & ~between.bulging
     return Labels(
         np.where(surer, own.disparity, np.where(is_labelled(status), between.disparity, np.nan)),
         np.where(surer, own.slope, between.slope),
