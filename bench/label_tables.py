@@ -23,6 +23,7 @@ KINDS = {
     "measured": Status.LABELLED,
     "between": Status.LABELLED_BETWEEN,
     "by images": Status.LABELLED_BY_IMAGES,
+    "crown": Status.LABELLED_CROWN,
 }
 Bools = NDArray[np.bool_]
 

@@ -56,7 +56,7 @@ GONE = (errno.ENOENT, errno.ENOTDIR)
 SYSTEM = {
     FULL: (
         "no space left on the disk",
-        "make space there (also for new files: df -i), and run again: what is done is kept",
+        "make space there, and run again: what is done is kept (new files need inodes: df -i)",
     ),
     REFUSED: ("no permission", "get the right to it (ls -l), and run again"),
     GONE: (

@@ -23,12 +23,20 @@ def last_lines(products: Iterable[str]) -> list[str]:
         for pattern, say in SAYINGS.items()
         for product in sorted(products)
         if (found := re.fullmatch(pattern, product))
-        for line in say(product, *found.groups())
+        for line in _lines(say, product, *found.groups())
     ]
     if said or not products:
         return said
     more = f" and {len(products) - 3} more" if len(products) > 3 else ""
     return [f"Made {', '.join(products[-3:])}{more}"]
+
+
+def _lines(say: Callable[..., Iterator[str]], product: str, *groups: str) -> list[str]:
+    """What to say of a product; where its figures cannot be read, that it is damaged."""
+    try:
+        return list(say(product, *groups))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return [f"Look at {product}: its figures cannot be read; delete it and run again"]
 
 
 def _read(*parts: str) -> Mapping[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
+from stereotruth.alignment.aligned_pair import Alignment, ViewFit
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.fit import fit_epipolar
@@ -28,6 +29,28 @@ def model_of(left_angle: float = 90.0) -> EpipolarModel:
     left = camera(BACKWARD, angle=left_angle, size=SIZE)
     right = camera(FORWARD, angle=left_angle + 2.0, gsd=0.8, size=SIZE)
     return fit_epipolar(left, right, SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 50, HEIGHT + 100))
+
+
+def alignment_of(model: EpipolarModel, factor: float, worse: str = "left") -> Alignment:
+    """Exact RPCs, known to ``factor`` times 0.04 px; those of one view half as well."""
+    sigma = factor * np.array([0.01, 0.0, 0.04, 0.0, 0.01, 0.04])
+    sensors = model.left, model.right
+    fits = [
+        ViewFit(
+            view=view,
+            image=f"{view}.tif",
+            size=SIZE,
+            affine=np.array(sensor.affine),
+            gcps=(),
+            sigma0=np.nan,
+            redundancy=0,
+            origin=(SIZE[0] / 2, SIZE[1] / 2),
+            scale=100.0,
+            covariance=np.diag(sigma) ** 2 * (4 if view == worse else 1),
+        )
+        for view, sensor in zip(("left", "right"), sensors)
+    ]
+    return Alignment("S-1", "affine", *sensors, *fits, HEIGHT, (), {})
 
 
 def on_ground(sensor, col: np.ndarray, row: np.ndarray, height: float) -> np.ndarray:

@@ -16,7 +16,7 @@ SIZE = 96
 SHIFT = 7  # px of disparity, of every tile
 HOLE = np.s_[10:30, 20:50]  # pixels without a label
 FLAGS = {0: "no_points", 1: "labelled", 2: "hidden_in_left", 9: "a_new_reason"}
-CITY = 'Ville <b>"A & B"</b>'
+CITY = 'Ville <b>"A & B"'
 REASON = "<script>window.broken = true</script> 9.1 px off"
 
 

@@ -130,7 +130,7 @@ def make_scene(
     return SceneFiles(folder.name, *stores)
 
 
-NO_LIMITS = Limits(*[None] * 6)
+NO_LIMITS = Limits(*[None] * 7)
 COUNTS = {"training": 600, "validation": 80, "testing": 200}
 
 

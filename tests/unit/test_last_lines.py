@@ -82,3 +82,10 @@ def test_what_has_no_figures_is_named():
     assert last_lines([]) == []
     stores = [f"results/ingest/A/A-1/{n}.points" for n in range(5)]
     assert last_lines(stores) == [f"Made {stores[2]}, {stores[3]}, {stores[4]} and 2 more"]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", "\udcff"])
+def test_figures_that_cannot_be_read_end_no_run(text):
+    Path("results/export/A/summary.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    (line,) = last_lines(["tiles/A"])
+    assert line == "Look at tiles/A: its figures cannot be read; delete it and run again"

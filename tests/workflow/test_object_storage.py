@@ -133,6 +133,20 @@ def test_a_mark_of_a_killed_upload_has_the_product_made_again(server, stored, da
     assert fresh.plan(*CALL, *STORED) == {}
 
 
+@pytest.mark.parametrize("how", ["deleted", "replaced"])
+def test_objects_that_somebody_touched_are_planned(server, stored, data, tmp_path, how):
+    """Snakemake looks at the times of objects alone, of those that are there."""
+    fresh = checkout(tmp_path / "elsewhere", data)
+    name = next(n for n in sorted(stored.files) if n.startswith("tiles/Tiny/left/"))
+    if how == "deleted":
+        server.client.delete_object(Bucket=BUCKET, Key=f"tiny/{name}")
+    else:
+        server.put(f"tiny/{name}", b"of somebody else")
+    assert "export" in fresh.plan(*CALL, *STORED)
+    server.put(f"tiny/{name}", stored.files[name])
+    assert fresh.plan(*CALL, *STORED) == {}
+
+
 def test_xarray_opens_the_products_from_the_bucket(made, stored):
     import xarray as xr
 

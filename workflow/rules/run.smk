@@ -91,11 +91,13 @@ def say(text):
 
 onsuccess:
     save_metadata()
+    keep_states()
     tidy_copies()
     say(made())
 
 
 onerror:
     save_metadata()
+    keep_states()
     list_pages()
     say(complaints(log))

@@ -18,12 +18,22 @@ def product_name(path):
 
 
 def record_mirror():
-    """The records of the products in the bucket, brought here."""
+    """The records of the products in the bucket, brought here; what differs there is marked."""
     from stereotruth.products.record_mirror import RecordMirror
+    from stereotruth.products.stored_states import StoredStates
 
     mirror = RecordMirror(STORAGE.default_storage_prefix, copies())
     mirror.pull()
+    StoredStates(STORAGE.default_storage_prefix, copies()).mark_changed()
     return mirror
+
+
+def keep_states():
+    """Keep what the bucket holds of the products that this run has made."""
+    from stereotruth.products.stored_states import StoredStates
+
+    if STORAGE.default_storage_provider:
+        StoredStates(STORAGE.default_storage_prefix, copies()).keep(Run().name)
 
 
 def keep_mirrored(mirror):

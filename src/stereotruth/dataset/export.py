@@ -37,6 +37,7 @@ from ..products.files import growing_table, replacing, whole_folder, write_table
 from ..products.provenance import describe, file_sha256, source_digest
 from .footprints import FOOTPRINTS, feature, write_footprints
 from .ground_looks import write_ground_looks
+from .label_doubts import doubts, surface_figures
 from .orientation import save
 from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
@@ -76,7 +77,7 @@ def _refuse_empty(
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
             "project.recipe: surface, the default, labels pixels between them"
         )
-    doubts = "; ".join(
+    told = "; ".join(
         f"the alignment of scene {source.scene} is in doubt: {doubt}"
         for source in sources
         for doubt in source.doubts
@@ -85,11 +86,11 @@ def _refuse_empty(
         f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
         f"or LiDAR that covers the overlap of the two images{sparse}"
     )
-    if doubts:
-        doubts = f". Labels are missing where LiDAR and images disagree: {doubts}"
+    if told:
+        told = f". Labels are missing where LiDAR and images disagree: {told}"
         remedy = f"first what the alignment's doubts say; else {remedy}"
     raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){doubts}",
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
         remedy=remedy,
     )
 
@@ -135,7 +136,7 @@ def export_city(
     step = cell_step(size, stride)
     sources, chosen, phases, outcomes, scans = [], [], {}, {}, {}
     for item in scenes:
-        source = open_stores(SceneFiles(*item))
+        source = open_stores(SceneFiles(*item), settings.max_uncertainty_px)
         cells = scan_scene(source, step, workers)
         windows, phase, outcome = choose_windows(
             cells, size, stride, settings.min_labelled, settings.right_offset
@@ -154,6 +155,7 @@ def export_city(
         "right_offset": settings.right_offset,
         "disparity_dtype": disparity_dtype,
         "nodata": nodata,
+        "max_uncertainty_px": settings.max_uncertainty_px,
         "split_counts": {"train": training, "val": validation, "test": testing},
         "seed": settings.seed,
         "quality": asdict(settings.quality),
@@ -217,7 +219,7 @@ def export_city(
                 written.append((row, ring))
                 if checks is None:
                     continue
-                scene_checks[row["scene"]].add(checks)
+                scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
                 if table is not None:
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
                     table.writerows(match_rows(head, checks.matches))
@@ -287,20 +289,26 @@ def _split(
 
 def _gates(
     city: str,
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
     limits: Limits,
     strict: bool,
 ) -> dict[str, Any]:
-    """Figures and missed gates of scenes, flagged tiles; logs each miss, or ends a strict run."""
-    found, problems = {}, []
+    """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
+
+    Logs each miss and doubt, or ends a strict run.
+    """
+    found, problems, in_doubt = {}, [], {}
     for scene, checks in scenes.items():
         figures = checks.figures()
         misses = missed(figures, limits)
         found[scene] = figures | {"quality": flag(misses)}
+        in_doubt[scene] = doubts(checks.matches.biases, limits.min_agreement)
         problems += [f"scene {scene}: {miss}" for miss in misses]
+        problems += [f"scene {scene}: {doubt}" for doubt in in_doubt[scene] if not doubt.explained]
     labelled = [row for row in rows if row["complete"] == "yes"]
     for row in labelled:
+        row["doubt"] = "; ".join(map(str, in_doubt[row["scene"]]))
         figures = {name: float(row[name]) for name in CHECK_COLUMNS if row[name] != ""}
         problems += [
             f"tile {row['tile']} of scene {row['scene']}: {miss}"
@@ -313,10 +321,18 @@ def _gates(
             remedy="better control points, images or LiDAR for what is named, another limit "
             "(null: none) in quality of the configuration, or strict: false to have it flagged",
         )
-    for problem in problems:
+    remarks = [
+        f"scene {scene}: {doubt}"
+        for scene, of in in_doubt.items()
+        for doubt in of
+        if doubt.explained
+    ]
+    for problem in problems + remarks:
         log.warning("%s: %s", city, problem)
     return {
         "limits": asdict(limits),
         "scenes": found,
+        "surfaces": {s: surface_figures(of.matches.biases) for s, of in scenes.items()},
+        "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},
         "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
     }

@@ -38,7 +38,10 @@ log = logging.getLogger("stereotruth")
 
 KITTI_SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 US3D_SPLITS = {"train": "Train-Track2", "val": "Validate-Track2", "test": "Test-Track2"}
-KEPT = ("tile", "number", "city", "scene", "row0", "col0", "size", "split", "class", "quality")
+KEPT = (
+    *("tile", "number", "city", "scene", "row0", "col0", "size", "split", "class", "quality"),
+    "doubt",
+)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ Conventions
 - No ground lies in two splits: tiles of which two overlap are in one split, or in none and then
   not here. Splits are contiguous regions. {shared}
 - quality in manifest.csv: ok, or the limits that the pair's labels exceed when held against its
-  images (SIFT matches, image warping); class: building or vegetation.
+  images (SIFT matches, image warping); class: building or vegetation. doubt: what the images of
+  the whole scene say against its labels, if they do.
 - footprints.geojson: where the pairs lie on the ground, with a style for QGIS.
 - manifest.csv: a row per pair with scene, window, offset, counts, split and SHA-256 of each file.
 """

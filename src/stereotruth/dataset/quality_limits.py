@@ -19,6 +19,7 @@ FIGURES = {  # the figure that a limit is for; of signed figures, the size count
     "max_sift_mean_absolute_error_px": "sift_mean_absolute_error_px",
     "min_sift_matches": "sift_matches",
     "min_warp_correlation": "warp_correlation",
+    "min_agreement": "agreement",
 }
 OF_ERRORS = ("max_sift_error_px", "max_sift_mean_absolute_error_px")
 

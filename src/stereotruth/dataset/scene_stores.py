@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..products.grids import require_complete
 from ..products.provenance import digest, file_sha256
 from .orientation import sensor_record
+from .sure_labels import Labels, tile_flags, tile_labels
 
 
 class SceneFiles(NamedTuple):
@@ -37,17 +39,19 @@ class SceneStores:
     """Opened stores of a scene, its epipolar model, and the meaning of the status values.
 
     ``doubts``: warnings of the alignment, a refinement that was refused among them.
+    ``disparity``, ``status``, and these of the right view (``of_right``), as the tiles have them.
     """
 
     scene: str
     left: zarr.Array
     right: zarr.Array
     colours: tuple[tuple[zarr.Array, ...], tuple[zarr.Array, ...]] | None  # of left, right
-    disparity: zarr.Array
-    status: zarr.Array
+    disparity: Labels
+    status: Labels
     height: zarr.Array
-    of_right: zarr.Group | None
+    of_right: Mapping[str, Labels] | None
     surface_class: zarr.Array | None
+    uncertainty: zarr.Array | None
     gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
@@ -58,8 +62,11 @@ class SceneStores:
     doubts: tuple[str, ...]
 
 
-def open_stores(item: SceneFiles) -> SceneStores:
-    """Open a scene's stores; InputError if their grids do not fit together."""
+def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> SceneStores:
+    """Open a scene's stores; InputError if their grids do not fit together.
+
+    ``max_uncertainty_px``: of the labels of rough surfaces that the tiles have.
+    """
     disparity = require_complete(item.disparity)
     left, right = require_complete(item.left), require_complete(item.right)
     model = EpipolarModel.from_dict(disparity.attrs["epipolar"])
@@ -78,14 +85,17 @@ def open_stores(item: SceneFiles) -> SceneStores:
     status = disparity["status"]
     meanings = status.attrs["flag_meanings"]
     names = meanings.split() if isinstance(meanings, str) else list(meanings)
+    flags = dict(zip((int(v) for v in status.attrs["flag_values"]), names))
+    sure = tile_labels(disparity, flags, max_uncertainty_px)
     inputs = {
         f"{item.scene}/{name}": digest(dict(group.attrs.get("provenance", {})))
         for name, group in (("left", left), ("right", right), ("disparity", disparity))
     }
     of_right = None
     if item.disparity_of_right is not None:
-        of_right = require_complete(item.disparity_of_right)
-        found = digest(dict(of_right.attrs.get("provenance", {})))
+        store = require_complete(item.disparity_of_right)
+        of_right = tile_labels(store, flags, max_uncertainty_px)
+        found = digest(dict(store.attrs.get("provenance", {})))
         inputs[f"{item.scene}/disparity_of_right"] = found
     if item.alignment is not None:
         inputs[f"{item.scene}/alignment"] = file_sha256(item.alignment)
@@ -95,15 +105,16 @@ def open_stores(item: SceneFiles) -> SceneStores:
         left=left["image"],
         right=right["image"],
         colours=_colours(left, right),
-        disparity=disparity["disparity"],
-        status=status,
+        disparity=sure["disparity"],
+        status=sure["status"],
         height=disparity["height"],
         of_right=of_right,
         surface_class=disparity.get("surface_class"),
+        uncertainty=disparity.get("uncertainty"),
         gcp_rms=gcp_rms,
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},
-        flags=dict(zip((int(v) for v in status.attrs["flag_values"]), names)),
+        flags=tile_flags(flags),
         inputs=inputs,
         points_per_px=disparity.attrs.get("points_per_px"),
         points_per_m2=disparity.attrs.get("points_per_m2"),

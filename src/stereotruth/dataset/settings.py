@@ -36,6 +36,11 @@ class Tiles:
     nodata: Annotated[Number, Unit("px")] = -999
     """value of unlabelled pixels in the disparity files"""
 
+    max_uncertainty_px: Annotated[Number, Field(ge=0), Unit("px")] = 0.5
+    """of the labels of rough surfaces (`labelled_crown`, 12), those with a greater `uncertainty`
+    are in the disparity store alone: in the tiles they have no disparity and the status
+    `too_uncertain` (13). 0: none of them is in the tiles. All other labels are"""
+
 
 @settings
 class Dataset:
@@ -93,6 +98,11 @@ class Limits:
 
     min_warp_correlation: Annotated[Number, Field(ge=-1, le=1)] | None = 0.5
     """correlation of the left and the right image warped by the labels"""
+
+    min_agreement: Share | None = 0.01
+    """probability that chance alone has the SIFT matches of a scene disagree so with its labels, by
+    the standard errors of both: on open ground, on roofs, and of the rows. With less, the scene is
+    in doubt, whatever the amount; so many scenes without fault are, too. null: no doubts"""
 
 
 @settings

@@ -182,6 +182,11 @@ class TileMatches:
     surface_class: NDArray[np.uint8]
 
     @property
+    def pixel(self) -> tuple[Indices, Indices]:
+        """Row and column of the nearest pixel of the left image."""
+        return np.floor(self.y + 0.5).astype(np.intp), np.floor(self.x + 0.5).astype(np.intp)
+
+    @property
     def y_parallax(self) -> Floats:
         """Of all matches, y_right − y_left."""
         return self.y_right - self.y

@@ -78,8 +78,14 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
         some = ", ".join(f"{tile} ({gates})" for tile, gates in list(flagged.items())[:5])
         more = f" and {len(flagged) - 5} more" if len(flagged) > 5 else ""
         lines.append(f"Beyond the limits of quality: {some}{more}")
-    else:
+    elif not summary["quality"]["doubts"]:
         lines.append("All labelled pairs are within the limits of quality")
+    lines += [
+        f"{'Remark on' if doubt['explained_by_alignment'] else 'Doubt about'} {scene}: "
+        f"{doubt['text']}"
+        for scene, found in summary["quality"]["doubts"].items()
+        for doubt in found
+    ]
     return [*lines, f"Look at {out_dir}/manifest.csv, {out_dir}/left, right, disp, status"]
 
 

@@ -11,7 +11,7 @@ small houses in forests on slopes; of tiles without houses, 0.4 % pass for build
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,8 +30,11 @@ ROUGH_M = 0.25
 FAR = 1e6  # m
 
 
-def _rough(height: Floats, known: NDArray[np.bool_]) -> Floats:
-    """Standard deviation (m) of heights from the plane in the square around each pixel."""
+def off_plane(height: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Standard deviation of heights from the plane in the square around each pixel, in their unit.
+
+    0 where they are not known; infinite where less than 70 % of the square are.
+    """
     size = (PLANE_PX, PLANE_PX)
 
     def mean(values: Floats) -> Floats:
@@ -65,28 +68,35 @@ def buildings_by_shape(height: Floats) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(ground, (0, 0), GROUND_PX / 4)
     slope = cv2.dilate(np.hypot(*np.gradient(smooth)), square)  # as the opening, from all around
     raised &= z - ground > RAISED_M + slope * GROUND_PX / 2
-    flat = raised & (_rough(z, known) < ROUGH_M)
+    flat = raised & (off_plane(z, known) < ROUGH_M)
     square = np.ones((PLANE_PX, PLANE_PX), np.uint8)
     return raised & (cv2.dilate(flat.astype(np.uint8), square) > 0)
 
 
-def tile_class(
-    surface_class: NDArray[np.uint8],
-    height: Any,
-    here: tuple[slice, slice],
-    building_share: float,
-) -> str:
-    """Class of a tile from the LiDAR's classes in it (0: unknown), or from heights.
+class Buildings(NamedTuple):
+    """Pixels of a tile that are building, and those that could be: bool[h, w]."""
 
-    ``height``: of the whole scene, m, NaN where there is none (may be a Zarr array); ``here``: the
-    tile's rows and columns in it. Heights are read with ``GROUND_PX`` of their surroundings.
-    """
-    if np.isin(surface_class, CLASSED_CODES).any():
-        found, of = surface_class == BUILDING_CODE, surface_class != 0
-    else:
+    found: NDArray[np.bool_]
+    of: NDArray[np.bool_]
+
+    @classmethod
+    def of_tile(
+        cls, surface_class: NDArray[np.uint8], height: Any, here: tuple[slice, slice]
+    ) -> Buildings:
+        """By the LiDAR's classes in the tile (0: unknown), or from heights.
+
+        ``height``: of the whole scene, m, NaN where there is none (may be a Zarr array); ``here``:
+        the tile's rows and columns in it. Heights are read with ``GROUND_PX`` of their
+        surroundings.
+        """
+        if np.isin(surface_class, CLASSED_CODES).any():
+            return cls(surface_class == BUILDING_CODE, surface_class != 0)
         wide = tuple(slice(max(s.start - GROUND_PX, 0), s.stop + GROUND_PX) for s in here)
         tile = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(here, wide))
         values = np.asarray(height[wide], dtype=np.float64)
-        found, of = buildings_by_shape(values)[tile], np.isfinite(values[tile])
-    share = found.sum() / max(of.sum(), 1)
-    return BUILDING if share >= building_share else VEGETATION
+        return cls(buildings_by_shape(values)[tile], np.isfinite(values[tile]))
+
+    def tile_class(self, building_share: float) -> str:
+        """Class of a tile of which so large a share must be building."""
+        share = self.found.sum() / max(self.of.sum(), 1)
+        return BUILDING if share >= building_share else VEGETATION

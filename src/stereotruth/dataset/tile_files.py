@@ -17,13 +17,14 @@ from ..products.files import link
 from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
 from ..products.rasters import write_tiff
+from .label_surfaces import label_surfaces
 from .orientation import orientation, save
 from .scene_stores import SceneStores
 from .settings import Limits
 from .sift_matches import match_tile
 from .split_names import NONE
 from .tile_checks import TileChecks, check_cells
-from .tile_classes import tile_class
+from .tile_classes import Buildings
 from .windows import Window
 
 FILES = ("left", "right", "disp", "status", "orientation")
@@ -148,6 +149,47 @@ def _write_images(
         write_tiff(paths["status_right"], crop.status_of_right, description=meanings)
 
 
+@dataclass(frozen=True, eq=False)
+class LabelsKnown:
+    """What is known of a tile's labels beside their values: uint8[h, w], and px, float64[h, w].
+
+    ``kind``: class of the tile; ``surface``: see :class:`.label_surfaces.LabelSurface`; ``sigma``:
+    their uncertainty, 0 where a store does not tell.
+    """
+
+    kind: str
+    surface_class: NDArray[np.uint8]
+    surface: NDArray[np.uint8]
+    sigma: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        source: SceneStores,
+        here: tuple[slice, slice],
+        disparity: NDArray[np.float64],
+        building_share: float,
+    ) -> LabelsKnown:
+        """Of the tile at those rows and columns."""
+        surface_class = np.zeros(disparity.shape, np.uint8)
+        if source.surface_class is not None:
+            surface_class = np.asarray(source.surface_class[here])
+        sigma = np.zeros(disparity.shape)
+        if source.uncertainty is not None:
+            sigma = np.nan_to_num(np.asarray(source.uncertainty[here], np.float64))
+        buildings = Buildings.of_tile(surface_class, source.height, here)
+        return cls(
+            kind=buildings.tile_class(building_share),
+            surface_class=surface_class,
+            surface=label_surfaces(disparity, sigma, surface_class, buildings.found),
+            sigma=sigma,
+        )
+
+    def arrays(self) -> list[NDArray[Any]]:
+        """All that the checks of a tile follow from, beside its pixels."""
+        return [self.surface_class, self.surface, self.sigma]
+
+
 def _finished(
     source: SceneStores, window: Window, names: Mapping[str, str], crop: _Crop, cut: Cut
 ) -> tuple[dict[str, str], TileChecks | None]:
@@ -159,14 +201,11 @@ def _finished(
         slice(window.row0, window.row0 + cut.size),
         slice(window.col0, window.col0 + cut.size),
     )
-    surface_class = np.zeros(crop.left.shape, np.uint8)
-    if source.surface_class is not None:
-        surface_class = np.asarray(source.surface_class[here])
-    kind = ""
+    known = None
     if window.labelled:
-        kind = tile_class(surface_class, source.height, here, cut.building_share)
+        known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
     pixels = hashlib.sha256()
-    for array in (*crop.arrays(), surface_class):
+    for array in (*crop.arrays(), *(known.arrays() if known else ())):
         pixels.update(array)
     files = {name: path for name, path in names.items() if name != "orientation"}
     paths = {name: cut.work / path for name, path in files.items()}
@@ -174,16 +213,14 @@ def _finished(
         "pixels": pixels.hexdigest(),
         "files": files,
         "flags": [[int(value), meaning] for value, meaning in source.flags.items()],
-        "settings": [cut.dtype, cut.nodata, kind],
+        "settings": [cut.dtype, cut.nodata, known.kind if known else ""],
         "code": cut.code,
     }
     key, tile = digest(made_of), f"{cut.prefix}_{names['left'].rpartition('_')[2][:-5]}"
     piece = cut.ledger.find(tile, key, paths)
     if piece is None:
         _write_images(paths, source, window, crop, cut)
-        checks = None
-        if window.labelled:
-            checks = _check(crop, surface_class, kind)
+        checks = None if known is None else _check(crop, known)
         piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
     found = piece.result
     return dict(piece.sha256), None if found is None else TileChecks.from_dict(found)
@@ -270,13 +307,16 @@ def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, 
     )
 
 
-def _check(crop: _Crop, surface_class: NDArray[np.uint8], kind: str) -> TileChecks:
+def _check(crop: _Crop, known: LabelsKnown) -> TileChecks:
     """Hold the labels of a tile, as stored, against its images."""
     left, right = crop.left, crop.right
     disparity = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
     x = np.arange(left.shape[1])[None, :] - disparity
+    matches = match_tile(left, right, disparity, known.surface_class)
     return TileChecks(
-        kind=kind,
-        matches=match_tile(left, right, disparity, surface_class),
+        kind=known.kind,
+        matches=matches,
         warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
+        surface=known.surface[matches.pixel],
+        sigma=known.sigma[matches.pixel],
     )

@@ -129,11 +129,15 @@ class GroundInView:
         """Which triangles [m, 3] may be seen."""
         return _touching(vertices.x, vertices.y, corner, self.squares)
 
+    def near(self, vertices: Vertices, cells: int) -> Bools:
+        """Which vertices lie up to so many ``cells`` around all that may be seen."""
+        around = (cells >> (SQUARE_BITS - PART_BITS)) + 1
+        wide = _greatest_around(self.squares.astype(np.int64), around) > 0
+        return _inside(vertices.x, vertices.y, wide)
+
     def with_halo(self, vertices: Vertices, halo: int) -> Vertices:
         """The vertices up to ``halo`` cells around all that may be seen."""
-        around = (halo >> (SQUARE_BITS - PART_BITS)) + 1
-        wide = _greatest_around(self.squares.astype(np.int64), around) > 0
-        kept = _inside(vertices.x, vertices.y, wide)
+        kept = self.near(vertices, halo)
         return Vertices(*(getattr(vertices, f.name)[kept] for f in fields(Vertices)))
 
 

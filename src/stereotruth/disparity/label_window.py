@@ -3,9 +3,7 @@
 With the recipe ``surface``, the surface of the points tells what each pixel's centre shows and what
 hides it in either view (:mod:`.surface_between`). A pixel whose own points on the surface that its
 centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured, others are between
-points. Then: do the images agree with what the LiDAR has there, and is it no water
-(:class:`.image_agreement.Agreement`)?
-
+points. Then: do the images agree with what the LiDAR has XX
 With the recipe ``paper`` labels are those of :mod:`.paper_recipe`.
 """
 
@@ -19,9 +17,10 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import surface_correlation
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from .crowns import Crowns, crowns
 from .ground_in_view import GroundInView
 from .image_agreement import Agreement, apart_from_steps, warp_to_left
-from .image_patches import Patch, read_patch
+from .image_patches import USABLE, Patch, read_patch
 from .local_projection import LocalProjection
 from .paper_recipe import paper_labels
 from .pixel_labels import Labels, Pixels, at_centres, condense
@@ -31,7 +30,7 @@ from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX, seen_surface
 from .smooth_triangles import ground_surface
 from .status import WATER_CLASS, Status, is_labelled
-from .surface_between import between_labels, surface_between
+from .surface_between import between_labels, surface_between, usable_at
 from .vertices import VertexBuilder, Vertices
 
 Floats = NDArray[np.float64]
@@ -103,8 +102,59 @@ def _on_surface(
         surface_class=np.where(measured, pixels.surface_class, between.surface_class),
     )
     agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
+    found = crowns(surface, between, local, first, scene.scale, px_per_m)
+    if settings.edge_margin_px > 0.0:
+        found = replace(found, shown=found.shown & ~edge)
+    labels, pixels, agreement = _with_crowns(
+        scene, found, labels, pixels, agreement, status, left, right, wide
+    )
     layers = _layers(scene, pixels, labels, agreement, status, wide)
     return layers, _counts(points, pixels, status, settings.margin)
+
+
+def _with_crowns(
+    scene: SceneInputs,
+    found: Crowns,
+    labels: Labels,
+    pixels: Pixels,
+    agreement: Floats,
+    status: NDArray[np.uint8],
+    left: Patch,
+    right: Patch,
+    wide: Window,
+) -> tuple[Labels, Pixels, Floats]:
+    """Labels, pixels and correlation with those of rough surfaces; sets these in ``status``.
+
+    Labels of other statuses stay as they are: crowns are held against the images by themselves.
+    """
+    row, col = np.nonzero(found.shown & (status == Status.EDGE_IN_PIXEL))
+    x = col + wide[1].start
+    match = np.floor(x - found.disparity[row, col]).astype(np.int64)
+    both = usable_at(left, row + wide[0].start, x) & usable_at(right, row + wide[0].start, match)
+    at = row[both == USABLE], col[both == USABLE]
+    new = np.zeros(status.shape, np.bool_)
+    new[at] = True
+    merged = Labels(
+        np.where(new, found.disparity, labels.disparity),
+        np.where(new, found.slope, labels.slope),
+        np.where(new, found.variance, labels.variance),
+    )
+    if at[0].size:
+        held = _agreement(scene, merged, left, right, wide)
+        agreement = np.where(new, held.correlation, agreement)
+        changed = new & held.outvoted()
+        status[changed] = Status.CHANGED
+        new &= ~changed
+    status[new] = Status.LABELLED_CROWN
+    return (
+        merged,
+        replace(
+            pixels,
+            highest=np.where(new, found.height, pixels.highest),
+            surface_class=np.where(new, found.surface_class, pixels.surface_class),
+        ),
+        agreement,
+    )
 
 
 def _patches(scene: SceneInputs, wide: Window, reach: Reach) -> tuple[Patch, Patch]:
@@ -172,14 +222,7 @@ def _test_agreement(
     wide: Window,
 ) -> Floats:
     """Correlation of the images over each pixel's surface; sets what has changed in status."""
-    settings = scene.settings
-    warped = warp_to_left(right, *wide, labels.disparity)
-    top, side = wide[0].start - left.row, wide[1].start - left.col
-    shown = left.pixels[top : top + status.shape[0], side : side + status.shape[1]]
-    surface = labels.disparity, labels.slope
-    clear = apart_from_steps(labels.disparity)
-    found = surface_correlation(shown, warped, *surface, settings.window, clear)
-    agreement = Agreement(found, *surface, settings.correlation_threshold, scene.scale.trust)
+    agreement = _agreement(scene, labels, left, right, wide)
     changed = agreement.outvoted()
     rim = agreement.beside(changed)
     if scene.scale.points_per_px < DENSE:
@@ -188,7 +231,21 @@ def _test_agreement(
     changed |= is_labelled(status) & rim
     changed |= is_labelled(status) & (pixels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
-    return found
+    return agreement.correlation
+
+
+def _agreement(
+    scene: SceneInputs, labels: Labels, left: Patch, right: Patch, wide: Window
+) -> Agreement:
+    """Of the images, by the labels of a window."""
+    settings, (rows, cols) = scene.settings, labels.disparity.shape
+    warped = warp_to_left(right, *wide, labels.disparity)
+    top, side = wide[0].start - left.row, wide[1].start - left.col
+    shown = left.pixels[top : top + rows, side : side + cols]
+    surface = labels.disparity, labels.slope
+    clear = apart_from_steps(labels.disparity)
+    found = surface_correlation(shown, warped, *surface, settings.window, clear)
+    return Agreement(found, *surface, settings.correlation_threshold, scene.scale.trust)
 
 
 def _layers(

@@ -20,7 +20,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
     condensed = "disparity of the point at mean longitude and latitude, greatest height"
     used = "points whose image windows correlate"
     compared = "mean correlation coefficient of the image windows at the points used"
-    between, lonely = {}, {}
+    between, lonely, rough = {}, {}, {}
     if settings.on_surface:
         condensed = (
             "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
@@ -33,11 +33,18 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         )
         between = {
             "between": "where the status is labelled_between, or a point is less sure than those "
-            "around it: linear in the triangle of points that the pixel's centre sees"
+            "around it: linear in the triangle of points that the pixel's centre sees; where it is "
+            "labelled_crown: linear in the triangle of the tops of a rough surface"
         }
         lonely = {
+            "labelled_crown": "a rough surface that both views must show; its uncertainty follows "
+            "from the roughness of its points",
             "edge_in_pixel": "no smooth triangle of points, or a step between points may be "
             "nearer to one of the cameras",
+        }
+        rough = {
+            "labelled_crown": "v / n + p is what the roughness of the tops of the surface leaves "
+            "between them"
         }
     hidden = {}
     if masked:
@@ -117,7 +124,8 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
                 "variance of the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey)"
                 " errors of a ground point's disparity and place by the alignment, whose "
                 "covariance is that of alignment.json",
-            },
+            }
+            | rough,
         ),
         "surface_class": Layer(
             "uint8",

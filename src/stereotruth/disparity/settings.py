@@ -21,10 +21,13 @@ class Settings:
     are cut at the outline that the points on both sides of it tell. All others are swept vertically
     as what may hide a pixel in either view. All pixels on the surface have a label: those with
     points on it the status `labelled` (1), those between points `labelled_between` (9) and an
-    `uncertainty` of their own. Where a step lies between points, pixels are `edge_in_pixel`. Where
-    the images contradict the LiDAR over most of a surface (25 px around a pixel), pixels are
-    `changed`. `paper`: as in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and
-    max Z of its points, and points around which the images do not correlate are dropped"""
+    `uncertainty` of their own. Rough surfaces, as crowns are, have labels where both views must see
+    them, `labelled_crown` (12), with the `uncertainty` that the roughness of their points leaves;
+    which of these are in the tiles, `tiles.max_uncertainty_px` says. Where a step lies between
+    points, other pixels are `edge_in_pixel`. Where the images contradict the LiDAR over most of a
+    surface (25 px around a pixel), pixels are `changed`. A value is always the LiDAR's. `paper`: as
+    in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and max Z of its points, and
+    points around which the images do not correlate are dropped"""
 
     window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
     """side of the correlation window; with `surface`, of the pixels in it only those of the same
@@ -55,8 +58,10 @@ class Settings:
     @property
     def statuses(self) -> list[Status]:
         """Those that the recipe's grids name; MASKED comes with masks alone."""
-        last = Status.LABELLED_BETWEEN if self.on_surface else Status.EDGE_IN_PIXEL
-        return [status for status in Status if status <= last]
+        found = [status for status in Status if status <= Status.EDGE_IN_PIXEL]
+        if self.on_surface:
+            found += [Status.LABELLED_BETWEEN, Status.LABELLED_CROWN]
+        return found
 
     @property
     def images_window(self) -> int:

@@ -51,6 +51,8 @@ SUPPORT = 2
 # Trees and huts of fewer pixels are told by the images: where points are farther apart than this,
 # a label between them needs a higher correlation.
 NOTICED_PX = 1.5
+# Mean distances of points around a top of a rough surface that say whether it is one.
+ROUGH_REACH = 2.2
 # Crowns bulge: all around lies below their planes, however steeply it falls, while at the foot of a
 # step it rises. A triangle of a dome is no higher than this, less where points are sparse (trust).
 DOME_PX = 3.0
@@ -70,8 +72,9 @@ class Scale:
     in its circumcircle. A label follows from its triangle, the neighbours of that and theirs
     (noise), the neighbours of these (support), the triangles that share a vertex with them
     (planes), and again (gradients): six steps of two radii. Where it is cut follows from the points
-    up to REACH around it and the planes there (two radii more). Which vertices there are follows
-    from the squares around (:mod:`.even_squares`).
+    up to REACH around it and the planes there (two radii more). Which points are of a rough surface
+    follows from six steps, and its labels from ``rough_halo`` around. Which vertices there are
+    follows from the squares around (:mod:`.even_squares`).
     """
 
     distance: float
@@ -83,6 +86,12 @@ class Scale:
     def width(self) -> float:
         """Parts of a cell between a place of a triangle and any point that tells heights there."""
         return max(REACH * self.distance + 2.0 * self.smooth, 2.0 * self.swept)
+
+    @property
+    def rough_halo(self) -> int:
+        """Cells around a triangle of a rough surface whose points have a say in it: its vertices,
+        those beside it and beside these (misfits), and what lies around these."""
+        return int(np.ceil((6.0 * self.smooth + ROUGH_REACH * self.distance) / PART))
 
     @property
     def distance_px(self) -> float:
@@ -114,6 +123,7 @@ class Scale:
         smooth = SMOOTH_RADIUS * distance
         swept = max(SWEPT_RADIUS * smooth, float(SWEPT_CELLS * PART))
         halo = max(12 * smooth, 2 * swept) + REACH * distance + 2 * smooth
+        halo = max(halo, 18 * smooth + ROUGH_REACH * distance)
         return cls(distance, smooth, swept, int(np.ceil(halo / PART)) + EVEN_REACH + 2)
 
 
@@ -354,6 +364,13 @@ def _variances(
     return out
 
 
+def _around(corner: Steps, chosen: Bools, vertices: int) -> Bools:
+    """Which vertices the ``chosen`` triangles have."""
+    out = np.zeros(vertices, np.bool_)
+    out[corner[chosen].reshape(-1)] = True
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class GroundSurface:
     """The surface of a window's points, and where it steps.
@@ -363,7 +380,9 @@ class GroundSurface:
     ``bulge`` [m] (lattice steps) times the sum of the products of two barycentric coordinates, the
     form of a quadratic function between its values at the vertices; ``steps`` [k, 3] that may hold
     any surface between the heights ``span`` [k, 2] (lattice steps); of the first ``rough`` of these
-    nobody knows which surfaces they hold, the others lie between two known ones.
+    nobody knows which surfaces they hold, the others lie between two known ones. ``uneven`` [n]:
+    which of the first vertices, those of points, share a triangle with one of a step, and may
+    have a say in what is seen.
     """
 
     vertices: Vertices
@@ -373,6 +392,7 @@ class GroundSurface:
     steps: Steps
     span: Ints
     rough: int
+    uneven: Bools
 
 
 def ground_surface(
@@ -407,6 +427,9 @@ def ground_surface(
     seen = np.ones(len(corner), np.bool_)
     if view is not None:
         seen = view.touching(vertices, corner)
+    uneven = _around(corner, _around(corner, ~smooth, x.size)[corner].any(axis=1), x.size)
+    if view is not None:
+        uneven &= view.near(vertices, scale.rough_halo)
     cut, pieces = cut_at_outlines(
         x, y, h, corner, radius, smooth, seen, plane, scale.distance, scale.smooth, step, *floors
     )
@@ -421,6 +444,7 @@ def ground_surface(
         np.concatenate([whole, strips]),
         np.concatenate([span, np.rint(pieces.heights).astype(np.int64)]),
         len(whole),
+        uneven,
     )
 
 

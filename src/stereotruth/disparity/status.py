@@ -28,9 +28,12 @@ class Status(IntEnum):
     LABELLED_BETWEEN = 9
     LABELLED_BY_IMAGES = 10
     MASKED = 11
+    LABELLED_CROWN = 12
+    TOO_UNCERTAIN = 13  # in tiles alone
 
 
 def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where a status says that there is a label: measured, between points, or told by images."""
+    """Where a status says that there is a label: measured, between points, told by images, or of a
+    rough surface."""
     between = (status >= Status.LABELLED_BETWEEN) & (status <= Status.LABELLED_BY_IMAGES)
-    return (status == Status.LABELLED) | between
+    return (status == Status.LABELLED) | between | (status == Status.LABELLED_CROWN)

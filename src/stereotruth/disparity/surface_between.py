@@ -126,10 +126,10 @@ def _face_in_left(
 
 
 @kernel
-def _nearest_smooth(
+def nearest_faces(
     xy: Floats, corner: Steps, first: tuple[int, int], nearest: Floats, shown: Steps
 ) -> None:
-    """The smooth triangle of the greatest disparity at each pixel's centre, and that disparity.
+    """The triangle of the greatest disparity at each pixel's centre, and that disparity.
 
     ``xy`` [4, vertices]: places in both images, px. Of equals, the triangle of the lower number.
     """
@@ -219,7 +219,7 @@ def _prisms_in_right(
 
 
 @kernel
-def _at_pixels(
+def at_pixels(
     xy: Floats, h: Ints, classes: NDArray[np.uint8], count: Steps, corner: Steps, noise: Floats,
     bulge: Floats, shown: Steps, first: tuple[int, int], slope: Floats, variance: Floats,
     height: Floats, rise: Floats, surface_class: NDArray[np.uint8],
@@ -254,7 +254,7 @@ def _at_pixels(
 Where = tuple[tuple[int, int], int, NDArray[np.int32], Floats, Floats]
 
 
-def _by_right_column(
+def by_right_column(
     row: Ints, col: Ints, disparity: Floats, first: tuple[int, int]
 ) -> tuple[Ints, Where]:
     """Pixels [n] of a window, one at least, in their order in the right image, and where they are
@@ -281,7 +281,7 @@ class Places:
     first: tuple[int, int]
 
     def hidden(self, where: Where) -> Bools:
-        """Which places, as :func:`_by_right_column` gives them, lie behind a triangle."""
+        """Which places, as :func:`by_right_column` gives them, lie behind a triangle."""
         behind = np.zeros(where[3].size, np.bool_)
         _smooth_in_right(self.xy, self.corner, *where, behind)
         return behind
@@ -290,7 +290,7 @@ class Places:
         """Whether a triangle hides pixels [n] of the window, of this disparity, from there."""
         out = np.zeros(row.size, np.bool_)
         if row.size:
-            order, where = _by_right_column(row, col, disparity, self.first)
+            order, where = by_right_column(row, col, disparity, self.first)
             out[order] = self.hidden(where)
         return out
 
@@ -335,24 +335,20 @@ def surface_between(
     vertices, corner = surface.vertices, surface.smooth
     xy = local.at_points(vertices.lon_q, vertices.lat_q, vertices.h_q)
     nearest, shown = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    _nearest_smooth(xy, corner, first, nearest, shown)
+    nearest_faces(xy, corner, first, nearest, shown)
     before = np.full(shape, -np.inf)
-    for prisms in _prisms(surface, local, 0, surface.rough):
-        _prisms_in_left(prisms, first, before)
+    steps_in_left(surface, local, slice(0, surface.rough), first, before)
     rough = before > nearest + TOLERANCE_PX
-    for prisms in _prisms(surface, local, surface.rough, len(surface.steps)):
-        _prisms_in_left(prisms, first, before)
+    steps_in_left(surface, local, slice(surface.rough, len(surface.steps)), first, before)
     outcome = np.where(shown >= 0, np.uint8(SHOWN), np.uint8(NOTHING))
     outcome[before > nearest + TOLERANCE_PX] = STEP_IN_LEFT
 
     places = Places(xy, corner, first)
     row, col = np.nonzero(outcome == SHOWN)
     if row.size:
-        order, where = _by_right_column(row, col, nearest[row, col], first)
+        order, where = by_right_column(row, col, nearest[row, col], first)
         behind = places.hidden(where)
-        unsure = np.zeros(row.size, np.bool_)
-        for prisms in _prisms(surface, local, 0, len(surface.steps)):
-            _prisms_in_right(prisms, *where, unsure)
+        unsure = steps_in_right(surface, local, slice(0, len(surface.steps)), where)
         found = np.where(behind, BEHIND_IN_RIGHT, np.where(unsure, STEP_IN_RIGHT, SHOWN))
         outcome[row[order], col[order]] = found
 
@@ -360,7 +356,7 @@ def surface_between(
     slope, variance, height = np.zeros((2, *shape)), np.zeros(shape), np.full(shape, np.nan)
     rise = np.zeros(shape)
     classes = np.zeros(shape, np.uint8)
-    _at_pixels(
+    at_pixels(
         xy, vertices.h_q, vertices.surface_class, vertices.count, corner, surface.noise,
         surface.bulge, shown, first, slope, variance, height, rise, classes,
     )  # fmt: skip
@@ -377,6 +373,25 @@ def surface_between(
         bulging=rise > 0.0,
         places=places,
     )
+
+
+def steps_in_left(
+    surface: GroundSurface, local: LocalProjection, steps: slice, first: tuple[int, int],
+    highest: Floats,
+) -> None:  # fmt: skip
+    """Raises ``highest`` [rows, cols] to the disparity that some of the ``steps`` may have."""
+    for prisms in _prisms(surface, local, steps.start, steps.stop):
+        _prisms_in_left(prisms, first, highest)
+
+
+def steps_in_right(
+    surface: GroundSurface, local: LocalProjection, steps: slice, where: Where
+) -> Bools:
+    """Which places, as :func:`by_right_column` gives them, some of the ``steps`` may hide."""
+    hidden = np.zeros(where[3].size, np.bool_)
+    for prisms in _prisms(surface, local, steps.start, steps.stop):
+        _prisms_in_right(prisms, *where, hidden)
+    return hidden
 
 
 def _prisms(
@@ -411,8 +426,8 @@ def between_labels(
     shown = between.outcome == SHOWN
     row, col = np.nonzero(shown)
     place = col + first[1] - between.disparity[row, col]
-    in_left = _usable(left, row + first[0], col + first[1])
-    in_right = _usable(right, row + first[0], np.floor(place).astype(np.int64))
+    in_left = usable_at(left, row + first[0], col + first[1])
+    in_right = usable_at(right, row + first[0], np.floor(place).astype(np.int64))
     inside, masked = in_left & in_right == USABLE, (in_left | in_right) & MASKED != 0
     status[row[~inside], col[~inside]] = Status.OUT_OF_FRAME
     status[row[masked], col[masked]] = Status.MASKED
@@ -431,7 +446,7 @@ def between_labels(
     ), status
 
 
-def _usable(patch: Patch, row: Ints, col: Ints) -> NDArray[np.uint8]:
+def usable_at(patch: Patch, row: Ints, col: Ints) -> NDArray[np.uint8]:
     """Of :class:`.image_patches.Patch`, at pixels [n]; 0 outside the patch."""
     r, c = row - patch.row, col - patch.col
     inside = (r >= 0) & (c >= 0) & (r < patch.usable.shape[0]) & (c < patch.usable.shape[1])

@@ -19,6 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..dataset.manifest import Tile, carries_label, labelled_tiles
+from ..dataset.sure_labels import tile_flags
 from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
@@ -136,9 +137,9 @@ class Labels:
 
 
 def status_names(store: xr.Dataset) -> tuple[str, ...]:
-    """Names of the status values of a disparity store, by value."""
+    """Names of the status values of a disparity store and its tiles, by value."""
     attrs = store["status"].attrs
-    names = dict(zip(attrs["flag_values"], attrs["flag_meanings"].split()))
+    names = tile_flags(dict(zip(attrs["flag_values"], attrs["flag_meanings"].split())))
     return tuple(names.get(value, f"status_{value}") for value in range(max(names) + 1))
 
 

@@ -91,7 +91,7 @@ def draw_panels(tile: WarpedTile, path: str | Path) -> None:
     for ax, (image, title, style) in zip(axes.ravel(), panels):
         ax.set_facecolor("black" if style is gray else np.array(NO_VALUE) / 255)
         shown = ax.imshow(image, interpolation="nearest", **style)
-        ax.set_title(f"{tile.name}: {title}")
+        ax.set_title(f"{tile.name}: {title}", parse_math=False)
         if style is not gray:
             figure.colorbar(shown, ax=ax, shrink=0.7)
     with replacing(path) as scratch:

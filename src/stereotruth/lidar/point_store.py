@@ -164,9 +164,14 @@ class PointStore:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.attrs = self._attributes()
-        self.bounds: tuple[float, ...] = tuple(self.attrs["bounds"])
-        self.count = int(self.attrs["points"]["kept"])
-        cells = self._cell_table()
+        try:
+            self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
+            self.count = int(self.attrs["points"]["kept"])
+            cells = self._cell_table()
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise self._damaged(ATTRIBUTES) from error
         self.cell_row = cells["row"].astype(np.int64)
         self.cell_col = cells["col"].astype(np.int64)
         self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
@@ -189,9 +194,9 @@ class PointStore:
             raise self._damaged(ATTRIBUTES) from error
         if not isinstance(attrs, dict) or attrs.get("kind") != "points":
             raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
-        if attrs["format"] != FORMAT:
+        if attrs.get("format") != FORMAT:
             raise InputError(
-                f"a point store of format {attrs['format']}, not {FORMAT}",
+                f"a point store of format {attrs.get('format')}, not {FORMAT}",
                 file=self.path,
                 remedy="delete it and run the workflow again",
             )
@@ -216,7 +221,7 @@ class PointStore:
                 right = (shape, dtype) == ((self.count, WORDS), np.dtype("<u4"))
                 if right and file.stat().st_size - stream.tell() == self.count * POINT_BYTES:
                     return stream.tell()
-        except (OSError, ValueError) as error:
+        except Exception as error:  # NumPy reads the header as Python, which fails in many ways
             raise self._damaged(POINTS) from error
         raise self._damaged(POINTS)
 

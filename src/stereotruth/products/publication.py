@@ -71,6 +71,7 @@ def publication(inputs: Iterable[str], outputs: Iterable[str], made: str) -> Ite
     Raises InputError if an input changes meanwhile, or another run begins.
     """
     global _job
+    inputs = list(map(str, inputs))
     with listed():
         job = _Job(inputs, outputs, made)
         _job = job
@@ -78,6 +79,14 @@ def publication(inputs: Iterable[str], outputs: Iterable[str], made: str) -> Ite
             with job.run.watched():
                 yield
                 job.end()
+        except (InputError, OSError):
+            raise
+        except Exception as error:
+            from .damaged_chunks import damage_behind  # few jobs fail, and not all need Zarr
+
+            if damage := damage_behind(error, inputs):
+                raise damage from error
+            raise
         finally:
             _job = None
 

@@ -89,8 +89,11 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
+    doubted = list(quality.get("doubts", {}))
+    if doubted:
+        note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
-    return Headline("quality gates", text, note, bool(bad or scenes))
+    return Headline("quality gates", text, note, bool(bad or scenes or doubted))
 
 
 def _of_images(

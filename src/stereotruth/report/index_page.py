@@ -57,7 +57,12 @@ def write_index(root: Path = Path()) -> Path | None:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    """What a record holds; nothing if it is missing or damaged: the page says what there is."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _link(out: Path, page: Path, text: str) -> Cell:

@@ -18,6 +18,7 @@ import numpy as np
 from ..dataset import quick_looks
 from ..dataset.manifest import read_manifest
 from ..dataset.pixel_size import PixelSize
+from ..errors import InputError
 from ..job import progress
 from ..products import pictures
 from ..products.files import read_table
@@ -47,10 +48,15 @@ def _rows(path: str | Path | None) -> list[dict[str, str]]:
 
 
 def _record(path: str | Path | None) -> dict[str, Any]:
-    """A JSON file's object; empty if there is no such file."""
+    """A JSON file's object; empty if there is no such file. Raises InputError if it is damaged."""
     if path is None or not Path(path).is_file():
         return {}
-    return json.loads(Path(path).read_text(encoding="utf-8"))
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise InputError(
+            "damaged: it is no JSON", file=path, remedy="delete it and run the workflow again"
+        ) from None
 
 
 def _chosen(names: Sequence[str], most: int) -> set[str]:

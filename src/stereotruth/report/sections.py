@@ -220,7 +220,10 @@ def exact_truth(
 
 
 def quality_gates(record: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The limits of the gates, and the figures of each scene with the gates that it misses."""
+    """The limits of the gates, the figures of each scene with the gates that it misses, doubts.
+
+    And what the images say of the labels of each scene, by surface.
+    """
     scenes = record.get("scenes", {})
     if not scenes:
         return None
@@ -232,6 +235,18 @@ def quality_gates(record: Mapping[str, Any]) -> dict[str, Any] | None:
     return {
         "table": table(rows, list(dict.fromkeys(["scene", "quality", *rows[0]]))),
         "limits": limits,
+        "doubts": [
+            f"{scene}: {doubt['text']}"
+            for scene, found in record.get("doubts", {}).items()
+            for doubt in found
+        ],
+        "surfaces": table(
+            [
+                {"scene": scene, "of": words(of), **{k: str(v) for k, v in figures.items()}}
+                for scene, by in record.get("surfaces", {}).items()
+                for of, figures in by.items()
+            ]
+        ),
     }
 
 

@@ -31,6 +31,8 @@ STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
     "edge_in_pixel": "#2183d5",
     "labelled_between": "#aab1dc",
     "labelled_by_images": "#ffe9b8",
+    "labelled_crown": "#bfe3c0",
+    "too_uncertain": "#3f7d4f",
 }
 
 

@@ -137,13 +137,15 @@ def _ground(s, x, y, slope2):
 
 
 @inlined
-def reflectance(s, sun, view, x, y, z, kind, index, face, zx, zy):
-    """Light that comes back from a surface point, about 0 to 1; ``zx``, ``zy``: slope of ground.
+def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
+    """Light that comes back from a surface point, about 0 to 1.
 
-    ``sun``: the three values of ``s.sun``. ``view``: bits of the objects that are there.
+    ``sun``: the three values of ``s.sun``. ``view``: bits of the objects that are there. ``slope``:
+    that of the ground along x and y.
     """
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == GROUND:
+        zx, zy = slope
         value = _ground(s, x, y, zx * zx + zy * zy)
         if s.ground_look[1] != 1.0:
             value = GROUND_MEAN + s.ground_look[1] * (value - GROUND_MEAN)

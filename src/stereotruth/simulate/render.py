@@ -244,7 +244,7 @@ def _shade_rows(s, above, shown, cam, first_row, out):
                     value = 0.1
                     if kind != NONE:
                         value = reflectance(
-                            s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, zx, zy
+                            s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
                         )
                     out[r0 + k, c0 + n] = value
 

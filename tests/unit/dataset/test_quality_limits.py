@@ -12,9 +12,10 @@ GOOD = {
     "sift_mean_absolute_error_px": 0.3,
     "sift_matches": 500,
     "warp_correlation": 0.97,
+    "agreement": 0.4,
 }
-LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.5)
-NO_LIMITS = Limits(*[None] * 6)
+LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.5, 0.01)
+NO_LIMITS = Limits(*[None] * 7)
 
 
 def test_good_figures_miss_nothing():
@@ -31,6 +32,7 @@ def test_good_figures_miss_nothing():
         ("max_sift_mean_absolute_error_px", 1.2),
         ("min_sift_matches", 9),
         ("min_warp_correlation", 0.2),
+        ("min_agreement", 0.003),
     ],
 )
 def test_each_gate_finds_its_figure_and_can_be_switched_off(gate, value):
@@ -44,7 +46,7 @@ def test_each_gate_finds_its_figure_and_can_be_switched_off(gate, value):
 
 
 def test_limits_are_kept_when_met_exactly_and_absent_figures_miss_nothing():
-    exact = dict(zip(FIGURES.values(), (1.0, -0.5, 0.5, 1.0, 10, 0.5)))
+    exact = dict(zip(FIGURES.values(), (1.0, -0.5, 0.5, 1.0, 10, 0.5, 0.01)))
     assert missed(exact, LIMITS) == []
     assert missed({"sift_matches": 11, "warp_correlation": float("nan")}, LIMITS) == []
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from stereotruth.dataset import label_doubts
 from stereotruth.dataset.settings import Limits
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.dataset.verify import defects
@@ -30,7 +31,7 @@ from ...synthetic.tiled_scene import (
 )
 
 SIZE = 96
-LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9)
+LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9, 0.01)
 
 
 def rough(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
@@ -59,7 +60,7 @@ def made(tmp_path_factory):
         scene = make_scene(folder / "s1", bare_from=240, texture=rough, **planted)
         alignment = folder / "alignment.json"
         rms = {"left": {"rms": {"after": 0.3}}, "right": {"rms": {"after": 0.4}}}
-        alignment.write_text(json.dumps(rms))
+        alignment.write_text(json.dumps({**rms, "warnings": []}))
         scene = scene._replace(alignment=alignment)
         out, matches = folder / "Town", folder / "matches.csv"
         summary = run([scene], out, size=SIZE, quality=LIMITS, matches=matches, workers=2)
@@ -100,6 +101,29 @@ def test_labels_that_are_off_are_flagged(made):
     assert not any("max_y_parallax_px" in row["quality"] for row in labelled(wrong.out))
     assert "max_sift_error_px" in wrong.summary["quality"]["scenes"]["s1"]["quality"]
     assert any("TN_0 (max_sift_error_px" in line for line in summary_lines(wrong.summary, "out"))
+
+
+@pytest.mark.parametrize("planted", [0.0, 0.15])
+def test_a_small_bias_is_a_doubt_that_names_its_amount(tmp_path, monkeypatch, caplog, planted):
+    monkeypatch.setattr(label_doubts, "CELL_PX", 48)  # a scene so small has few of the usual size
+    scene = make_scene(tmp_path / "s1", texture=rough, label_offset=-planted)
+    summary = run([scene], tmp_path / "Town", size=SIZE, quality=LIMITS)
+    lines, quality = summary_lines(summary, "out"), summary["quality"]
+    ground = quality["surfaces"]["s1"]["open_ground"]
+    assert ground["bias_px"] == pytest.approx(planted, abs=0.03)
+    assert ground["standard_error_px"] < 0.03
+    told = [row["doubt"] for row in labelled(tmp_path / "Town")]
+    assert column(tmp_path / "Town", "sift_median_error_px").max() < 0.3  # no limit in px is missed
+    assert any("All labelled pairs are within" in line for line in lines) == (not planted)
+    if not planted:
+        assert (quality["doubts"], set(told)) == ({}, {""})
+        return
+    text = quality["doubts"]["s1"][0]["text"]
+    assert text.startswith("images say +0.1")
+    assert lines[-2] == f"Doubt about s1: {text}"
+    assert set(told) == {text}
+    assert text in caplog.text
+    assert quality["scenes"]["s1"]["quality"] == "min_agreement"
 
 
 def test_rows_that_are_off_are_flagged(made):

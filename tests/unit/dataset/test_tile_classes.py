@@ -16,9 +16,8 @@ def heights(slope: float = 0.0) -> np.ndarray:
 
 
 def kind(codes: np.ndarray, height: np.ndarray, share: float) -> str:
-    return tile_classes.tile_class(
-        codes, height, (slice(0, len(codes)), slice(0, len(codes))), share
-    )
+    here = slice(0, len(codes)), slice(0, len(codes))
+    return tile_classes.Buildings.of_tile(codes, height, here).tile_class(share)
 
 
 def test_class_by_the_classes_of_the_lidar():
@@ -49,5 +48,6 @@ def test_class_by_shape_where_the_lidar_has_no_classes(slope):
     assert found[105:135, 55:105].mean() > 0.9  # of which 5 % are not known
     assert kind(unknown, houses, 0.02) == "building"
     corner = slice(60, 100), slice(20, 60)  # the house is beside it
-    assert tile_classes.tile_class(unknown[corner], houses, corner, 0.02) == "vegetation"
+    beside = tile_classes.Buildings.of_tile(unknown[corner], houses, corner)
+    assert beside.tile_class(0.02) == "vegetation"
     assert not tile_classes.buildings_by_shape(np.full((50, 50), np.nan)).any()

@@ -12,7 +12,6 @@ import pytest
 import zarr
 
 import stereotruth.disparity.label_window as module
-from stereotruth.alignment.aligned_pair import Alignment, ViewFit
 from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
@@ -28,9 +27,9 @@ from stereotruth.products.grids import open_grid
 
 from ...synthetic.box_scene import (
     ROOF,
-    SIZE,
     UTM,
     Scene,
+    alignment_of,
     dilated,
     hidden_truth,
     project_with,
@@ -435,24 +434,7 @@ def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box, monkeypatch) -
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path, view) -> None:
     """Added in squares to that of the points; nothing else of the labels follows from it."""
-    sensors = plane.model.left, plane.model.right
-    fits = [
-        ViewFit(
-            view=name,
-            image=f"{name}.tif",
-            size=SIZE,
-            affine=np.array(sensor.affine),
-            gcps=(),
-            sigma0=np.nan,
-            redundancy=0,
-            origin=(SIZE[0] / 2, SIZE[1] / 2),
-            scale=100.0,
-            covariance=np.diag([0.01, 0.0, 0.04, 0.0, 0.01, 0.04]) ** 2
-            * (4 if name == view else 1),
-        )
-        for name, sensor in zip(("left", "right"), sensors)
-    ]
-    alignment = Alignment("S-1", "affine", *sensors, *fits, HEIGHT, (), {})
+    alignment = alignment_of(plane.model, 1.0, view)
     alignment.save(tmp_path / "alignment.json")
     plain, grid = (
         plane.project(f"{view}-{k}.zarr", view=view, **options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from stereotruth.job import dask_scheduler
 from stereotruth.lidar.point_store import ATTRIBUTES
 from stereotruth.products.grids import Strip
 
-from ...synthetic.box_scene import Scene, project_with, write_image, write_points
+from ...synthetic.box_scene import Scene, alignment_of, project_with, write_image, write_points
 from ...synthetic.stores import tree
 
 
@@ -81,6 +82,22 @@ def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
     shutil.rmtree(scene.images[0])
     name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
     assert project(scene, [scene.store], out) == everything
+
+
+def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_path):
+    """And what else its file says makes no block anew."""
+    out, file = tmp_path / "out.zarr", tmp_path / "alignment.json"
+    known = {}
+    for factor in (1.0, 3.0):
+        alignment = alignment_of(scene.model, factor)
+        alignment.save(file)
+        assert project(scene, [scene.store], out, alignment=file)
+        known[factor] = {name: array[:] for name, array in zarr.open_group(out).arrays()}
+        replace(alignment, warnings=("a doubt",)).save(file)
+        assert project(scene, [scene.store], out, alignment=file) == set()
+    for name, array in known[1.0].items():
+        assert np.array_equal(array, known[3.0][name], equal_nan=True) == (name != "uncertainty")
+    assert np.nanmin(known[3.0]["uncertainty"] - known[1.0]["uncertainty"]) > 0.01
 
 
 def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):

@@ -46,7 +46,7 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
         "share_of_pixels": {"labelled": 0.829, "no_points": 0.171},
         "disparity_px": {"min": -5.5, "max": 33.3},
         "disparity_rounding": {"largest_px": 0.0005},
-        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}},
+        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}, "doubts": {}},
     }
     said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
     found = cards({"A-1": SCENE})
@@ -87,3 +87,10 @@ def test_density_is_that_of_the_scenes():
     dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
     assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
     assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"
+
+
+def test_a_doubt_stands_with_the_gates():
+    quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
+    (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "quality gates")
+    assert gates.bad
+    assert "images and labels disagree in A-1" in gates.note

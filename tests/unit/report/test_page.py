@@ -220,6 +220,23 @@ def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
     assert "and S-1 as a whole" in text
 
 
+def test_doubts_and_what_the_images_say_by_surface_are_listed(tmp_path):
+    write_city(tmp_path / "tiles", 1, quality=["ok", ""])
+    text = "images say +0.15 ± 0.02 px of the labels of roofs, more than the 0.01 px that …"
+    record = {
+        "scenes": {"S-1": {"agreement": 0.0001, "quality": "min_agreement"}},
+        "doubts": {"S-1": [{"of": "roofs", "text": text, "explained_by_alignment": False}]},
+        "surfaces": {"S-1": {"roofs": {"matches": 400, "bias_px": 0.1512}}},
+    }
+    (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
+    page.write_report("City", tmp_path / "tiles", tmp_path / "index.html")
+    section = re.search(
+        r'<section id="quality">.*?</section>', (tmp_path / "index.html").read_text(), re.DOTALL
+    )[0]
+    assert f"<li>S-1: {text}</li>" in section
+    assert re.findall(r"<td[^>]*>(.*?)</td>", section)[-4:] == ["S-1", "roofs", "400", "0.151"]
+
+
 def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path):
     write_city(tmp_path / "tiles", 2)
     page.write_report(

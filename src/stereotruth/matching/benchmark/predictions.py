@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
-from ...errors import InputError
+from ...errors import InputError, without_secrets
 from ...job import progress
 from ...products.files import link, whole_folder
 from ...products.finished_pieces import Ledger
@@ -117,7 +117,10 @@ def predict(
         "dataset": dataset.name,
         "split": split,
         "method": name,
-        "settings": dict(settings),
+        "settings": {
+            key: without_secrets(value) if isinstance(value, str) else value
+            for key, value in settings.items()
+        },
         "identity": identity(settings, files, code),
         "machine": machine(),
         "disparity_range": list(dataset.disparity_range),

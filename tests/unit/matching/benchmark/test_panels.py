@@ -29,3 +29,14 @@ def test_pictures_without_truth_have_no_errors(tmp_path):
     draw_columns(tmp_path / "b.png", columns, across=True)
     tall, wide = (cv2.imread(str(tmp_path / f"{n}.png")).shape for n in "ab")
     assert tall[0] > tall[1] and wide[1] > wide[0]
+
+
+@pytest.mark.parametrize("name", [r"$\frac$", "$a_{", "a$b"])
+def test_names_are_no_formulas(tmp_path, name):
+    """Of pairs and of methods; Matplotlib would end with an error."""
+    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
+    flat = np.full((8, 8), 3.0, np.float32)
+    for across in (False, True):
+        column = Column(name, image, image, flat, {name: flat})
+        draw_columns(tmp_path / "a.png", [column], across=across)
+        assert cv2.imread(str(tmp_path / "a.png")) is not None

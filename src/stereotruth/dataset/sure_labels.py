@@ -1,0 +1,64 @@
+"""Labels of a scene that go into its tiles: those of rough surfaces only if they are sure enough.
+
+A disparity store holds all labels. A tile's pixel whose label is left out has no disparity and the
+status ``too_uncertain``, which occurs in tiles alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+CROWN = "labelled_crown"
+TOO_UNCERTAIN, NAME = 13, "too_uncertain"
+
+
+@dataclass(frozen=True, eq=False)
+class SureLabels:
+    """The array ``name`` of a disparity store, as the tiles have it; sliced as a Zarr array is.
+
+    ``crown``: the status of rough surfaces, of whose labels those with an uncertainty above
+    ``limit`` px are left out.
+    """
+
+    store: zarr.Group
+    name: str
+    crown: int
+    limit: float
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, cols)."""
+        return self.store[self.name].shape
+
+    def __getitem__(self, key: Any) -> NDArray[Any]:
+        values = np.array(self.store[self.name][key])
+        doubtful = self.store["status"][key] == self.crown
+        if doubtful.any():
+            doubtful &= ~(self.store["uncertainty"][key] <= self.limit)
+            values[doubtful] = TOO_UNCERTAIN if self.name == "status" else np.nan
+        return values
+
+
+Labels = zarr.Array | SureLabels
+
+
+def tile_labels(store: zarr.Group, flags: Mapping[int, str], limit: float) -> dict[str, Labels]:
+    """``disparity`` and ``status`` of a store as its tiles have them; ``flags``: names of its
+    status values."""
+    crown = next((value for value, name in flags.items() if name == CROWN), None)
+    names = "disparity", "status"
+    if crown is None:
+        return {name: store[name] for name in names}
+    return {name: SureLabels(store, name, crown, limit) for name in names}
+
+
+def tile_flags(flags: Mapping[int, str]) -> dict[int, str]:
+    """Names of the status values of tiles, from those of their store."""
+    more = {TOO_UNCERTAIN: NAME} if CROWN in flags.values() else {}
+    return dict(flags) | more

@@ -1,0 +1,76 @@
+"""Objects that are deleted or replaced in a bucket (fsspec's in memory): the next plan sees it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from stereotruth.products.records import read_record, write_record
+from stereotruth.products.stored_states import StoredStates
+
+COPIES = Path(".snakemake/storage/memory")
+
+
+@pytest.fixture
+def stored(tmp_path, monkeypatch):
+    """Three products, each made of the one before; what the bucket holds of them is kept."""
+    monkeypatch.chdir(tmp_path)
+    place = f"bucket/{tmp_path.name}"
+    storage = fsspec.filesystem("memory")
+    names = ("results/left.zarr", "results/labels.zarr", "tiles/A")
+    products = [str(COPIES / place / name) for name in names]
+    for before, product, name in zip([None, *products], products, names):
+        for chunk in ("a", "b"):
+            storage.pipe_file(f"/{place}/{name}/{chunk}", f"{name} {chunk}".encode())
+        inputs = {"gcps.csv": "0"} if before is None else {before: "0"}
+        write_record(product, {"made": "", "run": "1", "outputs": [product], "inputs": inputs})
+    states = StoredStates(f"memory://{place}", COPIES)
+    states.keep("1")
+    return states, storage, f"/{place}", products
+
+
+def made(products):
+    return [read_record(product)["made"] != "" for product in products]
+
+
+def test_what_is_as_it_was_stays(stored):
+    states, _, _, products = stored
+    assert states.mark_changed() == []
+    assert made(products) == [False, False, False]
+
+
+@pytest.mark.parametrize("how", ["deleted", "replaced", "added", "emptied"])
+def test_what_was_touched_is_made_again_with_what_follows(stored, how):
+    states, storage, place, products = stored
+    folder = f"{place}/results/labels.zarr"
+    if how == "deleted":
+        storage.rm_file(f"{folder}/a")
+    elif how == "emptied":
+        storage.rm(folder, recursive=True)
+    else:
+        storage.pipe_file(f"{folder}/{'a' if how == 'replaced' else 'c'}", b"of somebody else")
+    assert states.mark_changed() == [products[1]]
+    assert made(products) == [False, True, True]
+    states.keep("2")  # of a run that has failed before it made anything
+    assert states.mark_changed() == [products[1]]
+    for product in products[1:]:  # of one that was killed when it had
+        write_record(product, read_record(product) | {"made": "", "run": "3"})
+    assert states.mark_changed() == []
+    for chunk in "ab":
+        storage.pipe_file(f"{folder}/{chunk}", b"made again")
+    states.keep("3")
+    assert states.mark_changed() == []
+    assert made(products) == [False, False, False]
+    storage.pipe_file(f"{place}/tiles/A/b", b"of somebody else")
+    assert states.mark_changed() == [products[2]]
+
+
+def test_a_damaged_record_of_the_states_is_as_none(stored):
+    states, storage, place, products = stored
+    storage.pipe_file(f"{place}/.records/stored.json", b"{")
+    assert states.mark_changed() == []
+    storage.rm_file(f"{place}/.records/stored.json")
+    assert states.mark_changed() == []
+    assert made(products) == [False, False, False]
