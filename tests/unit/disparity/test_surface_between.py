@@ -142,8 +142,6 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(poro
         variance=zeros,
         height=zeros,
         surface_class=zeros.astype(np.uint8),
-        highest=level,
-        rough=zeros.astype(bool),
         bulging=np.arange(8) + zeros == 5,
         places=None,
     )
