@@ -39,8 +39,9 @@ TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1
     0.5: (90.5, 0.2, 0.03),
     0.25: (88, 0.3, 0.05),
 }
+RECIPES = ("surface", "paper")
 TABLES = ("errors", "edges", "surfaces")
-Run = tuple[str, str, str]  # scene, condition, fill
+Run = tuple[str, str, str]  # scene, condition, recipe
 
 
 def block_of(pair: Pair, condition: str, options: argparse.Namespace) -> Block:
@@ -63,40 +64,40 @@ def looks(block: Block) -> str:
 
 
 def labelled(options: argparse.Namespace) -> dict[Run, dict[float, Figures]]:
-    """Labels of every scene under every condition by every fill, by density, and their truth."""
+    """Labels of every scene under every condition by every recipe, by density, and their truth."""
     found: dict[Run, dict[float, Figures]] = defaultdict(dict)
     fresh = [fresh_pair(number + 1, options.folder) for number in range(options.fresh)]
     for pair in [*(made_pair(scene, options.results) for scene in options.scenes), *fresh]:
         for condition in options.conditions:
             block = block_of(pair, condition, options)
             print(f"{pair.name}, {condition}: {looks(block)}", flush=True)
-            for fill in options.fill:
+            for recipe in options.recipe:
                 for target in options.densities:
-                    job = block.job(target, fill)
+                    job = block.job(target, recipe)
                     block.compile(job)
                     start = time.process_time()
                     layers = block.labels(job)
                     took = (time.process_time() - start) / block.megapixels
                     figures = Figures.of(block, layers)
-                    found[pair.name, condition, fill][target] = figures
+                    found[pair.name, condition, recipe][target] = figures
                     said = f"{shown(shares(figures.counts))}, {took:.1f} s/Mpx"
-                    print(f"  {fill}, {target:g} points/m²: {said}", flush=True)
+                    print(f"  {recipe}, {target:g} points/m²: {said}", flush=True)
     return found
 
 
 def print_shares(found: dict[Run, dict[float, Figures]], densities: Sequence[float]) -> None:
     """Visible / hidden labelled / off, by scene and density, and over the scenes."""
-    columns = ["pair", "condition", "fill", *(f"{d:g}" for d in densities)]
+    columns = ["pair", "condition", "recipe", *(f"{d:g}" for d in densities)]
     rows = []
     for run, by in found.items():
         rows.append([*run, *(shown(shares(by[d].counts)) for d in densities)])
-    for condition, fill in dict.fromkeys(run[1:] for run in found):
-        of = [by for run, by in found.items() if run[1:] == (condition, fill)]
+    for condition, recipe in dict.fromkeys(run[1:] for run in found):
+        of = [by for run, by in found.items() if run[1:] == (condition, recipe)]
         if len(of) < 2:
             continue
         both = [spread([shares(by[d].counts) for by in of]) for d in densities]
         for name, cells in zip(("median", "range"), zip(*both)):
-            rows.append([f"{name} of {len(of)}", condition, fill, *cells])
+            rows.append([f"{name} of {len(of)}", condition, recipe, *cells])
     rows.append(["asked for", "", "", *(shown(TARGETS.get(d, ())) for d in densities)])
     title = "Visible labelled / hidden labelled / off by more than 1 px, %, by points/m²"
     print_table(title, columns, rows)
@@ -115,7 +116,7 @@ def print_errors(found: dict[Run, dict[float, Figures]]) -> None:
                 cover = f"{f['< 1 sigma']:.1f} / {f['< 2 sigma']:.1f}"
                 sizes = f"{f['mean absolute']:.4f}", f"{f['median']:+.4f}"
                 rows.append([*run, f"{target:g}", kind, f"{f['share']:.1f}", *sizes, cover])
-    columns = ["pair", "condition", "fill", "points/m²", "labels", "of visible, %"]
+    columns = ["pair", "condition", "recipe", "points/m²", "labels", "of visible, %"]
     columns += ["mean abs, px", "median, px", "< 1 / 2 sigma, %"]
     print_table("Errors of labels on visible pixels, by kind", columns, rows)
 
@@ -123,12 +124,12 @@ def print_errors(found: dict[Run, dict[float, Figures]]) -> None:
 def print_edges(found: dict[Run, dict[float, Figures]]) -> None:
     """Shares by distance from the nearest edge and by surface, all pairs together."""
     sums: dict[tuple, dict[tuple[str, str], list]] = defaultdict(lambda: defaultdict(list))
-    for (_, condition, fill), by in found.items():
+    for (_, condition, recipe), by in found.items():
         for target, figures in by.items():
             for place, counts in figures.rings.items():
-                sums[condition, fill, target][place].append(counts)
+                sums[condition, recipe, target][place].append(counts)
     surfaces = list(dict.fromkeys(("all", *SURFACES.values())))
-    for (condition, fill, target), places in sums.items():
+    for (condition, recipe, target), places in sums.items():
         total = {place: sum(counts) for place, counts in places.items()}
         visible = sum(total["all", name][0] for name in rings(total)[: len(DISTANCES_PX)])
         rows = [
@@ -136,7 +137,7 @@ def print_edges(found: dict[Run, dict[float, Figures]]) -> None:
             + [shown(shares(total[of, name])) for of in surfaces]
             for name in rings(total)
         ]
-        title = f"By distance from the nearest edge: {condition}, {fill}, {target:g} points/m²"
+        title = f"By distance from the nearest edge: {condition}, {recipe}, {target:g} points/m²"
         columns = ["px", "of visible, %", *surfaces]
         print_table(f"{title} (visible / hidden / off, %)", columns, rows)
 
@@ -185,7 +186,7 @@ def as_json(found: dict[Run, dict[float, Figures]]) -> list[dict]:
     """All figures."""
     names = ("visible labelled, %", "hidden labelled, %", "off, %")
     return [
-        {"pair": run[0], "condition": run[1], "fill": run[2], "points/m2": target}
+        {"pair": run[0], "condition": run[1], "recipe": run[2], "points/m2": target}
         | dict(zip(names, shares(figures.counts)))
         | {"hidden in the LiDAR's world, too, labelled, %": figures.hidden_in_both}
         | {"errors": figures.errors, "surfaces": figures.surfaces}
@@ -204,7 +205,7 @@ def main() -> None:
     )
     parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=["plain"])
     parser.add_argument("--densities", type=float, nargs="+", default=list(TARGETS))
-    parser.add_argument("--fill", nargs="+", default=["surface"])
+    parser.add_argument("--recipe", nargs="+", choices=RECIPES, default=["surface"])
     parser.add_argument("--first", type=int, nargs=2, help="row, column; default: in the middle")
     parser.add_argument("--size", type=int, default=1024, help="px; 0: to the end of the grid")
     parser.add_argument("--view", choices=("left", "right"), default="left")

@@ -22,7 +22,6 @@ SURFACES = {"ground": "ground", "roof": "roof and wall", "wall": "roof and wall"
 KINDS = {
     "measured": Status.LABELLED,
     "between": Status.LABELLED_BETWEEN,
-    "by images": Status.LABELLED_BY_IMAGES,
     "crown": Status.LABELLED_CROWN,
 }
 Bools = NDArray[np.bool_]

@@ -95,9 +95,9 @@ class Block:
         """Its size."""
         return self.surface.size / 1e6
 
-    def job(self, points_per_m2: float | None, fill: str, method: str = "both") -> SceneInputs:
+    def job(self, points_per_m2: float | None, recipe: str = "surface") -> SceneInputs:
         """What labels the block; ``points_per_m2`` None, or more than there are: all points."""
-        settings = Settings(method=method, fill=fill)
+        settings = Settings(recipe=recipe)
         images = (self.rectified / f"{view}.zarr" for view in ("left", "right"))
         alignment = self.pair.alignment(self.rectified)
         job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)

@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="left.tif, right.tif, two CSV files, lidar/")
     parser.add_argument("--every", type=int, nargs="+", default=[1, 4, 16])
-    parser.add_argument("--fill", nargs="+", default=["surface"])
+    parser.add_argument("--recipe", nargs="+", choices=("surface", "paper"), default=["surface"])
     parser.add_argument("--folder", type=Path, default=Path("results/thinned_scene"))
     options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
@@ -58,21 +58,21 @@ def main() -> None:
     for every in options.every:
         stores = thinned(options.scene, every, options.folder)
         pair = rectified(options.scene, stores, options.folder / f"every_{every}_pair")
-        for fill in options.fill:
-            store = options.folder / f"every_{every}_{fill}.zarr"
+        for recipe in options.recipe:
+            store = options.folder / f"every_{every}_{recipe}.zarr"
             project_scene(
                 *(pair / f"{view}.zarr" for view in VIEWS),
                 stores,
                 store,
-                Settings(fill=fill),
+                Settings(recipe=recipe),
                 alignment=pair / "alignment.json",
                 code=source_digest("disparity.project"),
             )
             f = evaluate_checkpoints(store, options.scene / "checkpoints.csv")
             share = 100.0 * f["labelled"] / f["points"]
             cells = [f"{f['median']:+.3f}", f"{f['nmad']:.3f}", f"{f['y_parallax_rms']:.3f}"]
-            rows.append([str(every), fill, shown([share]), *cells])
-    columns = ["every", "fill", "check points labelled, %", "median, px", "NMAD, px"]
+            rows.append([str(every), recipe, shown([share]), *cells])
+    columns = ["every", "recipe", "check points labelled, %", "median, px", "NMAD, px"]
     print_table("Labels less check points", [*columns, "y-parallax rms, px"], rows)
 
 

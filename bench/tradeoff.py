@@ -1,4 +1,4 @@
-"""Visible against hidden pixels labelled, over thresholds of the correlation filter.
+"""Visible against hidden pixels labelled by both recipes, over thresholds of the correlation.
 
 One command, a table and a figure; see README.md beside this file.
 """
@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -45,15 +46,7 @@ from stereotruth.products.pictures import SERIES
 from stereotruth.products.provenance import source_digest
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)
-# name: occlusion method, representative, thresholds of the correlation (None: it takes none)
-WAYS: dict[str, tuple[str, str, tuple[float | None, ...]]] = {
-    "paper's filter, paper's point": ("correlation", "paper", THRESHOLDS),
-    "paper's filter, top surface": ("correlation", "top", (0.5, 0.8)),
-    "both, top surface": ("both", "top", THRESHOLDS),
-    "geometric, top surface": ("geometric", "top", (None,)),
-}
-STYLES = ("o-", "s", "o-", "*")
-COLOURS = ("#8a8a8a", *SERIES[:2], "#000000")
+COLOURS = {"paper": "#8a8a8a", "surface": SERIES[0]}  # of the recipes
 Window = tuple[slice, slice]
 Rows = list[dict[str, Any]]
 
@@ -96,32 +89,29 @@ def measure(
 def rows_of_city(
     scenes: Sequence[Made], config: Mapping[str, Any], arguments: argparse.Namespace
 ) -> Rows:
-    """A row for each way and threshold, all scenes of a city together."""
-    found: dict[tuple[str, float | None], ByClass] = {}
+    """A row for each recipe and threshold, all scenes of a city together."""
+    found: dict[tuple[str, float], ByClass] = {}
     for made in scenes:
         made.exact.mkdir(parents=True, exist_ok=True)
         truth = made.truth(made.exact, made.disparity, arguments.workers)
         windows = fullest(truth, arguments.blocks)
-        for way, (method, representative, thresholds) in WAYS.items():
-            for threshold in thresholds:
-                settings = asdict(Settings.of(config)) | {"fill": "none"}
-                settings |= {"method": method, "representative": representative}
-                if threshold is not None:
-                    settings["correlation_threshold"] = threshold
-                part = measure(made, windows, truth, settings, arguments.workers)
-                found.setdefault((way, threshold), ByClass()).merge(part)
+        for recipe, threshold in product(COLOURS, THRESHOLDS):
+            settings = asdict(Settings.of(config))
+            settings |= {"recipe": recipe, "correlation_threshold": threshold}
+            part = measure(made, windows, truth, settings, arguments.workers)
+            found.setdefault((recipe, threshold), ByClass()).merge(part)
     return [
-        {"city": scenes[0].scene.city, "way": way, "threshold": threshold}
-        | truth_row(way, part.total)
-        for (way, threshold), part in found.items()
+        {"city": scenes[0].scene.city, "recipe": recipe, "threshold": threshold}
+        | truth_row(recipe, part.total)
+        for (recipe, threshold), part in found.items()
     ]
 
 
 def shown(row: Mapping[str, Any]) -> dict[str, str]:
     return {
         "city": row["city"],
-        "way": row["way"],
-        "threshold": "–" if row["threshold"] is None else f"{row['threshold']:g}",
+        "recipe": row["recipe"],
+        "threshold": f"{row['threshold']:g}",
         "visible labelled": share(row["visible"]),
         "hidden labelled": share(row["hidden"]),
         "in LiDAR only": share(row["in_lidar_only"]),
@@ -139,14 +129,13 @@ def draw(rows: Rows, path: Path) -> None:
     axes = np.ravel(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False))
     for ax, city in zip(axes, cities):
         ax.fill_between([0.1, 1], 98.5, 100, color="0.8", alpha=0.6, lw=0, label="aim")
-        for way, style, colour in zip(WAYS, STYLES, COLOURS):
-            here = [row for row in rows if row["city"] == city and row["way"] == way]
+        for recipe, colour in COLOURS.items():
+            here = [row for row in rows if row["city"] == city and row["recipe"] == recipe]
             x, y = (100 * np.array([row[key] for row in here]) for key in ("hidden", "visible"))
-            size = 11 if style == "*" else 4
-            ax.plot(x, y, style, color=colour, ms=size, lw=1.3, label=way)
+            ax.plot(x, y, "o-", color=colour, ms=4, lw=1.3, label=recipe)
             for row, at_x, at_y in zip(here, x, y):
-                # the points of "both" lie close together: its last one only
-                if style == "o-" and (colour == COLOURS[0] or row["threshold"] == THRESHOLDS[-1]):
+                # the points of surface lie close together: its last one only
+                if recipe == "paper" or row["threshold"] == THRESHOLDS[-1]:
                     ax.annotate(
                         f"{row['threshold']:g}", (at_x, at_y), (3, -8),
                         textcoords="offset points", fontsize=6, color=colour, annotation_clip=True,
@@ -197,7 +186,7 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print_table("Labelled pixels, by way and threshold of the correlation", [*map(shown, rows)])
+    print_table("Labelled pixels, by recipe and threshold of the correlation", [*map(shown, rows)])
     if arguments.figure and rows:
         draw(rows, arguments.figure)
     return 0

@@ -19,8 +19,9 @@ from pydantic import Field
 
 from .alignment.settings import Settings as Alignment
 from .dataset.settings import Dataset, Evaluation, Limits, Tiles
-from .disparity.settings import Occlusion, Project
+from .disparity.settings import Project
 from .epipolar.settings import Settings as Rectify
+from .errors import InputError
 from .evaluation.audit.settings import Settings as Audit
 from .lidar.settings import Settings as Ingest
 from .matching.benchmark.settings import Settings as Benchmark
@@ -33,6 +34,18 @@ from .sheets import City, Scene
 from .simulate.settings import Settings as Simulate
 
 Strips = Annotated[Whole, Field(ge=1, le=1000)]
+
+
+REPLACED = {
+    "occlusion.method": "project.recipe: surface takes the place of both, paper that of "
+    "correlation; there is nothing in place of geometric and none",
+    "occlusion.window": "it is project.window now",
+    "occlusion.correlation_threshold": "it is project.correlation_threshold now",
+    "project.representative": "project.recipe: surface takes the place of top, paper that of paper",
+    "project.fill": "project.recipe: surface labels pixels between points; there is nothing in "
+    "place of none (drop the status labelled_between) and of surface_and_images",
+}
+"""Keys of earlier versions, and what takes their place."""
 
 
 @settings
@@ -66,7 +79,6 @@ class Configuration:
     ingest: Ingest = field(default_factory=Ingest)
     alignment: Alignment = field(default_factory=Alignment)
     rectify: Rectify = field(default_factory=Rectify)
-    occlusion: Occlusion = field(default_factory=Occlusion)
     project: Project = field(default_factory=Project)
     tiles: Tiles = field(default_factory=Tiles)
     evaluation: Evaluation = field(default_factory=Evaluation)
@@ -92,7 +104,17 @@ class Configuration:
     @classmethod
     def of(cls, config: Mapping[str, Any], file: str | Path = "config") -> Configuration:
         """What the user wrote. Raises InputError that names ``file`` and the first wrong key."""
+        _refuse_replaced(config, file)
         return check(config, cls, file)
+
+
+def _refuse_replaced(config: Mapping[str, Any], file: str | Path) -> None:
+    """Raise InputError that names the first key of REPLACED which is given."""
+    for name, remedy in REPLACED.items():
+        section, key = name.split(".")
+        given = config.get(section)
+        if isinstance(given, Mapping) and key in given:
+            raise InputError(f"{name}: there is no such key any more", file=file, remedy=remedy)
 
 
 BELOW = ("training", "benchmark.methods")  # have tables of their own

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from stereotruth import sheets
-from stereotruth.configuration import Configuration, with_tables
+from stereotruth.configuration import REPLACED, Configuration, with_tables
 from stereotruth.errors import InputError
 from stereotruth.settings_text import fields_of, nested
 
@@ -90,9 +90,29 @@ def test_an_unknown_key_is_refused_with_a_guess():
 
 def test_a_value_out_of_range_is_refused_with_its_meaning():
     config = default_config()
-    config["occlusion"]["window"] = 8
-    with pytest.raises(InputError, match=r"occlusion.window.*odd"):
+    config["project"]["window"] = 8
+    with pytest.raises(InputError, match=r"project.window.*odd"):
         Configuration.of(config)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "remedy"),
+    [
+        ("occlusion.method", "geometric", "project.recipe: surface"),
+        ("occlusion.window", 9, "project.window"),
+        ("occlusion.correlation_threshold", 0.5, "project.correlation_threshold"),
+        ("project.representative", "top", "project.recipe: surface"),
+        ("project.fill", "surface_and_images", "project.recipe: surface"),
+    ],
+)
+def test_a_key_of_earlier_versions_is_refused_with_what_takes_its_place(path, value, remedy):
+    assert path in REPLACED
+    with pytest.raises(InputError) as refusal:
+        Configuration.of(with_key(path, value), "mine.yaml")
+    assert f"mine.yaml: {path}" in str(refusal.value)
+    assert remedy in refusal.value.remedy
+    section, key = path.split(".")
+    assert not hasattr(getattr(Configuration(), section, None), key), "replaced and known"
 
 
 def default_config() -> dict:
@@ -160,8 +180,8 @@ MINE = {"root": "mine", "layout": "whu", "disparity_range": [-64, 64]}
         ("strict", "yes", ["strict: 'yes'", "true, false"]),
         ("tiles.stride", "z", ["tiles.stride: 'z'", "px, null"]),
         ("tiles.min_labelled", 1.5, ["tiles.min_labelled: 1.5", "share, 0 … 1"]),
-        ("occlusion.window", 33, ["33 should be less than or equal to 31", "odd, 3 … 31"]),
-        ("occlusion.method", "bth", ["'bth'", "correlation, geometric, both, none"]),
+        ("project.window", 33, ["33 should be less than or equal to 31", "odd, 3 … 31"]),
+        ("project.recipe", "papr", ["'papr'", "surface, paper"]),
         ("ingest.drop_classes", [300], ["ingest.drop_classes.0: 300"]),
         ("ingest.drop_classes", [7, 7], ["ingest.drop_classes", "a value twice"]),
         ("alignment.fixed", {"S-1": 3}, ["alignment.fixed.S-1: 3", "scene: path"]),

@@ -16,8 +16,7 @@ KEYS: dict[str, tuple[str, ...]] = {
     "seed": (),
     "ingest": ("drop_classes",),
     "alignment": ("model", "refine"),
-    "occlusion": ("method",),
-    "project": ("fill", "min_points_per_px", "right_view"),
+    "project": ("recipe", "min_points_per_px", "right_view"),
     "tiles": ("size", "stride", "min_labelled", "disparity_dtype"),
     "quality": ("max_gcp_rms_px", "max_y_parallax_px", "max_sift_error_px"),
 }

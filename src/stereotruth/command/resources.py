@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 INGEST_POINT = 0.49e-6
 PROJECT_POINT = 0.47e-6
 RECTIFY_PX = 0.3e-6  # both images
-PROJECT_PX = {"none": 6e-6, "surface": 6e-6, "surface_and_images": 8e-6}  # of covered ones
+PROJECT_PX = 6e-6  # of covered ones
 EXPORT_PX = 0.9e-6
 TILE = 4.0  # a labelled tile of 1024 px: SIFT matches, warping
 SCENE = 60.0  # refinement
@@ -41,7 +41,7 @@ def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found:
     seconds = (
         (INGEST_POINT + PROJECT_POINT) * points
         + RECTIFY_PX * pixels
-        + PROJECT_PX[settings.project.fill] * covered
+        + PROJECT_PX * covered
         + EXPORT_PX * pixels
         + TILE * covered / 2**20
         + SCENE * len(facts)

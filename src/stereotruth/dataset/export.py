@@ -75,7 +75,7 @@ def _refuse_empty(
     if sparse:
         sparse = (
             f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
-            "project.fill: surface, the default, labels pixels between them"
+            "project.recipe: surface, the default, labels pixels between them"
         )
     told = "; ".join(
         f"the alignment of scene {source.scene} is in doubt: {doubt}"

@@ -1,17 +1,10 @@
 """The labels of one window of the left epipolar grid, and why its other pixels have none.
 
-With the methods ``both`` and ``geometric``, the surface of the points tells what each pixel's
-centre shows and what hides it in either view (:mod:`.surface_between`); a pixel whose own points on
-the surface that its centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured,
-others are between points (``fill``). Then (``both``): do the images agree with what the LiDAR has
-there, and is it no water (:class:`.image_agreement.Agreement`)? The images may tell the surface of
-pixels that stay open (:mod:`.open_pixels`). Of rough surfaces the rest is labelled as far as both
-cameras must see it (:mod:`.crowns`).
-
-With ``correlation`` (the paper's filter, :func:`.paper_correlation.correlate`) and ``none`` a pixel
-has the status of that of its points that got furthest: does it lie in both frames; is it on the
-surface that the centre sees (representative ``top``); do the image windows around it correlate;
-is an edge of its surface near the centre (``top``); are there ``min_points``.
+With the recipe ``surface``, the surface of the points tells what each pixel's centre shows and what
+hides it in either view (:mod:`.surface_between`). A pixel whose own points on the surface that its
+centre sees (:func:`.seen_surface.seen_surface`) agree with it is measured, others are between
+points. Then: do the images agree with what the LiDAR has XX
+With the recipe ``paper`` labels are those of :mod:`.paper_recipe`.
 """
 
 from __future__ import annotations
@@ -29,24 +22,15 @@ from .ground_in_view import GroundInView
 from .image_agreement import Agreement, apart_from_steps, warp_to_left
 from .image_patches import USABLE, Patch, read_patch
 from .local_projection import LocalProjection
-from .open_pixels import surfaces_by_images
-from .paper_correlation import correlate
-from .pixel_labels import Labels, Pixels, at_centres, at_points, condense
+from .paper_recipe import paper_labels
+from .pixel_labels import Labels, Pixels, at_centres, condense
 from .pixel_points import Collection, PixelPoints
 from .point_windows import Box, Reach
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX, seen_surface
-from .settings import Settings
 from .smooth_triangles import ground_surface
 from .status import WATER_CLASS, Status, is_labelled
-from .surface_between import (
-    STEP_IN_LEFT,
-    STEP_IN_RIGHT,
-    Between,
-    between_labels,
-    surface_between,
-    usable_at,
-)
+from .surface_between import between_labels, surface_between, usable_at
 from .vertices import VertexBuilder, Vertices
 
 Floats = NDArray[np.float64]
@@ -79,20 +63,8 @@ def label_window(
     points, local, vertices = found
     if vertices is not None:
         return _on_surface(scene, points, local, vertices, left, right, wide)
-    use, edge = np.ones(points.points.size, dtype=np.bool_), None
-    if settings.representative == "top":
-        use, edge = seen_surface(points, settings.edge_margin_px)
-    seen, correlation = use, None
-    if settings.method == "correlation":
-        correlation = correlate(points, use, left, right, settings.window)
-        use = use & (correlation >= settings.correlation_threshold)
-    pixels = condense(scene.pair.model, local, points, use, correlation, settings.representative)
-    status = _test_points(settings, points, seen, pixels)
-    if edge is not None:
-        status[(status == Status.LABELLED) & edge] = Status.EDGE_IN_PIXEL
-    labels = _labels(scene, pixels, status == Status.LABELLED, wide)
-    few = (status == Status.LABELLED) & (pixels.count < settings.min_points)
-    status[few] = Status.BELOW_MINIMUM_COUNT
+    model, px_per_m = scene.pair.model, scene.rays.px_per_m
+    pixels, labels, status = paper_labels(settings, model, points, left, right, px_per_m)
     layers = _layers(scene, pixels, labels, pixels.correlation, status, wide)
     return layers, _counts(points, pixels, status, margin)
 
@@ -106,48 +78,36 @@ def _on_surface(
     right: Patch,
     wide: Window,
 ) -> tuple[dict[str, NDArray], NDArray[np.int64]]:
-    """As :func:`label_window`, by the surface of the points."""
+    """As :func:`label_window`, by the recipe surface."""
     settings, px_per_m = scene.settings, scene.rays.px_per_m
     first = wide[0].start, wide[1].start
     use, edge = seen_surface(points, settings.edge_margin_px)
-    pixels = condense(scene.pair.model, local, points, use, None, settings.representative)
-    enough = pixels.count >= max(settings.min_points, 1)
-    own = _labels(scene, pixels, enough, wide)
+    pixels = condense(points, use, lambda sums, _: local.at_means(sums))
+    own = at_centres(pixels, pixels.count >= settings.min_points, first, px_per_m)
     cell = scene.rays.cell
     view = GroundInView.of(vertices, scene.scale.width, local, first, points.shape, cell)
     surface = ground_surface(vertices, scene.scale, px_per_m, cell, view)
     between = surface_between(surface, local, first, points.shape, px_per_m)
-    paper = settings.representative == "paper"
     # less than two distances of points around a hidden one are looked at for what covers it
     porous = scene.scale.distance_px > MAX_COVER_PX / 2.0
-    labels, status = between_labels(between, own, left, right, first, paper, porous)
+    labels, status = between_labels(between, own, left, right, first, porous)
     status[(status == Status.NO_POINTS) & (points.count > 0)] = Status.EDGE_IN_PIXEL
     if settings.edge_margin_px > 0.0:
         status[is_labelled(status) & edge] = Status.EDGE_IN_PIXEL
-    if not settings.fills:
-        bare = status == Status.LABELLED_BETWEEN
-        status[bare] = Status.NO_POINTS
-        status[bare & (points.count > 0)] = Status.HIDDEN_IN_LEFT
-        status[bare & (pixels.count > 0) & ~enough] = Status.BELOW_MINIMUM_COUNT
     measured = status == Status.LABELLED
     pixels = replace(
         pixels,
-        count=np.where(measured | (status == Status.BELOW_MINIMUM_COUNT), pixels.count, 0),
+        count=np.where(measured, pixels.count, 0),
         highest=np.where(measured, pixels.highest, between.height),
         surface_class=np.where(measured, pixels.surface_class, between.surface_class),
     )
-    agreement = pixels.correlation
-    if settings.method == "both":
-        agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
-    if settings.asks_images:
-        labels, pixels = _by_images(scene, between, labels, pixels, status, left, right, wide)
-    if settings.fills:
-        found = crowns(surface, between, local, first, scene.scale, px_per_m)
-        if settings.edge_margin_px > 0.0:
-            found = replace(found, shown=found.shown & ~edge)
-        labels, pixels, agreement = _with_crowns(
-            scene, found, labels, pixels, agreement, status, left, right, wide
-        )
+    agreement = _test_agreement(scene, labels, pixels, status, left, right, wide)
+    found = crowns(surface, between, local, first, scene.scale, px_per_m)
+    if settings.edge_margin_px > 0.0:
+        found = replace(found, shown=found.shown & ~edge)
+    labels, pixels, agreement = _with_crowns(
+        scene, found, labels, pixels, agreement, status, left, right, wide
+    )
     layers = _layers(scene, pixels, labels, agreement, status, wide)
     return layers, _counts(points, pixels, status, settings.margin)
 
@@ -179,7 +139,7 @@ def _with_crowns(
         np.where(new, found.slope, labels.slope),
         np.where(new, found.variance, labels.variance),
     )
-    if scene.settings.method == "both" and at[0].size:
+    if at[0].size:
         held = _agreement(scene, merged, left, right, wide)
         agreement = np.where(new, held.correlation, agreement)
         changed = new & held.outvoted()
@@ -194,72 +154,6 @@ def _with_crowns(
             surface_class=np.where(new, found.surface_class, pixels.surface_class),
         ),
         agreement,
-    )
-
-
-def _by_images(
-    scene: SceneInputs,
-    between: Between,
-    labels: Labels,
-    pixels: Pixels,
-    status: NDArray[np.uint8],
-    left: Patch,
-    right: Patch,
-    wide: Window,
-) -> tuple[Labels, Pixels]:
-    """With the open pixels of which both images tell the surface; sets these in ``status``.
-
-    Where a step of two known surfaces lies is known better than to a pixel (:mod:`.outlines`), and
-    no pixel tells more: only where what a pixel may show is unknown, or what hides it from the
-    right camera, images have a say.
-    """
-    top, side, (rows, cols) = wide[0].start - left.row, wide[1].start - left.col, status.shape
-    shown = left.pixels[top : top + rows, side : side + cols].astype(np.float64)
-    top = wide[0].start - right.row
-    warped_from = right.pixels[top : top + rows].astype(np.float64)
-    known = is_labelled(status)
-    is_open = between.outcome == STEP_IN_RIGHT
-    is_open |= (between.outcome == STEP_IN_LEFT) & between.rough
-    found = surfaces_by_images(
-        is_open & ~np.isin(status, (Status.CHANGED, Status.OUT_OF_FRAME, Status.MASKED)),
-        np.where(known, labels.disparity, np.nan),
-        labels.slope,
-        between.disparity,
-        between.slope,
-        between.highest,
-        shown,
-        warped_from,
-        right.col - wide[1].start,
-        between.places.hide_from_right,
-    )
-    at, (y, x) = (found.row, found.col), found.source.T
-    own = (found.row == y) & (found.col == x)
-    told = {
-        "disparity": np.where(known, labels.disparity, between.disparity),
-        "variance": np.where(known, labels.variance, between.variance),
-        "height": np.where(known, pixels.highest, between.height),
-        "class": np.where(known, pixels.surface_class, between.surface_class),
-    }
-    dry = told["class"][y, x] != WATER_CLASS
-    own, y, x = own[dry], y[dry], x[dry]
-    at = found.row[dry], found.col[dry]
-    disparity = found.disparity[dry]
-    # a plane is less sure the farther it is drawn out beyond its points
-    far = np.hypot(at[0] - y, at[1] - x) / scene.scale.distance_px
-    rise = (disparity - told["disparity"][y, x]) / scene.rays.px_per_m
-    values = {
-        "disparity": disparity,
-        "variance": told["variance"][y, x] * (1.0 + far) ** 2,
-        "height": told["height"][y, x] + np.where(own, 0.0, rise),
-        "class": told["class"][y, x],
-    }
-    status[at] = Status.LABELLED_BY_IMAGES
-    slope = labels.slope.copy()
-    slope[:, at[0], at[1]] = found.slope[:, dry]
-    for name, array in told.items():
-        array[at] = values[name]
-    return Labels(told["disparity"], slope, told["variance"]), replace(
-        pixels, highest=told["height"], surface_class=told["class"]
     )
 
 
@@ -300,7 +194,7 @@ def _collect(
     first = wide[0].start, wide[1].start
     collection = Collection(shape, first, (low[0], low[1]), left, right)
     vertices = None
-    if scene.settings.uses_geometry:
+    if scene.settings.on_surface:
         vertices = VertexBuilder(scene.rays, (low[0], low[1]), (high[0], high[1]))
     for strip in strips:
         for store in scene.stores:
@@ -316,28 +210,6 @@ def _collect(
     if points.points.size == 0 and not points.outside.any():
         return None
     return points, local, None if vertices is None else vertices.built()
-
-
-def _test_points(
-    settings: Settings, points: PixelPoints, seen: NDArray[np.bool_], pixels: Pixels
-) -> NDArray[np.uint8]:
-    """Status of each pixel by its point that got furthest."""
-    status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
-    status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
-    status[points.masked.reshape(points.shape)] = Status.MASKED
-    status[points.count > 0] = Status.HIDDEN_IN_LEFT
-    if settings.method == "correlation":
-        status[points.any(seen)] = Status.LOW_CORRELATION
-    status[pixels.count > 0] = Status.LABELLED
-    return status
-
-
-def _labels(scene: SceneInputs, pixels: Pixels, valid: NDArray[np.bool_], wide: Window) -> Labels:
-    """Labels of the valid pixels by the settings' representative."""
-    if scene.settings.representative == "paper":
-        return at_points(pixels, valid, scene.rays.px_per_m)
-    first = wide[0].start, wide[1].start
-    return at_centres(pixels, valid, first, scene.rays.px_per_m)
 
 
 def _test_agreement(

@@ -17,26 +17,23 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
     statuses = [*settings.statuses, *([Status.MASKED] if masked else [])]
     other = {"left": "right", "right": "left"}[view]
     match = {"left": "x - disparity", "right": "x + disparity"}[view]
-    condensed, used = (
-        (
-            "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
-            "of its neighbours on the same surface",
-            "points on the surface that the pixel's centre sees",
-        )
-        if settings.representative == "top"
-        else ("disparity of the point at mean longitude and latitude, greatest height", "points")
-    )
-    compared = {
-        "correlation": "mean correlation coefficient of the image windows at the points used",
-        "both": f"correlation coefficient of {view} and warped {other} image over the pixels of "
-        f"the same surface in {settings.window} x {settings.window} px",
-    }
+    condensed = "disparity of the point at mean longitude and latitude, greatest height"
+    used = "points whose image windows correlate"
+    compared = "mean correlation coefficient of the image windows at the points used"
     between, lonely, rough = {}, {}, {}
-    if settings.fills:
+    if settings.on_surface:
+        condensed = (
+            "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
+            "of its neighbours on the same surface"
+        )
+        used = "points on the surface that the pixel's centre sees"
+        compared = (
+            f"correlation coefficient of {view} and warped {other} image over the pixels of "
+            f"the same surface in {settings.window} x {settings.window} px"
+        )
         between = {
             "between": "where the status is labelled_between, or a point is less sure than those "
             "around it: linear in the triangle of points that the pixel's centre sees; where it is "
-            "labelled_by_images: on the plane of the label that both images tell; where it is "
             "labelled_crown: linear in the triangle of the tops of a rough surface"
         }
         lonely = {
@@ -65,7 +62,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
                 "nodata": "NaN",
                 "match": f"what the {view} image shows at (x, y), the {other} one shows at "
                 f"({match}, y)",
-                "representative": f"{settings.representative}: {condensed}",
+                "representative": condensed,
             }
             | between,
         ),
@@ -111,7 +108,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
             np.nan,
             {
                 "units": "1",
-                "long_name": compared.get(settings.method, "none: no windows are compared"),
+                "long_name": compared,
                 "nodata": "NaN",
             },
         ),

@@ -1,10 +1,10 @@
-"""One label per pixel from the points that passed: exact sums, then a plane to the pixel's centre.
+"""What the points of each pixel come to, and labels at the pixels' centres from it.
 
-- ``top``: mean longitude, latitude and height of the points on the surface that the pixel's centre
-  sees. The mean lies beside the centre; a plane through the means of the pixel and those of its
-  neighbours on the same surface takes the disparity there. No bias by the largest of several noisy
-  heights, by slopes, or by mixture where a roof's edge and the ground share a pixel.
-- ``paper``: mean longitude and latitude of all points, height of the highest (section III-C).
+A pixel's points are condensed to one (:func:`condense`): where it lies, a recipe says. With the
+recipe surface it is the mean of the points on the surface that the pixel's centre sees. The mean
+lies beside the centre; a plane through the means of the pixel and those of its neighbours on the
+same surface takes the disparity there (:func:`at_centres`). No bias by the largest of several noisy
+heights, by slopes, or by mixture where a roof's edge and the ground share a pixel.
 
 Sums are of integers, so that the order of the points leaves no trace; what is computed from
 neighbours takes them in a fixed order.
@@ -12,6 +12,7 @@ neighbours takes them in a fixed order.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +20,8 @@ from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..kernels import kernel
-from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from .local_projection import LocalProjection
+from ..lidar.lattice import PER_M
 from .pixel_points import PX, PixelPoints
-from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -34,7 +33,6 @@ Records = NDArray[np.void]
 HEIGHT_NOISE_M = 0.02
 FEW = 3  # degrees of freedom below which the points' own spread says nothing:
 FEW_NOISE_M = 0.05  # then this is taken
-_PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
 RIDGE = 0.1  # px², keeps planes through places in a line level across it
 
 
@@ -45,8 +43,7 @@ class Pixels:
     ``count`` of the points used; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the
     representative point; ``highest`` (m); ``correlation`` mean of the points'; ``surface_class``
     ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points, about their mean,
-    of uu, uv, vv, uz,
-    vz, zz, with (u, v) the place in the left grid and z the disparity, px².
+    of uu, uv, vv, uz, vz, zz, with (u, v) the place in the left grid and z the disparity, px².
     """
 
     count: NDArray[np.int64]
@@ -93,7 +90,7 @@ def _collect(
         sums[p, 0], sums[p, 3] = n, height
         sums[p, 1], sums[p, 2] = lon + n * origin[0], lat + n * origin[1]
         surface_class[p] = top_class
-        highest[p] = top / _PER_M if n else np.nan
+        highest[p] = top / PER_M if n else np.nan
         mean_correlation[p] = np.nan
         moments[p] = 0.0
         if n == 0:
@@ -127,17 +124,17 @@ def _collect(
 
 
 def condense(
-    model: ViewGeometry,
-    local: LocalProjection,
     window: PixelPoints,
     use: Bools,
-    correlation: NDArray[np.float32] | None,
-    representative: str,
+    place_of: Callable[[Ints, Floats], Floats],
+    correlation: NDArray[np.float32] | None = None,
 ) -> Pixels:
     """The pixels of a window from its points in ``use`` [n].
 
-    ``local`` is that of the ``model`` for a box with all points; ``correlation`` [n] of the points
-    or None.
+    ``place_of`` (sums, highest) gives the places [4, pixels] (px, of the left image, then of the
+    right one) of the point that stands for each pixel, NaN where it has none: from ``sums``
+    int64[pixels, 4], number of points and sums of their longitudes, latitudes and heights (lattice
+    steps), and ``highest`` (m). ``correlation`` [n] of the points or None.
     """
     size, shape = window.start.size - 1, window.shape
     sums = np.empty((size, 4), dtype=np.int64)
@@ -155,11 +152,7 @@ def condense(
         mean,
         moments,
     )
-    place = local.at_means(sums)
-    if representative == "paper":
-        found = np.flatnonzero(sums[:, 0])
-        lon, lat = (sums[found, axis] / sums[found, 0] / _PER_DEG for axis in (1, 2))
-        place[:, found] = model.ground_to_epipolar(lon, lat, highest[found])
+    place = place_of(sums, highest)
     return Pixels(
         count=sums[:, 0].reshape(shape),
         x=place[0].reshape(shape),
@@ -250,15 +243,8 @@ def at_centres(pixels: Pixels, valid: Bools, first: tuple[int, int], px_per_m: f
     label = np.empty(disparity.shape)
     slope, spread = np.zeros((2, *disparity.shape)), np.zeros(disparity.shape)
     _plane(disparity, pixels.x, pixels.y, *first, label, slope, spread)
-    variance = _noise(pixels, valid, slope, px_per_m) / np.maximum(pixels.count, 1) + spread
-    return Labels(label, slope, variance)
-
-
-def at_points(pixels: Pixels, valid: Bools, px_per_m: float) -> Labels:
-    """As :func:`at_centres`, with the disparity of each pixel's representative point."""
-    level = np.zeros((2, *valid.shape))
-    variance = _noise(pixels, valid, level, px_per_m) / np.maximum(pixels.count, 1)
-    return Labels(np.where(valid, pixels.disparity, np.nan), level, variance)
+    noise = noise_variance(pixels, valid, slope, px_per_m)
+    return Labels(label, slope, noise / np.maximum(pixels.count, 1) + spread)
 
 
 @kernel
@@ -299,7 +285,7 @@ def _pooled(
             out[j, i] = max(total / n if n >= FEW else few, least)
 
 
-def _noise(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float) -> Floats:
+def noise_variance(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float) -> Floats:
     """Variance (px²) of a point's disparity about its surface, pooled over 3 x 3 pixels."""
     squares, freedom, out = (np.empty(valid.shape) for _ in range(3))
     _rests(pixels.moments, pixels.count, valid, slope, squares, freedom)

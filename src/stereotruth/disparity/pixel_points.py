@@ -63,19 +63,6 @@ class PixelPoints:
         """Number of points in both frames by pixel, [rows, cols]."""
         return np.diff(self.start).astype(np.int32).reshape(self.shape)
 
-    def any(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which pixels [rows, cols] have one of the ``chosen`` points [n]."""
-        out = np.zeros(self.start.size - 1, dtype=np.bool_)
-        _any(self.start, chosen, out)
-        return out.reshape(self.shape)
-
-
-@kernel
-def _any(start: Ints, chosen: NDArray[np.bool_], out: NDArray[np.bool_]) -> None:
-    for p in range(out.size):
-        for k in range(start[p], start[p + 1]):
-            out[p] |= chosen[k]
-
 
 @kernel
 def _take(

@@ -1,7 +1,7 @@
 """Where the points of a window are.
 
 A window of the left epipolar grid shows the points of a box on the ground that depends on their
-heights; with geometric visibility, those that can hide these lie around it.
+heights; by the recipe surface, points that can hide these lie around it.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class PointWindows:
         """
         ground = self.outline(rows, cols, reach.low, reach.high)
         box = reach.box
-        if self.settings.uses_geometry:
+        if self.settings.on_surface:
             box = reach.around
             corners = np.array(
                 [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]

@@ -1,8 +1,8 @@
 """Points to disparity: the stage `project` (paper, section III-C).
 
-Every point is projected into both rectified images; hidden points are removed; what is left of a
-pixel of the left epipolar grid is condensed to one label, d = x_left - x_right (px), see
-:mod:`.label_window` and :mod:`.pixel_labels`. A point belongs to the pixel (floor(x_left + 0.5),
+Every point is projected into both rectified images, and a pixel of the left epipolar grid has the
+label d = x_left - x_right (px) of what it shows, by one of two recipes (``project.recipe``): see
+:mod:`.label_window` and :mod:`.paper_recipe`. A point belongs to the pixel (floor(x_left + 0.5),
 floor(y_left + 0.5)). The right image's labels are those of the mirrored pair, see
 :mod:`.right_view`.
 
@@ -55,12 +55,12 @@ def _tell_density(inputs: SceneInputs) -> None:
     per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
     said = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
-    if inputs.settings.fills or share > ENOUGH:
+    if inputs.settings.on_surface or share > ENOUGH:
         log.info("%s", said)
         return
     log.warning(
         "%s: a point falls into %.0f %% of the pixels, and the others get no label. "
-        "project.fill: surface labels pixels between points, too",
+        "project.recipe: surface labels pixels between points, too",
         said,
         share,
     )
@@ -206,7 +206,7 @@ def project_scene(
             "epipolar": left_attrs["epipolar"],
             "uncertainty": inputs.pair.uncertainty.content,
             "parameters": parameters
-            | ({"scale": asdict(inputs.scale)} if settings.uses_geometry else {}),
+            | ({"scale": asdict(inputs.scale)} if settings.on_surface else {}),
             "code": code,
         }
     )
@@ -249,12 +249,12 @@ def project_scene(
         unfinished.publish(out, every, attrs | {"summary": summary})
     log.info(
         "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
-        settings.method,
+        settings.recipe,
         labelled,
         100.0 * summary["labelled_share"],
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )
-    if settings.method in ("correlation", "both") and summary["labelled_share"] < 0.4:
+    if summary["labelled_share"] < 0.4:
         log.warning(
             "only %.0f %% of the pixels with points are seen alike in both images: check the "
             "vertical datum of the LiDAR (geoid in scenes.tsv), its CRS and the GCP residuals",

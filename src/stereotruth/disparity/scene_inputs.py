@@ -96,7 +96,7 @@ class SceneInputs:
     @property
     def halo(self) -> int:
         """Cells around all that a window shows and what hides it, whose points have a say."""
-        return self.scale.halo if self.settings.uses_geometry else 0
+        return self.scale.halo if self.settings.on_surface else 0
 
     @cached_property
     def windows(self) -> PointWindows:

@@ -1,4 +1,4 @@
-"""Settings of the stage project: how points are judged and condensed."""
+"""Settings of the stage project: how points become labels."""
 
 from __future__ import annotations
 
@@ -12,119 +12,82 @@ from .status import Status
 
 
 @settings
-class Occlusion:
-    """The configuration's section occlusion."""
+class Settings:
+    """What the labels of a grid follow from; see config/README.md."""
 
-    method: Literal["correlation", "geometric", "both", "none"] = "both"
-    """how hidden and changed points are found: by the paper's filter, which compares the images
-    around each point; by the surface of the points, drawn into both views; by that, and where the
-    images contradict the LiDAR over most of a surface (25 px around a pixel) it counts as changed;
-    not at all"""
+    recipe: Literal["surface", "paper"] = "surface"
+    """how points become labels. `surface`: the points are triangles over the ground. Those that go
+    on the plane of their neighbours, or bulge as crowns do, give labels. Those between two surfaces
+    are cut at the outline that the points on both sides of it tell. All others are swept vertically
+    as what may hide a pixel in either view. All pixels on the surface have a label: those with
+    points on it the status `labelled` (1), those between points `labelled_between` (9) and an
+    `uncertainty` of their own. Rough surfaces, as crowns are, have labels where both views must see
+    them, `labelled_crown` (12), with the `uncertainty` that the roughness of their points leaves;
+    which of these are in the tiles, `tiles.max_uncertainty_px` says. Where a step lies between
+    points, other pixels are `edge_in_pixel`. Where the images contradict the LiDAR over most of a
+    surface (25 px around a pixel), pixels are `changed`. A value is always the LiDAR's. `paper`: as
+    in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and max Z of its points, and
+    points around which the images do not correlate are dropped"""
 
     window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
-    """side of the correlation window; with `both`, of the pixels in it only those of the same
+    """side of the correlation window; with `surface`, of the pixels in it only those of the same
     surface count"""
 
     correlation_threshold: Annotated[Number, Field(ge=-1, le=1)] = 0.5
-    """with `correlation` a point below is dropped; with `both` a pixel below votes for change"""
-
-
-@settings
-class Representative:
-    """Of the configuration's section project, what disparities follow from."""
-
-    representative: Literal["top", "paper"] = "top"
-    """the point that stands for a pixel: the mean of its points on the surface that its centre
-    meets, or mean X, mean Y and max Z of all its points, as in the paper"""
+    """with `paper` a point below is dropped; with `surface` a pixel below votes for change"""
 
     edge_margin_px: Annotated[Number, Field(ge=0, le=1), Unit("px")] = 0
-    """with `top`: a pixel whose centre lies nearer to the edge between its surface (roof, crown)
-    and another stays unlabelled, since noise of the alignment decides which one it meets; pixels on
-    an edge itself always do"""
+    """with `surface`: a pixel whose centre lies nearer to the edge between its surface (roof,
+    crown) and another stays unlabelled, since noise of the alignment decides which one it meets;
+    pixels on an edge itself always do"""
 
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
-    """a pixel with fewer stays unlabelled"""
+    """a pixel with fewer stays unlabelled with `paper`, and is one between points with `surface`"""
 
-    fill: Literal["none", "surface", "surface_and_images"] = "surface"
-    """where labels are, with `occlusion.method` both or geometric and the representative top. The
-    points are triangles over the ground: those that go on the plane of their neighbours, or bulge
-    as crowns do, give labels; those between two surfaces are cut at the outline that the points on
-    both sides of it tell; all others are swept vertically as what may hide a pixel in either view.
-    `surface`: all pixels on it have a label, those with points on it the status `labelled` (1),
-    those between points `labelled_between` (9) and an `uncertainty` of their own. Rough surfaces,
-    as crowns are, have labels where both views must see them, `labelled_crown` (12), with the
-    `uncertainty` that the roughness of their points leaves; which of these are in the tiles,
-    `tiles.max_uncertainty_px` says. Where a step lies between points, other pixels are
-    `edge_in_pixel`. `none`: pixels with points alone.
-    `surface_and_images`: of the pixels that the surface leaves open, those that only one of the
-    surfaces around explains in both images are on that surface, `labelled_by_images` (10): more
-    labels in crowns and behind roofs, and more of the hidden pixels (with the method both alone). A
-    value is always the LiDAR's"""
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Settings:
+        """From the configuration."""
+        project = config.get("project", {})
+        return cls(**{key: value for key, value in project.items() if key != "right_view"})
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether labels follow from the surface of the points."""
+        return self.recipe == "surface"
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Those that the recipe's grids name; MASKED comes with masks alone."""
+        found = [status for status in Status if status <= Status.EDGE_IN_PIXEL]
+        if self.on_surface:
+            found += [Status.LABELLED_BETWEEN, Status.LABELLED_CROWN]
+        return found
+
+    @property
+    def images_window(self) -> int:
+        """Side in px of the window that both images must hold around a label; 1: its pixel."""
+        return 1 if self.on_surface else self.window
+
+    @property
+    def margin(self) -> int:
+        """Pixels around a window whose points have a say in it."""
+        if not self.on_surface:
+            return 1  # the points' noise is pooled over 3 x 3 pixels
+        # here, since these load compiled code and a workflow plans with the settings
+        from .image_agreement import NEARBY_PX, VOTE_PX
+        from .seen_surface import EDGE
+
+        # one for each ring of neighbours: planes, their pooled noise, support
+        reach = EDGE + 3
+        # steps beside pixels, windows, votes about them, and what is asked of the votes nearby; in
+        # the rim of a change, by the mean of what is not voted against
+        return reach + VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
 
 
 @settings
-class Project(Representative):
+class Project(Settings):
     """The configuration's section project."""
 
     right_view: Flag = False
     """also the labels of the right images: `results/project/<City>/<scene>_right.zarr`, and
     `disp_right`, `status_right` of the tiles"""
-
-
-@settings
-class Settings(Representative, Occlusion):
-    """How points are judged and condensed; see config/README.md."""
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Settings:
-        """From the configuration."""
-        project = {k: v for k, v in config.get("project", {}).items() if k != "right_view"}
-        return cls(**config.get("occlusion", {}), **project)
-
-    @property
-    def fills(self) -> bool:
-        """Whether there are labels between points."""
-        return self.fill != "none" and self.uses_geometry and self.representative == "top"
-
-    @property
-    def asks_images(self) -> bool:
-        """Whether images tell the surface of pixels that points leave open."""
-        return self.fill == "surface_and_images" and self.fills and self.method == "both"
-
-    @property
-    def statuses(self) -> list[Status]:
-        """Those that occur."""
-        return [
-            s
-            for s in Status
-            if s not in (Status.MASKED, Status.TOO_UNCERTAIN)
-            and (self.fills or s not in (Status.LABELLED_BETWEEN, Status.LABELLED_CROWN))
-            and (self.asks_images or s != Status.LABELLED_BY_IMAGES)
-        ]
-
-    @property
-    def uses_geometry(self) -> bool:
-        """Whether the surface of the points tells what is seen."""
-        return self.method in ("geometric", "both")
-
-    @property
-    def images_window(self) -> int:
-        """Side in px of the window that both images must hold around a label; 1: its pixel."""
-        return self.window if self.method == "correlation" else 1
-
-    @property
-    def margin(self) -> int:
-        """Pixels around a window whose points have a say in it."""
-        # here, since these load compiled code and a workflow plans with the settings
-        from .image_agreement import NEARBY_PX, VOTE_PX
-        from .open_pixels import MARGIN
-        from .seen_surface import EDGE
-
-        # one for each ring of neighbours: planes, their pooled noise, support
-        reach = EDGE + 3
-        if self.method != "both":
-            return reach
-        # steps beside pixels, windows, votes about them, and what is asked of the votes nearby; in
-        # the rim of a change, by the mean of what is not voted against
-        reach += VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
-        return reach + (MARGIN if self.asks_images else 0)

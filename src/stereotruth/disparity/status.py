@@ -11,7 +11,10 @@ WATER_CLASS = 9  # ASPRS
 
 
 class Status(IntEnum):
-    """Why a pixel has a label or none."""
+    """Why a pixel has a label or none. Numbers stay as they were published.
+
+    LABELLED_BY_IMAGES stands in grids of earlier versions alone: no recipe gives it.
+    """
 
     NO_POINTS = 0
     LABELLED = 1

@@ -286,14 +286,6 @@ class Places:
         _smooth_in_right(self.xy, self.corner, *where, behind)
         return behind
 
-    def hide_from_right(self, row: Steps, col: Steps, disparity: Floats) -> Bools:
-        """Whether a triangle hides pixels [n] of the window, of this disparity, from there."""
-        out = np.zeros(row.size, np.bool_)
-        if row.size:
-            order, where = by_right_column(row, col, disparity, self.first)
-            out[order] = self.hidden(where)
-        return out
-
 
 @dataclass(frozen=True, eq=False)
 class Between:
@@ -304,9 +296,8 @@ class Between:
     one), BEHIND_IN_RIGHT (a smooth triangle hides it from there). ``disparity`` px, its ``slope``
     [2, h, w] and ``variance`` px² (of the points alone), ``height`` m and ``surface_class`` (ASPRS,
     of the nearest vertex) of the smooth triangle that is nearest, NaN (0) where there is none.
-    ``highest``: disparity that a pixel has at most; ``rough``: whether a step of unknown surfaces
-    may be nearer; ``bulging``: whether the surface bulges out of its triangle. ``places``: the
-    smooth triangles in both images.
+    ``bulging``: whether the surface bulges out of its triangle. ``places``: the smooth triangles in
+    both images.
     """
 
     outcome: NDArray[np.uint8]
@@ -315,8 +306,6 @@ class Between:
     variance: Floats
     height: Floats
     surface_class: NDArray[np.uint8]
-    highest: Floats
-    rough: Bools
     bulging: Bools
     places: Places
 
@@ -337,9 +326,7 @@ def surface_between(
     nearest, shown = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
     nearest_faces(xy, corner, first, nearest, shown)
     before = np.full(shape, -np.inf)
-    steps_in_left(surface, local, slice(0, surface.rough), first, before)
-    rough = before > nearest + TOLERANCE_PX
-    steps_in_left(surface, local, slice(surface.rough, len(surface.steps)), first, before)
+    steps_in_left(surface, local, slice(0, len(surface.steps)), first, before)
     outcome = np.where(shown >= 0, np.uint8(SHOWN), np.uint8(NOTHING))
     outcome[before > nearest + TOLERANCE_PX] = STEP_IN_LEFT
 
@@ -368,8 +355,6 @@ def surface_between(
         variance=variance * (LATTICE_M * px_per_m) ** 2,
         height=(height + rise) * LATTICE_M,
         surface_class=classes,
-        highest=np.maximum(before, nearest),
-        rough=rough,
         bulging=rise > 0.0,
         places=places,
     )
@@ -412,17 +397,15 @@ def between_labels(
     left: Patch,
     right: Patch,
     first: tuple[int, int],
-    keep_own: bool = False,
     porous: bool = False,
 ) -> tuple[Labels, NDArray[np.uint8]]:
     """Labels of a window whose first pixel is (row, col) ``first``, and the status of its pixels.
 
     Pixels whose ``own`` points lie on the surface that their centre sees count as measured, and
     keep the label that these give if it is the surer one (one point is less than three around it,
-    and no plane bulges), or if ``keep_own``. Points of another surface tell of an edge in the
-    pixel. Only where points are so sparse that others show through between them (``porous``) those
-    behind are hidden, as the ground is that a tower leans over. ``left``, ``right``: patches that
-    tell the frames.
+    and no plane bulges). Points of another surface tell of an edge in the pixel. Only where points
+    are so sparse that others show through between them (``porous``) those behind are hidden, as the
+    ground is that a tower leans over. ``left``, ``right``: patches that tell the frames.
     """
     status = _STATUS[between.outcome]
     shown = between.outcome == SHOWN
@@ -440,7 +423,7 @@ def between_labels(
         other = lift > STEP_PX if porous else np.abs(lift) > STEP_PX
         status[between_points & other] = Status.EDGE_IN_PIXEL
     status[measured] = Status.LABELLED
-    surer = measured & (keep_own | ((own.variance <= between.variance) & ~between.bulging))
+    surer = measured & (own.variance <= between.variance) & ~between.bulging
     return Labels(
         np.where(surer, own.disparity, np.where(is_labelled(status), between.disparity, np.nan)),
         np.where(surer, own.slope, between.slope),

@@ -121,12 +121,12 @@ def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None
     with pytest.raises(InputError, match=r"Town: not one labelled .*labels incomplete") as caught:
         run([scene], tmp_path / "T", min_labelled=0.99)
     assert "tiles.min_labelled" in caught.value.remedy
-    assert "project.fill" not in caught.value.remedy
+    assert "project.recipe" not in caught.value.remedy
     grid = zarr.open_group(scene.disparity, mode="r+")
     grid.attrs["points_per_px"] = 0.42
     with pytest.raises(InputError, match="not one labelled") as caught:
         run([scene], tmp_path / "T", min_labelled=0.99)
-    assert "s1 0.42" in caught.value.remedy and "project.fill: surface" in caught.value.remedy
+    assert "s1 0.42" in caught.value.remedy and "project.recipe: surface" in caught.value.remedy
     del grid.attrs["points_per_px"]
     refusal = "not refined: the tie points contradict each other (0.61 px, 40 % blunders)"
     file = tmp_path / "alignment.json"

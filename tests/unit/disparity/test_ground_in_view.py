@@ -76,7 +76,7 @@ def test_vertices_in_the_halo_and_triangles_that_touch_stay() -> None:
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) -> None:
     box = Scene(tmp_path_factory.mktemp("box"), box=True, spacing=2.5)
-    scene = SceneInputs(*box.images, (box.store,), Settings(fill="surface_and_images"), view)
+    scene = SceneInputs(*box.images, (box.store,), Settings(), view)
     windows = [(slice(r, r + 50), slice(c, c + 50)) for r in (90, 140) for c in (60, 110, 160)]
     found = [module.label_window(scene, *window)[0] for window in windows]
     sizes = []

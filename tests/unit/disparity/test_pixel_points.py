@@ -67,6 +67,3 @@ def test_each_pixel_has_its_points() -> None:
         )
         classes = window.points["surface_class"][here][order]
         assert np.array_equal(classes, lattice[0, members[by_lon]] % 7)
-    chosen = window.points["lon"] > 3000
-    expected = [chosen[a:b].any() for a, b in zip(window.start, window.start[1:])]
-    assert np.array_equal(window.any(chosen).reshape(-1), expected)

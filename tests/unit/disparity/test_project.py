@@ -11,12 +11,14 @@ import pyproj
 import pytest
 import zarr
 
+import stereotruth.disparity.label_window as module
 from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.label_window import label_window
-from stereotruth.disparity.pixel_labels import RIDGE
+from stereotruth.disparity.pixel_labels import RIDGE, Labels
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.disparity.surface_between import between_labels
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
@@ -55,34 +57,30 @@ def noisy_box(tmp_path_factory) -> Scene:
     return Scene(tmp_path_factory.mktemp("noisy"), box=True, noise=0.1)
 
 
-@pytest.mark.parametrize("method", ["none", "correlation", "geometric", "both"])
-@pytest.mark.parametrize("representative", ["top", "paper"])
-def test_disparity_of_a_plane(plane, method, representative) -> None:
+@pytest.mark.parametrize("recipe", ["surface", "paper"])
+def test_disparity_of_a_plane(plane, recipe) -> None:
     """Within 1e-3 px at every pixel's centre; all labelled but a frame of 2 px, or of half a window
     where whole windows are compared."""
-    grid = plane.project(method=method, representative=representative)
+    grid = plane.project(recipe=recipe)
     disparity, status = grid["disparity"].values, grid["status"].values
     labelled = is_labelled(status)
     assert np.array_equal(labelled, np.isfinite(disparity))
     assert np.abs(disparity - plane.truth)[labelled].max() < 1e-3
     has_points = status != Status.NO_POINTS
     inner = has_points & (plane.truth > -np.inf)
-    edge = (6 if method == "correlation" else 2) + int(np.ceil(np.abs(plane.truth).max()))
+    edge = (6 if recipe == "paper" else 2) + int(np.ceil(np.abs(plane.truth).max()))
     inner[:edge] = inner[-edge:] = inner[:, :edge] = inner[:, -edge:] = False
     assert inner.sum() > 30_000
     assert labelled[inner].mean() > 0.999
     correlation = grid["correlation"].values[labelled]
-    if method in ("correlation", "both"):
-        assert np.nanmedian(correlation) > 0.99
-        assert np.isfinite(correlation).mean() > 0.98  # not where the images end
-    else:
-        assert np.isnan(correlation).all()
+    assert np.nanmedian(correlation) > 0.99
+    assert np.isfinite(correlation).mean() > 0.98  # not where the images end
 
 
-def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, float, int]]:
+def brute_force(scene: Scene, on_surface: bool) -> dict[tuple[int, int], tuple[float, float, int]]:
     """Disparity, height and count by pixel, point by point in Python from the definition.
 
-    With ``top``, only pixels around which all points are of one surface.
+    With ``on_surface``, only pixels around which all points are of one surface.
     """
     points = query_points([scene.store], -180, -90, 180, 90)
     xy = scene.model.ground_to_epipolar(points.lon, points.lat, points.height)
@@ -100,7 +98,7 @@ def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, f
         if not 110 < row < 200 or not 90 < col < 220:
             continue
         highest = float(points.height[members].max())
-        if not top:
+        if not on_surface:
             found[row, col] = float(place(members, highest)[2]), highest, len(members)
             continue
         blocks = [
@@ -122,14 +120,36 @@ def brute_force(scene: Scene, top: bool) -> dict[tuple[int, int], tuple[float, f
     return found
 
 
-@pytest.mark.parametrize("representative", ["top", "paper"])
-def test_representative_is_that_of_its_definition(noisy_box, representative) -> None:
-    """Points of 0.1 m noise on plane and roof, against sums in Python: 1e-5 px."""
-    grid = noisy_box.project(method="none", representative=representative)
-    disparity, height, count = (
-        grid[name].values for name in ("disparity", "height", "point_count")
-    )
-    expected = brute_force(noisy_box, representative == "top")
+def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, np.ndarray]]:
+    """What each pixel's own points give on the surface that its centre sees, before triangles of
+    points around it are asked, and the layers of the grid."""
+    found = []
+
+    def recorded(between, own, *rest):
+        found.append(own)
+        return between_labels(between, own, *rest)
+
+    monkeypatch.setattr(module, "between_labels", recorded)
+    inputs = SceneInputs(*scene.images, (scene.store,), Settings(correlation_threshold=-1))
+    rows, cols = scene.model.shape
+    layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
+    inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
+    own = found[0]
+    return Labels(own.disparity[inner], own.slope[:, *inner], own.variance[inner]), layers
+
+
+@pytest.mark.parametrize("recipe", ["surface", "paper"])
+def test_point_of_a_pixel_is_that_of_its_definition(noisy_box, recipe, monkeypatch) -> None:
+    """Points of 0.1 m noise on plane and roof, none dropped, against sums in Python: 1e-5 px."""
+    if recipe == "surface":
+        own, layers = labels_of_own_points(noisy_box, monkeypatch)
+        disparity, height, count = own.disparity, layers["height"], layers["point_count"]
+    else:
+        grid = noisy_box.project(recipe="paper", correlation_threshold=-1)
+        disparity, height, count = (
+            grid[name].values for name in ("disparity", "height", "point_count")
+        )
+    expected = brute_force(noisy_box, recipe == "surface")
     assert len(expected) > 4000
     for pixel, (d, h, n) in expected.items():
         assert disparity[pixel] == pytest.approx(d, abs=1e-5)
@@ -141,23 +161,26 @@ def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
     """Each label is that of the roof or of the ground, and the wrong one less often."""
     levels = [box.truth[box.surface[2] == h].mean() for h in (HEIGHT, ROOF)]
     off = {}
-    for representative in ("top", "paper"):
-        grid = box.project(method="none", representative=representative)
+    for recipe in ("surface", "paper"):
+        grid = box.project(recipe=recipe, correlation_threshold=-1)
         d = grid["disparity"].values
         d = d[np.isfinite(d)]
-        off[representative] = (np.minimum(abs(d - levels[0]), abs(d - levels[1])) > 0.05).sum()
+        off[recipe] = (np.minimum(abs(d - levels[0]), abs(d - levels[1])) > 0.05).sum()
         right = abs(grid["disparity"].values - box.truth) < 1
         seen_by_both = (box.surface[2] == HEIGHT) | (box.surface[2] == ROOF)
         known = np.isfinite(grid["disparity"].values) & seen_by_both
-        off[representative + " wrong"] = (known & ~right).sum()
-    assert off["top"] == 0
-    assert off["top wrong"] < 0.5 * off["paper wrong"]
+        off[recipe + " wrong"] = (known & ~right).sum()
+    assert off["surface"] == 0
+    assert off["surface wrong"] < 0.5 * off["paper wrong"]
 
 
-@pytest.mark.parametrize("method", ["geometric", "both"])
-def test_box_hides_a_run_of_the_ground(box, method) -> None:
-    """Hidden ground beside the box, walls without points included, to 2 px at its border."""
-    grid = box.project(method=method)
+@pytest.mark.parametrize("threshold", [-1, 0.5])
+def test_box_hides_a_run_of_the_ground(box, threshold) -> None:
+    """Hidden ground beside the box, walls without points included, to 2 px at its border.
+
+    Without votes (threshold -1) by the surface of the points alone.
+    """
+    grid = box.project(correlation_threshold=threshold)
     status = grid["status"].values
     hidden = hidden_truth(box)
     assert 800 < hidden.sum() < 20_000
@@ -177,7 +200,7 @@ def test_box_hides_a_run_of_the_ground(box, method) -> None:
     cols = np.flatnonzero((hidden | wall).any(axis=0))
     run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
     rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
-    tolerance = 1.5 if method == "geometric" else 4.5  # windows reach over edges
+    tolerance = 1.5 if threshold == -1 else 4.5  # windows reach over edges
     assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=tolerance)
 
 
@@ -190,7 +213,7 @@ def test_building_in_one_world_only_is_masked_as_changed(plane, box, only_in, tm
     else:
         shown, scanned = box, plane
         there = (box.surface[2] > HEIGHT) & (np.abs(box.truth - plane.truth) > 1)
-    project_with(*shown.images, [scanned.store], tmp_path / "out.zarr", method="both")
+    project_with(*shown.images, [scanned.store], tmp_path / "out.zarr")
     status = open_grid(tmp_path / "out.zarr")["status"].values
     labelled = status == Status.LABELLED
     inner = there & ~dilated(~there, 2)
@@ -208,7 +231,6 @@ def test_building_in_one_world_only_is_masked_as_changed(plane, box, only_in, tm
         scanned,
         tmp_path / "same",
         *(zarr.open_group(path)["image"][:] for path in scanned.images),
-        method="both",
     )
     assert not (without["status"].values == Status.CHANGED).any()
 
@@ -219,8 +241,8 @@ def test_right_view_has_its_own_labels(box) -> None:
     lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
     xy = box.model.ground_to_epipolar(lon, lat, height)
     truth = (xy[0] - xy[2]).reshape(box.model.shape)
-    right = box.project("of_right.zarr", method="both", view="right")
-    left = box.project("of_left.zarr", method="both")
+    right = box.project("of_right.zarr", view="right")
+    left = box.project("of_left.zarr")
     disparity, status = right["disparity"].values, right["status"].values
     labelled = np.isfinite(disparity)
     surface = np.isin(height, (HEIGHT, ROOF))
@@ -258,7 +280,7 @@ def test_water_is_masked_as_changed(plane, tmp_path) -> None:
         classification=water,
     )
     ingest(tmp_path / "water.las", tmp_path / "water.points")
-    project_with(*plane.images, [tmp_path / "water.points"], tmp_path / "out.zarr", method="both")
+    project_with(*plane.images, [tmp_path / "water.points"], tmp_path / "out.zarr")
     grid = open_grid(tmp_path / "out.zarr")
     status, east = grid["status"].values, plane.surface[0]
     assert not (status == Status.LABELLED)[east > 1.0].any()
@@ -267,11 +289,12 @@ def test_water_is_masked_as_changed(plane, tmp_path) -> None:
 
 
 def test_correlation_removes_most_of_what_is_hidden(box) -> None:
-    grid = box.project(method="correlation")
+    grid = box.project(recipe="paper")
     labelled = grid["status"].values == Status.LABELLED
     hidden = hidden_truth(box)
     assert labelled[hidden].mean() < 0.25
-    none = box.project(method="none")["status"].values == Status.LABELLED
+    every = box.project(recipe="paper", correlation_threshold=-1)
+    none = every["status"].values == Status.LABELLED
     assert none[hidden & (box.surface[2] == HEIGHT)].mean() > 0.95
 
 
@@ -292,7 +315,7 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
             (second, {"scheduler": "sync"}),
         ]
     ):
-        box.project(f"{number}.zarr", stores, method="both", **options)
+        box.project(f"{number}.zarr", stores, **options)
         digests.add(tree_digest(box.folder / f"{number}.zarr"))
     assert len(digests) == 1
 
@@ -312,7 +335,7 @@ def test_edge_margin_trades_labels_for_certainty(box) -> None:
     """Wider margins leave fewer labels and none of the wrong surface."""
     shares, wrong, edges = [], [], []
     for margin in (0.0, 0.1, 0.25, 0.5):
-        grid = box.project(method="geometric", edge_margin_px=margin)
+        grid = box.project(correlation_threshold=-1, edge_margin_px=margin)
         disparity = grid["disparity"].values
         known = np.isfinite(disparity) & np.isin(box.surface[2], (HEIGHT, ROOF))
         shares.append(known.mean())
@@ -334,13 +357,13 @@ def test_reasons_and_their_order(plane) -> None:
     flat = right.copy()
     flat[:] = 700
     folder = plane.folder / "others"
-    grid = project_and_open(plane, folder / "flat", left, flat, method="correlation")
+    grid = project_and_open(plane, folder / "flat", left, flat, recipe="paper")
     assert not (grid["status"].values == Status.LABELLED).any()
     assert (grid["status"].values == Status.LOW_CORRELATION).sum() > 30_000
 
     holed = left.copy()
     holed[100:110, 150:170] = 0
-    grid = project_and_open(plane, folder / "holed", holed, right, method="correlation")
+    grid = project_and_open(plane, folder / "holed", holed, right, recipe="paper")
     status = grid["status"].values
     # The window reaches 4 px to all sides, and one more for the interpolation.
     assert (status[96:114, 146:174] == Status.OUT_OF_FRAME).all()
@@ -348,13 +371,20 @@ def test_reasons_and_their_order(plane) -> None:
     count = grid["point_count"].values
     assert (count[status == Status.OUT_OF_FRAME] == 0).all()
 
-    grid = project_and_open(plane, folder / "few", left, right, method="none", min_points=4)
+    paper = {"recipe": "paper", "correlation_threshold": -1}
+    grid = project_and_open(plane, folder / "few", left, right, min_points=4, **paper)
     status, count = grid["status"].values, grid["point_count"].values
     assert (count[status == Status.LABELLED] >= 4).all()
     few = status == Status.BELOW_MINIMUM_COUNT
     assert few.any() and ((count[few] > 0) & (count[few] < 4)).all()
     assert np.isnan(grid["disparity"].values[few]).all()
     assert model.shape == status.shape
+
+    grid = project_and_open(plane, folder / "between", left, right, min_points=4)
+    status, between = grid["status"].values, grid["point_count"].values == 0
+    assert is_labelled(status[few]).mean() > 0.99
+    assert (status[few & is_labelled(status)] == Status.LABELLED_BETWEEN).all()
+    assert between[few].all()
 
 
 def project_and_open(scene: Scene, folder: Path, left, right, **options):
@@ -368,12 +398,12 @@ def project_and_open(scene: Scene, folder: Path, left, right, **options):
 
 
 def test_attributes_and_summary(plane) -> None:
-    grid = plane.project(method="correlation", code="abc", scene="plane-1")
+    grid = plane.project(recipe="paper", code="abc", scene="plane-1")
     for name in ("disparity", "status", "height", "point_count", "correlation", "uncertainty"):
         assert grid[name].dims == ("y", "x")
         assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
     status = grid["status"]
-    assert status.attrs["flag_values"] == list(range(9))  # none between points, by this method
+    assert status.attrs["flag_values"] == list(range(9))  # none between points, by this recipe
     assert status.attrs["flag_meanings"].split() == [s.name.lower() for s in Status][:9]
     assert grid.attrs["provenance"]["code"] == "abc"
     assert set(grid.attrs["provenance"]["inputs"]) == {"left", "right", "points/points.points"}
@@ -386,15 +416,17 @@ def test_attributes_and_summary(plane) -> None:
     json.dumps(dict(grid.attrs))
 
 
-def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box) -> None:
-    """Noise of 0.1 m is 0.09 px: uncertainty as known from it, and as the errors are."""
-    grid = noisy_box.project(method="none")
-    sigma, count = grid["uncertainty"].values, grid["point_count"].values
+def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box, monkeypatch) -> None:
+    """Noise of 0.1 m is 0.09 px: uncertainty of the labels of own points as known from it, and as
+    the errors are."""
+    own, layers = labels_of_own_points(noisy_box, monkeypatch)
+    measured = layers["status"] == Status.LABELLED
+    sigma, count = np.where(measured, np.sqrt(own.variance), np.nan), layers["point_count"]
     roof = noisy_box.surface[2] == ROOF
     clear = np.isfinite(sigma) & ~dilated(roof | (noisy_box.surface[2] > HEIGHT), 30)
     known = 0.1 * (FORWARD[1] - BACKWARD[1]) / 0.65  # px, of one point
     assert np.median((sigma * np.sqrt(count))[clear]) == pytest.approx(abs(known), rel=0.05)
-    ratio = np.abs(grid["disparity"].values - noisy_box.truth)[clear] / sigma[clear]
+    ratio = np.abs(own.disparity - noisy_box.truth)[clear] / sigma[clear]
     assert (ratio < 1).mean() == pytest.approx(0.68, abs=0.04)
     assert (ratio < 2).mean() == pytest.approx(0.95, abs=0.03)
 
@@ -405,7 +437,7 @@ def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path, view) -> Non
     alignment = alignment_of(plane.model, 1.0, view)
     alignment.save(tmp_path / "alignment.json")
     plain, grid = (
-        plane.project(f"{view}-{k}.zarr", method="none", view=view, **options)
+        plane.project(f"{view}-{k}.zarr", view=view, **options)
         for k, options in enumerate([{}, {"alignment": tmp_path / "alignment.json"}])
     )
     none, sigma = (g["uncertainty"].values.astype(float) for g in (plain, grid))
@@ -422,7 +454,7 @@ def test_uncertainty_carries_that_of_the_alignment(plane, tmp_path, view) -> Non
 def refused(scene: Scene, store: Path, match: str) -> None:
     out = scene.folder / "refused.zarr"
     with pytest.raises(InputError, match=match):
-        project_with(*scene.images, [store], out, method="none")
+        project_with(*scene.images, [store], out)
     assert not list(scene.folder.glob("refused*"))
 
 
@@ -433,13 +465,11 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     far = plane.points[:2000] + np.array([1.5, 3.0, 0])
     refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
     with pytest.raises(InputError, match=r"114\.3.*30\.6"):
-        project_with(
-            *plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr", method="none"
-        )
+        project_with(*plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr")
 
 
 def test_settings_are_checked(plane) -> None:
-    for options in ({"method": "guess"}, {"representative": "mean"}, {"window": 8}):
+    for options in ({"recipe": "guess"}, {"window": 8}, {"min_points": 0}):
         with pytest.raises(InputError, match="Remedy"):
             plane.project(**options)
     with pytest.raises(InputError, match="no point store"):
@@ -448,7 +478,7 @@ def test_settings_are_checked(plane) -> None:
 
 def test_store_bounds_and_density_are_kept(plane) -> None:
     """Points every 0.4 m over 230 m, in cells of 117 m."""
-    grid = plane.project(method="none")
+    grid = plane.project()
     assert grid.attrs["points_per_m2"] == pytest.approx(0.4**-2, rel=0.02)
     assert grid.attrs["points_per_px"] == pytest.approx((0.65 / 0.4) ** 2, rel=0.1)
     assert grid.attrs["points_bounds"] == list(PointStore(plane.store).bounds)

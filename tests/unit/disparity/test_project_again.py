@@ -48,7 +48,7 @@ def project(scene: Scene, stores: list[Path], out: Path, **options) -> set[str]:
     """Project; names of the blocks that were made."""
     done = out.with_name(f".{out.name}.work") / "done"
     before = {file.name: file.stat().st_mtime_ns for file in done.glob("*.json")}
-    project_with(*scene.images, stores, out, **{"method": "both", **options})
+    project_with(*scene.images, stores, out, **options)
     return {
         file.name
         for file in done.glob("*.json")

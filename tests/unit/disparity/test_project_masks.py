@@ -50,12 +50,7 @@ def hidden(shape: tuple[int, int], where: tuple[slice, slice]) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"method": "correlation"},
-        {"method": "both"},
-        {"method": "geometric"},
-        {"method": "both", "fill": "surface_and_images"},
-    ],
+    [{"recipe": "paper"}, {"recipe": "surface"}],
     ids=str,
 )
 @pytest.mark.parametrize("view", ["left", "right"])
@@ -88,7 +83,7 @@ def test_masked_pixels_of_either_view_have_a_status_and_no_label(
         assert np.isnan(grid[name].values[status == Status.MASKED]).all()
     assert (grid["point_count"].values[status == Status.MASKED] == 0).all()
     # what is no nearer than half a window and a step is as without masks
-    far = ~dilated(own | there, 7 if options["method"] != "geometric" else 3)
+    far = ~dilated(own | there, 7)
     np.testing.assert_array_equal(status[far], before["status"].values[far])
     np.testing.assert_array_equal(disparity[far], before["disparity"].values[far])
     assert (is_labelled(status) == np.isfinite(disparity)).all()

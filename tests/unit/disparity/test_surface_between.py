@@ -29,9 +29,9 @@ def box(tmp_path_factory) -> Scene:
     return Scene(tmp_path_factory.mktemp("box"), box=True, spacing=SPACING)
 
 
-@pytest.mark.parametrize("method", ["geometric", "both"])
-def test_a_plane_is_labelled_between_its_points(plane, method) -> None:
-    grid = plane.project(method=method, fill="surface")
+@pytest.mark.parametrize("threshold", [-1, 0.5])  # without votes of the images, and with them
+def test_a_plane_is_labelled_between_its_points(plane, threshold) -> None:
+    grid = plane.project(correlation_threshold=threshold)
     disparity, status = grid["disparity"].values, grid["status"].values
     labelled = is_labelled(status)
     assert np.array_equal(labelled, np.isfinite(disparity))
@@ -49,20 +49,20 @@ def test_a_plane_is_labelled_between_its_points(plane, method) -> None:
     assert "labelled_between" in grid["status"].attrs["flag_meanings"].split()
 
 
-def test_without_fill_nothing_tells_of_it_but_sparse_points_do(plane, caplog) -> None:
-    grid = plane.project(method="geometric", fill="none")
+def test_by_the_papers_recipe_sparse_points_tell_of_the_other(plane, caplog) -> None:
+    grid = plane.project(recipe="paper")
     assert "LiDAR points per m², pixels of 0.65 m: a point falls into" in caplog.text
-    assert "project.fill: surface" in caplog.text
+    assert "project.recipe: surface" in caplog.text
     assert 0.0 < grid.attrs["points_per_px"] < 0.1  # one in 15 pixels
     assert "labelled_between" not in grid["status"].attrs["flag_meanings"]
     assert "labelled_between" not in plane.summary["pixels"]
     assert not (grid["status"].values == Status.LABELLED_BETWEEN).any()
 
 
-@pytest.mark.parametrize("method", ["geometric", "both"])
-def test_nothing_hidden_by_a_box_has_a_label(box, method) -> None:
+@pytest.mark.parametrize("threshold", [-1, 0.5])
+def test_nothing_hidden_by_a_box_has_a_label(box, threshold) -> None:
     """No hidden pixel, no wall, no label of the wrong surface; what is clear keeps its label."""
-    grid = box.project(method=method, fill="surface")
+    grid = box.project(correlation_threshold=threshold)
     status, disparity = grid["status"].values, grid["disparity"].values
     labelled = is_labelled(status)
     hidden = hidden_truth(box)
@@ -88,23 +88,22 @@ def test_right_view_is_labelled_between_points_too(box) -> None:
     lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
     xy = box.model.ground_to_epipolar(lon, lat, height)
     truth = (xy[0] - xy[2]).reshape(box.model.shape)
-    grid = box.project("of_right.zarr", method="both", fill="surface", view="right")
+    grid = box.project("of_right.zarr", view="right")
     labelled = is_labelled(grid["status"].values)
     assert labelled.sum() > 20_000
     assert np.abs(grid["disparity"].values - truth)[labelled].max() < 1e-3
 
 
 @pytest.mark.parametrize(
-    ("view", "fill"), [("left", "surface"), ("right", "surface"), ("left", "surface_and_images")]
+    ("view", "recipe"), [("left", "surface"), ("right", "surface"), ("left", "paper")]
 )
-def test_any_cut_and_any_order_give_the_same_bytes(box, view, fill) -> None:
+def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
     def scene() -> SceneInputs:
-        settings = Settings(method="both", fill=fill)
-        return SceneInputs(*box.images, (box.store,), settings, view)
+        return SceneInputs(*box.images, (box.store,), Settings(recipe=recipe), view)
 
     rows, cols = slice(60, 220), slice(70, 250)
     whole = label_window(scene(), rows, cols)[0]
-    assert is_labelled(whole["status"]).mean() > 0.5
+    assert is_labelled(whole["status"]).mean() > (0.5 if recipe == "surface" else 0.03)
     part = scene()
     store = part.stores[0]
     read = store.query
@@ -124,32 +123,11 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view, fill) -> None:
             assert values.tobytes() == np.ascontiguousarray(whole[name][where]).tobytes(), name
 
 
-@pytest.mark.parametrize(
-    ("options", "fills", "asks"),
-    [
-        ({}, True, False),
-        ({"fill": "none"}, False, False),
-        ({"fill": "surface_and_images"}, True, True),
-        ({"fill": "surface_and_images", "method": "geometric"}, True, False),
-        ({"method": "correlation"}, False, False),  # the paper's ways know no surface
-        ({"representative": "paper"}, False, False),
-    ],
-)
-def test_labels_between_points_need_the_surface(options, fills, asks) -> None:
-    found = Settings(**options)
-    assert (found.fills, found.asks_images) == (fills, asks)
-    assert (Status.LABELLED_BETWEEN in found.statuses) == fills
-
-
-def test_without_fill_labels_are_those_of_pixels_with_points(box) -> None:
-    filled = box.project("filled.zarr", method="both")
-    bare = box.project("bare.zarr", method="both", fill="none")
-    measured = filled["status"].values == Status.LABELLED
-    assert measured.sum() > 2_000
-    assert np.array_equal(bare["status"].values == Status.LABELLED, measured)
-    for name in ("disparity", "uncertainty", "height", "point_count"):
-        assert np.array_equal(bare[name].values[measured], filled[name].values[measured])
-    assert np.isnan(bare["disparity"].values[~measured]).all()
+@pytest.mark.parametrize("recipe", ["surface", "paper"])
+def test_labels_between_points_need_the_surface(recipe) -> None:
+    statuses = Settings(recipe=recipe).statuses
+    assert (Status.LABELLED_BETWEEN in statuses) == (recipe == "surface")
+    assert not {Status.LABELLED_BY_IMAGES, Status.MASKED} & set(statuses)
 
 
 @pytest.mark.parametrize("porous", [True, False])
@@ -164,8 +142,6 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(poro
         variance=zeros,
         height=zeros,
         surface_class=zeros.astype(np.uint8),
-        highest=level,
-        rough=zeros.astype(bool),
         bulging=np.arange(8) + zeros == 5,
         places=None,
     )

@@ -1,0 +1,71 @@
+"""The paper's own way from points to labels (section III-C).
+
+1. A point is dropped if the windows of both images around its places do not correlate
+   (:func:`.paper_correlation.correlate`), whatever the reason: hidden, changed, moved.
+2. A pixel's label is the disparity of one point: mean longitude and latitude of its points that
+   are left, at the height of the highest.
+3. A pixel with fewer than ``min_points`` of them has no label.
+
+What the paper does not have is each label's uncertainty: the points' noise, pooled over 3 x 3
+pixels, by the root of their number.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lidar.lattice import PER_DEG
+from .image_patches import Patch
+from .paper_correlation import correlate
+from .pixel_labels import Labels, Pixels, condense, noise_variance
+from .pixel_points import PixelPoints
+from .settings import Settings
+from .status import Status
+from .view_geometry import ViewGeometry
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def paper_labels(
+    settings: Settings,
+    model: ViewGeometry,
+    points: PixelPoints,
+    left: Patch,
+    right: Patch,
+    px_per_m: float,
+) -> tuple[Pixels, Labels, NDArray[np.uint8]]:
+    """Pixels, labels and status [h, w] of a window from its points in both frames.
+
+    ``left``, ``right``: patches read for the settings' window. ``px_per_m``: disparity of a metre
+    of height.
+    """
+
+    def at_highest(sums: Ints, highest: Floats) -> Floats:
+        """Places [4, pixels] (px) of mean longitude and latitude at the greatest height."""
+        place = np.full((4, highest.size), np.nan)
+        known = np.flatnonzero(sums[:, 0])
+        lon, lat = (sums[known, axis] / sums[known, 0] / PER_DEG for axis in (1, 2))
+        place[:, known] = model.ground_to_epipolar(lon, lat, highest[known])
+        return place
+
+    every = np.ones(points.points.size, dtype=np.bool_)
+    correlation = correlate(points, every, left, right, settings.window)
+    correlated = correlation >= settings.correlation_threshold
+    pixels = condense(points, correlated, at_highest, correlation)
+    labelled = pixels.count > 0
+    level = np.zeros((2, *labelled.shape))
+    noise = noise_variance(pixels, labelled, level, px_per_m)
+    labels = Labels(
+        disparity=np.where(labelled, pixels.disparity, np.nan),
+        slope=level,
+        variance=noise / np.maximum(pixels.count, 1),
+    )
+    status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
+    status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
+    status[points.masked.reshape(points.shape)] = Status.MASKED
+    status[points.count > 0] = Status.LOW_CORRELATION
+    status[labelled] = Status.LABELLED
+    status[labelled & (pixels.count < settings.min_points)] = Status.BELOW_MINIMUM_COUNT
+    return pixels, labels, status
