@@ -49,7 +49,7 @@ def test_a_job_that_reads_it_says_so(damaged, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with (
         pytest.raises(InputError, match=r"left\.zarr/image/c/1/0: damaged"),
-        publication([str(damaged)], ["out.txt"], ""),
+        publication([str(damaged)], ["out.txt"], {}),
     ):
         require_complete(damaged)["image"][:]
 
