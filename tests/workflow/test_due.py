@@ -9,6 +9,7 @@ import pytest
 import snakemake.cli  # noqa: F401  first: the others import in a circle
 from snakemake.dag import DAG
 from snakemake.io import _IOFile
+from snakemake.jobs import Job
 from snakemake.persistence import PersistenceBase
 
 REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the version"
@@ -21,6 +22,8 @@ REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the ve
         (PersistenceBase.has_metadata, ["self", "job"]),
         (PersistenceBase.has_outdated_metadata, ["self", "job"]),
         (PersistenceBase.input_changed, ["self", "job", "file"]),
+        (PersistenceBase.code_changed, ["self", "job", "file"]),
+        (Job.outputs_older_than_script_or_notebook, ["self"]),
         (_IOFile.is_newer, ["self", "time"]),
         (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
         (PersistenceBase.started, ["self", "job", "external_jobid"]),
@@ -41,7 +44,7 @@ def test_a_plan_asks_these_questions_and_no_others():
         "has_outdated_metadata",
         "params_changed",
         "input_changed",
-        "code_changed",  # not among the triggers of profiles/default
+        "code_changed",
         "software_stack_changed",  # of conda and containers: Snakemake's own
     }, REMEDY
     assert "f.is_newer" in source, REMEDY

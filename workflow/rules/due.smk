@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from snakemake.dag import DAG
 from snakemake.io import _IOFile
+from snakemake.jobs import Job
 from snakemake.logging import logger
 from snakemake.persistence import PersistenceBase, ParamsChange
 
@@ -36,7 +37,7 @@ def instead(of, name, answer):
     before = getattr(of, name)
 
     def either(self, *arguments, **named):
-        asked = self if isinstance(self, _IOFile) else arguments[0]
+        asked = self if isinstance(self, (_IOFile, Job)) else arguments[0]
         ours = is_recorded(asked.rule)
         return (answer if ours else before)(self, *arguments, **named)
 
@@ -57,6 +58,11 @@ async def never(*_):
     return False
 
 
+async def none(*_):
+    for output in ():
+        yield output
+
+
 def started(persistence, job, *more, before=PersistenceBase.started, **named):
     if is_recorded(job.rule):
         mark_begun(job.output[0])  # its record takes the mark away, and nothing else does
@@ -72,6 +78,8 @@ instead(PersistenceBase, "params_changed", due)
 instead(PersistenceBase, "has_metadata", lambda *_: True)
 instead(PersistenceBase, "has_outdated_metadata", lambda *_: False)
 instead(PersistenceBase, "input_changed", lambda *_, **__: [])
+instead(PersistenceBase, "code_changed", lambda *_, **__: [])
+instead(Job, "outputs_older_than_script_or_notebook", none)  # without profiles/default
 instead(_IOFile, "is_newer", never)
 instead(DAG, "check_output_mtime", never)
 PersistenceBase.started = started
