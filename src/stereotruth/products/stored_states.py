@@ -20,7 +20,7 @@ from .remote_files import bucket
 
 log = logging.getLogger("stereotruth")
 
-STATES = ".records/stored.json"
+STATES = ".stored.json"
 CONTENT = ("ETag", "LastModified", "created")  # what tells contents apart, the first that there is
 
 

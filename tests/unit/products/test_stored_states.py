@@ -70,8 +70,8 @@ def test_what_was_touched_is_made_again(stored, how):
 
 def test_a_damaged_record_of_the_states_is_as_none(stored):
     states, storage, place, products = stored
-    storage.pipe_file(f"{place}/.records/stored.json", b"{")
+    storage.pipe_file(f"{place}/.stored.json", b"{")
     assert states.mark_changed() == []
-    storage.rm_file(f"{place}/.records/stored.json")
+    storage.rm_file(f"{place}/.stored.json")
     assert states.mark_changed() == []
     assert marked(products) == [False, False, False]
