@@ -42,8 +42,9 @@ class Pixels:
 
     ``count`` of the points used; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the point
     that stands for the pixel; ``highest`` (m); ``correlation`` mean of the points';
-    ``surface_class`` ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points, about their mean,
-    of uu, uv, vv, uz, vz, zz, with (u, v) the place in the left grid and z the disparity, px².
+    ``surface_class`` ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points,
+    about their mean, of uu, uv, vv, uz, vz, zz, with (u, v) the place in the left grid and z the
+    disparity, px².
     """
 
     count: NDArray[np.int64]
