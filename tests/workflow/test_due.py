@@ -24,6 +24,7 @@ REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the ve
         (PersistenceBase.input_changed, ["self", "job", "file"]),
         (PersistenceBase.code_changed, ["self", "job", "file"]),
         (Job.outputs_older_than_script_or_notebook, ["self"]),
+        (Job.cleanup, ["self", "skip_outputs"]),
         (_IOFile.is_newer, ["self", "time"]),
         (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
         (PersistenceBase.started, ["self", "job", "external_jobid"]),

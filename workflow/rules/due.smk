@@ -69,6 +69,12 @@ def started(persistence, job, *more, before=PersistenceBase.started, **named):
     return before(persistence, job, *more, **named)
 
 
+async def cleaned(job, *more, before=Job.cleanup, **named):
+    if is_recorded(job.rule):
+        mark_begun(job.output[0])  # a job that failed after its record was written, too
+    return await before(job, *more, **named)
+
+
 def if_possible(persistence, before=PersistenceBase.save_iocache):
     with suppress(OSError):  # a plan in a folder that is read-only
         before(persistence)
@@ -83,4 +89,5 @@ instead(Job, "outputs_older_than_script_or_notebook", none)  # without profiles/
 instead(_IOFile, "is_newer", never)
 instead(DAG, "check_output_mtime", never)
 PersistenceBase.started = started
+Job.cleanup = cleaned
 PersistenceBase.save_iocache = if_possible
