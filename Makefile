@@ -28,9 +28,9 @@ help:
 $(READY): envs/requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("Python 3.11 or later is needed, this is %d.%d: set PYTHON=/path/to/python3.11" % v[:2])'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r envs/requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r envs/requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	-$(BIN)/python -m compileall -q -j 0 .venv/lib src  # each of a run's jobs starts a Python
+	-$(BIN)/python -m compileall -q -j 0 -x '/tests/' .venv/lib src  # by all cores; pip would by one
 	-$(MAKE) --no-print-directory -j $(CORES) first-run
 	touch $@
 
@@ -42,7 +42,7 @@ first-labels:
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -q -p no:cacheprovider tests/unit/disparity/test_project.py -k same_in_any_order
 
 first-city:
-	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init --example .venv/first && \
+	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init .venv/first --example demo && \
 	  cd .venv/first && stereotruth run tiles/Demo --cores $(CORES) --quiet && cd ../.. && rm -rf .venv/first
 
 tiles/%: $(READY) FORCE

@@ -5,19 +5,30 @@ from pathlib import Path
 from snakemake.exceptions import WorkflowError
 from snakemake.utils import min_version
 
-from stereotruth.errors import InputError
+from stereotruth.errors import InputError, in_words
 from stereotruth.project import read_mapping
 
 min_version("9.10")
 
 
-if Path("config/config.yaml").is_file():  # of the working directory; see common.smk
-    try:
-        read_mapping(Path("config/config.yaml"))  # Snakemake names no file that it cannot read
-    except InputError as error:
-        raise WorkflowError(str(error))
+class Refused(WorkflowError):
+    """What users are meant to read: Snakemake shows it without the lines that it came from."""
 
-    configfile: "config/config.yaml"
+    __traceback__ = None  # where Snakemake looks for them
+
+
+OWN_CONFIG = Path("config/config.yaml")  # of the working directory; see common.smk
+try:
+    with in_words():
+        has_config = OWN_CONFIG.is_file()
+    if has_config:
+        read_mapping(OWN_CONFIG)  # Snakemake names no file that it cannot read
+except InputError as error:
+    raise Refused(str(error))
+
+if has_config:
+
+    configfile: str(OWN_CONFIG)
 
 
 include: "workflow/rules/common.smk"
@@ -32,6 +43,7 @@ include: "workflow/rules/align.smk"
 include: "workflow/rules/refine.smk"
 include: "workflow/rules/rectify.smk"
 include: "workflow/rules/project.smk"
+include: "workflow/rules/image_heights.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/evaluate_images.smk"
 include: "workflow/rules/evaluate.smk"

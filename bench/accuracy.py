@@ -15,24 +15,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
+from checkpoints import evaluate_checkpoints
 from drawn_cities import DENSITIES, NAMED, compare_drawn
-from synthetic_pairs import label_by
+from geometry_errors import geometry_errors
+from synthetic_pairs import label_by, labels_of
+from warped_panels import draw_panels
 
 from stereotruth import sheets
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.configuration import Configuration
 from stereotruth.dataset import warped_tile
 from stereotruth.dataset.manifest import labelled_tiles
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.error_statistics import LIMITS, ErrorSum
 from stereotruth.errors import InputError
-from stereotruth.evaluation import checkpoints, geometry_errors, labels_against_truth, scene_warping
+from stereotruth.evaluation import labels_against_truth
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.evaluation.scene_warping import warp_scene
+from stereotruth.numerics.error_sums import LIMITS, ErrorSum
 from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
+from stereotruth.project import read_mapping
+from stereotruth.settings import merged
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -47,16 +52,6 @@ GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to
     ("in LiDAR only labelled %", "in_lidar_only", None, 5.0, 100),
     ("SIFT mean abs px, building", "sift_building", None, 0.32, 1),
 )
-
-
-def overridden(base: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with the keys of another file in place of its own."""
-    for key, value in extra.items():
-        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
-            overridden(base[key], value)
-        else:
-            base[key] = value
-    return base
 
 
 def share(value: float | None) -> str:
@@ -218,7 +213,7 @@ def table4(city: str) -> list[dict[str, str]]:
 
 
 def geometry_row(scene: str, alignment: str, model: EpipolarModel, store: Path) -> dict[str, str]:
-    return error_row(scene, alignment, *geometry_errors.geometry_errors(model, store))
+    return error_row(scene, alignment, *geometry_errors(model, store))
 
 
 def error_row(scene: str, alignment: str, *sums: ErrorSum) -> dict[str, str]:
@@ -276,7 +271,7 @@ class Made:
         return folder / "truth.zarr"
 
 
-def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers: int) -> Path:
+def with_exact_gcps(made: Made, folder: Path, config: Configuration, workers: int) -> Path:
     """Align with noise-free GCPs, rectify and project again; the disparity store."""
     scene = made.scene
     shutil.rmtree(folder, ignore_errors=True)
@@ -284,12 +279,12 @@ def with_exact_gcps(made: Made, folder: Path, config: Mapping[str, Any], workers
         scene.left_image,
         scene.right_image,
         made.input / "gcps_exact.csv",
-        model=config["alignment"]["model"],
+        model=config.alignment.model,
         scene=scene.scene,
     )
     folder.mkdir(parents=True)
     images = scene.left_image, scene.right_image
-    return label_by(aligned, images, made.points, folder, Settings.of(config), workers=workers)
+    return label_by(aligned, images, made.points, folder, labels_of(config), workers=workers)
 
 
 def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
@@ -301,22 +296,22 @@ def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
         tile = warped_tile.warp_tile(made.tiles, of.row)
         found.append({"tile": tile.name, "correlation": f"{tile.correlation:.4f}"})
         if k < count:
-            scene_warping.draw_panels(tile, folder / f"{tile.name}.png")
+            draw_panels(tile, folder / f"{tile.name}.png")
     return found
 
 
-def read_config(files: Sequence[Path]) -> dict[str, Any]:
-    """The project's configuration with the keys of other files in place of its own."""
-    config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
+def read_config(files: Sequence[Path]) -> Configuration:
+    """The defaults with the keys of files in place of theirs."""
+    values: dict[str, Any] = {}
     for file in files:
-        overridden(config, yaml.safe_load(file.read_text(encoding="utf-8")) or {})
-    return config
+        values = merged(values, read_mapping(file))
+    return Configuration.of(values)
 
 
-def scenes_made(config: Mapping[str, Any], only: Sequence[str] | None) -> list[Made]:
+def scenes_made(config: Configuration, only: Sequence[str] | None) -> list[Made]:
     """The scenes of the sheet, of these cities or of all, that the workflow has made."""
-    cities = sheets.read_cities(config["cities"])
-    scenes = sheets.read_scenes(config["scenes"], cities)
+    cities = sheets.read_cities(config.cities)
+    scenes = sheets.read_scenes(config.scenes, cities)
     present = []
     for made in (Made(s) for s in scenes.values() if not only or s.city in only):
         if made.disparity.is_dir():
@@ -354,7 +349,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             model = EpipolarModel.from_dict(require_complete(made.disparity).attrs["epipolar"])
             if not raw.is_dir():
                 print(f"{name}: for the alignment alone, make {raw} (snakemake --cores 2 {raw})")
-            elif made.refined.is_file() and config["alignment"]["refine"]:
+            elif made.refined.is_file() and config.alignment.refine:
                 report["geometry"].append(geometry_row(name, "GCPs", made.before(model), raw))
             if raw.is_dir():
                 report["geometry"].append(geometry_row(name, "as used", model, raw))
@@ -370,14 +365,15 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             if raw.is_dir():
                 report["geometry"].append(geometry_row(name, "noise-free GCPs", model, raw))
         if (made.input / "checkpoints.csv").is_file():
-            figures = checkpoints.evaluate_checkpoints(
+            figures = evaluate_checkpoints(
                 made.disparity, made.input / "checkpoints.csv", scene=name
             )
             report["points"].append({"scene": name, **figures})
-        warped = scene_warping.evaluate_warping(made.left, made.right, made.disparity)
+        sums = warp_scene(made.left, made.right, made.disparity).sums
+        warped = {"pixels": sums.count, "correlation": round(sums.coefficient, 6)}
         tiles_warped = panels(made, arguments.panels or Path(), 2 if arguments.panels else 0)
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
-    settings = Settings.of(config)
+    settings = labels_of(config)
     for name in arguments.drawn:
         for density in DENSITIES:
             drawn = compare_drawn(name, density, settings, arguments.workers)

@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
@@ -29,7 +28,8 @@ from stereotruth.evaluation.audit.matches import Matches, match_pair
 from stereotruth.evaluation.audit.pair import EXTRA_PX, measure_arrays
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, UNDECIDED, judge
-from stereotruth.products.files import replacing
+from stereotruth.matching.benchmark.settings import DATASETS
+from stereotruth.products.files import atomic_file
 from stereotruth.products.grids import require_complete
 from stereotruth.products.rasters import read_image
 
@@ -151,7 +151,7 @@ def run_pair(
         if name not in found:
             figures = measured(a, b, labels, match_pair(a, b, reach), dataset.disparity_range)
             found[name] = {"check": check, "figures": figures}
-    with replacing(file) as scratch:
+    with atomic_file(file) as scratch:
         scratch.write_text(json.dumps(found))
 
 
@@ -195,10 +195,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=1e9, help="start no pair after this time")
     arguments = parser.parse_args()
-    config = yaml.safe_load((PROJECT / "config/config.yaml").read_text())
-    settings = config["benchmark"]["datasets"]["synthetic"] | {"root": str(arguments.dataset)}
-    dataset = StereoDataset.of("synthetic", settings)
-    limits = Settings(**config["audit"])
+    dataset = StereoDataset.of("own", DATASETS["synthetic"] | {"root": str(arguments.dataset)})
+    limits = Settings()
     pairs = dataset.pairs(labelled=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)

@@ -14,10 +14,10 @@ from wooded_scenes import MIXED, Draw, Scene
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
 from stereotruth.disparity.settings import Settings
-from stereotruth.error_statistics import ErrorSum
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.evaluation.labels_against_truth import SceneComparison, compare_scene
-from stereotruth.products.files import whole_folder
+from stereotruth.numerics.error_sums import ErrorSum
+from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
 
 FOLDER = Path("results/accuracy/drawn")
@@ -55,7 +55,7 @@ def compare_drawn(name: str, density: float, settings: Settings, workers: int) -
     code = source_digest("alignment.refine", "disparity.project")[:8]
     made = FOLDER / f"{name}-{density:g}-{code}"
     if not made.is_dir():
-        with whole_folder(made) as scratch:
+        with atomic_folder(made) as scratch:
             refined, _ = refine(alone, *scene.images, scene.stores, provenance={})
             label_by(refined, scene.images, scene.stores, scratch, settings, workers=workers)
             write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",

@@ -28,10 +28,11 @@ from stereotruth.dataset.sift_matches import TileMatches, match_tile
 from stereotruth.dataset.tile_files import LabelsKnown
 from stereotruth.dataset.windows import cell_step, choose_windows, scan_scene
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.products.files import whole_folder
+from stereotruth.products.files import atomic_folder
 from stereotruth.simulate.truth import truth_at
 
 SIDE_PX = 1400
@@ -67,16 +68,15 @@ def labelled(scene: Scene, gcps: int, refined: bool) -> SceneStores:
         if refined:
             alignment, _ = refine(alignment, *scene.images, scene.stores)
         model = epipolar_model(alignment)
-        with whole_folder(folder) as made:
+        with atomic_folder(folder) as made:
             stores = [made / f"{view}.zarr" for view in VIEWS]
             attrs = LabelUncertainty.of(alignment, model).to_attrs()
             with open_pair(*scene.images) as opened:
                 rectify(
                     *opened, model, made / "epipolar.json", *stores, workers=1, left_attrs=attrs
                 )
-            project_scene(
-                *stores, scene.stores, made / "disparity.zarr", Settings(), code="", workers=1
-            )
+            inputs = SceneInputs.of(*stores, scene.stores, Settings())
+            project_scene(inputs, made / "disparity.zarr", code="", workers=1)
     files = [folder / f"{kind}.zarr" for kind in ("disparity", *VIEWS)]
     return open_stores(SceneFiles("Wooded", *files))
 

@@ -11,15 +11,15 @@ import xarray as xr
 from numpy.typing import NDArray
 from synthetic_pairs import Pair
 
-from stereotruth.disparity.label_window import label_window
 from stereotruth.disparity.project import MAX_POINTS, SHARD
+from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.evaluation.labels_against_truth import Truth
-from stereotruth.lidar.lattice import DEGREE_M
 from stereotruth.lidar.point_store import Points, PointStore
+from stereotruth.numerics.degrees import DEGREE_M
 
 
 class Thinned(PointStore):

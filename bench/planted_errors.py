@@ -49,6 +49,7 @@ from stereotruth.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.numerics.robust import reweighted_fit, robust_sigma, tukey_weights
 from stereotruth.products.ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
@@ -118,12 +119,10 @@ def lidar_offset(scene: Scene) -> tuple[Floats, Floats]:
             rows.append([-plane[0], -plane[1], 1.0])
             seen.append(plane[2])
     a, b = np.array(rows), np.array(seen)
-    weight = np.ones(len(b))
-    for _ in range(30):  # Tukey's biweight
-        root = np.sqrt(weight)
-        offset = np.linalg.lstsq(a * root[:, None], b * root, rcond=None)[0]
-        sigma = 1.4826 * np.median(np.abs(b - a @ offset))
-        weight = np.clip(1.0 - ((b - a @ offset) / (4.685 * sigma)) ** 2, 0.0, None) ** 2
+    plain = np.linalg.lstsq(a, b, rcond=None)[0]
+    offset = reweighted_fit(a, b, tukey_weights, least_sigma=1e-4, start=plain)
+    sigma = robust_sigma(b - a @ offset, 1e-4)
+    weight = tukey_weights((b - a @ offset) / sigma)
     covariance = sigma**2 * np.linalg.inv((a * weight[:, None]).T @ a)
     return offset, np.sqrt(np.diag(covariance))
 

@@ -17,7 +17,7 @@ from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.labels_against_truth import CLASSES, WATER
-from stereotruth.products.files import whole_folder
+from stereotruth.products.files import atomic_folder
 from stereotruth.simulate.render import prepare
 from stereotruth.simulate.surfaces import GROUND, TREE, terrain_heights
 from stereotruth.simulate.truth import truth_at
@@ -61,7 +61,7 @@ def coverage(error: NDArray, sigma: NDArray) -> Figures:
 def label_figures(scene: Scene, alignment: Alignment, folder: Path) -> Figures:
     """Labels of the block in the middle, by an alignment of the scene, against exact truth."""
     made = folder / "rectified" / scene.draw.key()
-    with whole_folder(made) as scratch:
+    with atomic_folder(made) as scratch:
         rectify_by(alignment, scene.images, scratch)
     rows, cols = EpipolarModel.load(made / "epipolar.json").shape
     window = (

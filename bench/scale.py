@@ -26,7 +26,7 @@ from rasterio.rpc import RPC
 from rasterio.windows import Window
 
 from stereotruth.products.pictures import SERIES
-from stereotruth.simulate.camera import aim, locate, project
+from stereotruth.simulate.camera import Pass, aim, locate, project
 from stereotruth.simulate.geodesy import LocalFrame
 from stereotruth.simulate.rpcs import draw_bias, fit_rpc
 
@@ -156,12 +156,10 @@ def make_scene(folder: Path, given: argparse.Namespace) -> dict[str, float]:
         camera = aim(
             frame,
             np.zeros(3),
-            view,
+            Pass.drawn(view, 3, ascending=False),
             gsd=GSD,
             cols=given.cols,
             rows=given.rows,
-            seed=3,
-            ascending=False,
         )
         bias = draw_bias(given.cols, given.rows, 3, view)
         rpc = fit_rpc(

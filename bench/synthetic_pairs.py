@@ -18,13 +18,15 @@ from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
+from stereotruth.configuration import Configuration
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images, smooth
-from stereotruth.products.files import whole_folder
+from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files
@@ -75,6 +77,11 @@ def sun_an_hour_later(city: CitySpec) -> tuple[float, float]:
     north = pole * math.cos(lat) - meridian * math.sin(lat)
     up = pole * math.sin(lat) + meridian * math.cos(lat)
     return math.degrees(math.atan2(east, north)) % 360.0, math.degrees(math.asin(up))
+
+
+def labels_of(config: Configuration) -> Settings:
+    """How points become labels by a configuration."""
+    return Settings(**{name: getattr(config.project, name) for name in vars(Settings())})
 
 
 @dataclass(frozen=True)
@@ -147,10 +154,9 @@ def label_by(
     made = folder / "disparity.zarr"
     rectified = (folder / f"{view}.zarr" for view in VIEWS)
     code = source_digest("disparity.project")
-    project_scene(
-        *rectified, stores, made, settings, alignment=folder / "alignment.json", workers=workers,
-        code=code,
-    )  # fmt: skip
+    alignment_file = folder / "alignment.json"
+    inputs = SceneInputs.of(*rectified, stores, settings, alignment=alignment_file)
+    project_scene(inputs, made, workers=workers, code=code)
     return made
 
 
@@ -193,7 +199,7 @@ class Pair:
             return own
         made = folder / condition / self.name
         if not made.is_dir():
-            with whole_folder(made) as scratch:
+            with atomic_folder(made) as scratch:
                 self._rectify(CONDITIONS[condition], scratch)
         return made
 
@@ -227,7 +233,7 @@ def fresh_pair(number: int, folder: Path) -> Pair:
     city = replace(drawn, name=name, scenes=(replace(drawn.scenes[0], name=name),))
     pair = Pair(city, name, folder / "data" / name, folder / "results")
     if not pair.data.is_dir():
-        with whole_folder(pair.data) as data:
+        with atomic_folder(pair.data) as data:
             for view in VIEWS:
                 simulate_image(city, pair.spec, view, data / f"{view}.tif", seed=SEED)
             for file in lidar_files(city, pair.spec):
@@ -236,7 +242,7 @@ def fresh_pair(number: int, folder: Path) -> Pair:
                 )
     stores = pair.results / "ingest" / name / name
     if not stores.is_dir():
-        with whole_folder(stores) as scratch:
+        with atomic_folder(stores) as scratch:
             for file in lidar_files(city, pair.spec):
                 store = scratch / f"{Path(file).stem}.points"
                 ingest(pair.data / "lidar" / file, store, scene=name)

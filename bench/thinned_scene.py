@@ -11,14 +11,15 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+from checkpoints import evaluate_checkpoints
 from label_tables import print_table, shown
 from synthetic_pairs import VIEWS, rectify_pair
 
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.evaluation.checkpoints import evaluate_checkpoints
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.files import whole_folder
+from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
 
 
@@ -26,7 +27,7 @@ def thinned(scene: Path, every: int, folder: Path) -> list[Path]:
     """Point stores of every n-th point, made once."""
     made = folder / f"every_{every}"
     if not made.is_dir():
-        with whole_folder(made) as scratch:
+        with atomic_folder(made) as scratch:
             for file in sorted((scene / "lidar").glob("*.la[sz]")):
                 points = laspy.read(file)
                 points.points = points.points[np.arange(0, len(points), every)]
@@ -41,7 +42,7 @@ def rectified(scene: Path, stores: list[Path], folder: Path) -> Path:
     made = folder / "rectified"
     if not made.is_dir():
         images = [scene / f"{view}.tif" for view in VIEWS]
-        with whole_folder(made) as scratch:
+        with atomic_folder(made) as scratch:
             rectify_pair(images, scene / "gcps.csv", stores, scratch)
     return made
 
@@ -60,14 +61,10 @@ def main() -> None:
         pair = rectified(options.scene, stores, options.folder / f"every_{every}_pair")
         for recipe in options.recipe:
             store = options.folder / f"every_{every}_{recipe}.zarr"
-            project_scene(
-                *(pair / f"{view}.zarr" for view in VIEWS),
-                stores,
-                store,
-                Settings(recipe=recipe),
-                alignment=pair / "alignment.json",
-                code=source_digest("disparity.project"),
-            )
+            images = (pair / f"{view}.zarr" for view in VIEWS)
+            settings, alignment = Settings(recipe=recipe), pair / "alignment.json"
+            inputs = SceneInputs.of(*images, stores, settings, alignment=alignment)
+            project_scene(inputs, store, code=source_digest("disparity.project"))
             f = evaluate_checkpoints(store, options.scene / "checkpoints.csv")
             share = 100.0 * f["labelled"] / f["points"]
             cells = [f"{f['median']:+.3f}", f"{f['nmad']:.3f}", f"{f['y_parallax_rms']:.3f}"]

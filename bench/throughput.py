@@ -31,7 +31,6 @@ import laspy
 import numpy as np
 import pyproj
 import rasterio
-import yaml
 from rasterio.transform import RPCTransformer
 
 import stereotruth
@@ -41,6 +40,7 @@ from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.paper_correlation import correlate
 from stereotruth.disparity.pixel_points import Collection
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.model import EpipolarModel
@@ -52,7 +52,7 @@ from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.projection_polynomials import PatchedTransform
 from stereotruth.products.grids import Layer, require_complete
 from stereotruth.products.provenance import source_digest
-from stereotruth.products.resumable_grids import making
+from stereotruth.products.resumable_grids import resumable_grid
 from stereotruth.simulate.cities import CITIES, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -74,12 +74,14 @@ with job(log, "ingest"):
 PROJECT_JOB = """
 import json, sys
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.job import job
-left, right, points, out, log, settings, options = sys.argv[1:]
-settings = Settings(**json.loads(settings))
+left, right, points, out, log, alignment, settings, options = sys.argv[1:]
+points, settings = json.loads(points), Settings(**json.loads(settings))
+inputs = SceneInputs.of(left, right, points, settings, alignment=alignment)
 with job(log, "project"):
-    project_scene(left, right, json.loads(points), out, settings, **json.loads(options))
+    project_scene(inputs, out, **json.loads(options))
 """
 BOUNDS = {  # part of a profile: what its time goes into
     "laspy": "arithmetic decoding, bit by bit: the floor",
@@ -92,10 +94,11 @@ BOUNDS = {  # part of a profile: what its time goes into
     "pixel_points": "scattered writes of the sort: cache misses",
     "seen_surface": "scattered updates of the surface",
     "vertices": "scattered updates of the cells",
-    "point_triangles": "exact tests and cache misses, a vertex at a time",
-    "smooth_triangles": "passes over all triangles: memory",
-    "outlines": "points on both sides of each edge",
-    "surface_between": "triangles drawn into both views",
+    "delaunay": "exact tests and cache misses, a vertex at a time",
+    "facets": "passes over all triangles: memory",
+    "step_points": "points on both sides of each edge",
+    "breaklines": "half-planes of the points on both sides of each edge",
+    "facet_raster": "triangles drawn into both views",
     "pixel_labels": "exact sums by pixel: one pass over the points",
     "image_agreement": "windows of pixels, not of points",
     "paper_correlation": "200 samples a point in vectors: arithmetic",
@@ -286,8 +289,12 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     ingest_all([smallest], folder / "points", 1, env)
     smallest_store = folder / "points" / f"{smallest.stem}.points"
     code = source_digest("disparity.project")
-    options = {"alignment": str(folder / "alignment.json"), "code": code}
-    project_scene(left, right, [smallest_store], out, Settings(**settings), **options)
+    alignment, options = folder / "alignment.json", {"code": code}
+
+    def inputs(points: Sequence[Path]) -> SceneInputs:
+        return SceneInputs.of(left, right, points, Settings(**settings), alignment=alignment)
+
+    project_scene(inputs([smallest_store]), out, **options)
 
     print("T0, ingest, project", flush=True)
     count = decode(files)  # into the page cache
@@ -310,6 +317,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
                     json.dumps(list(map(str, stores))),
                     out,
                     folder / "project.log",
+                    alignment,
                     *told,
                     env=env,
                 ),
@@ -333,9 +341,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         shutil.rmtree(made)
         shutil.rmtree(out.parent)
         times = profiled(
-            lambda: project_scene(
-                left, right, stores, out, Settings(**settings), scheduler="synchronous", **options
-            )
+            lambda: project_scene(inputs(stores), out, scheduler="synchronous", **options)
         )
         profiles["project"] = parts(times, count)
 
@@ -627,7 +633,7 @@ def rectification(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
     def ours(source: Source, threads: int) -> None:
         store = folder / "remap" / "left.zarr"
-        with making(store, model.shape, layers, chunk=256, shard=1024) as target:
+        with resumable_grid(store, model.shape, layers, chunk=256, shard=1024) as target:
             key = str(time.perf_counter_ns())  # nothing of an earlier call is taken over
             rectify_image(source, model.left_image, target, model.shape, key=key, workers=threads)
 
@@ -716,8 +722,7 @@ def main() -> int:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.workers])
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    config = yaml.safe_load((PROJECT / "config" / "config.yaml").read_text(encoding="utf-8"))
-    settings = asdict(Settings.of(config))
+    settings = asdict(Settings())
     report: dict[str, Any] = {"machine": machine(arguments.workers)}
     print(", ".join(f"{k} {v}" for k, v in report["machine"].items()))
     if not arguments.kernels:

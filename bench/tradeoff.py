@@ -28,8 +28,11 @@ from accuracy import (
     truth_row,
 )
 from matplotlib.figure import Figure
+from synthetic_pairs import labels_of
 
+from stereotruth.configuration import Configuration
 from stereotruth.disparity.project import SHARD, project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.evaluation.labels_against_truth import (
@@ -40,7 +43,7 @@ from stereotruth.evaluation.labels_against_truth import (
     open_truth,
     status_names,
 )
-from stereotruth.products.files import replacing
+from stereotruth.products.files import atomic_file
 from stereotruth.products.grids import blocks, open_grid
 from stereotruth.products.pictures import SERIES
 from stereotruth.products.provenance import source_digest
@@ -68,16 +71,12 @@ def measure(
     with tempfile.TemporaryDirectory(dir=made.exact) as folder:
         out = Path(folder) / "disparity.zarr"
         with patch("stereotruth.disparity.project.blocks", lambda *_: list(windows)):
-            project_scene(
-                made.left,
-                made.right,
-                made.points,
-                out,
-                Settings(**settings),
-                workers=workers,
-                alignment=made.refined if made.refined.is_file() else made.aligned,
-                code=source_digest("disparity.project"),
+            alignment = made.refined if made.refined.is_file() else made.aligned
+            inputs = SceneInputs.of(
+                made.left, made.right, made.points, Settings(**settings), alignment=alignment
             )
+            code = source_digest("disparity.project")
+            project_scene(inputs, out, workers=workers, code=code)
         store = open_grid(out)
         true = open_truth(truth, store.attrs["epipolar"])
         for window in windows:
@@ -87,7 +86,7 @@ def measure(
 
 
 def rows_of_city(
-    scenes: Sequence[Made], config: Mapping[str, Any], arguments: argparse.Namespace
+    scenes: Sequence[Made], config: Configuration, arguments: argparse.Namespace
 ) -> Rows:
     """A row for each recipe and threshold, all scenes of a city together."""
     found: dict[tuple[str, float], ByClass] = {}
@@ -96,7 +95,7 @@ def rows_of_city(
         truth = made.truth(made.exact, made.disparity, arguments.workers)
         windows = fullest(truth, arguments.blocks)
         for recipe, threshold in product(COLOURS, THRESHOLDS):
-            settings = asdict(Settings.of(config))
+            settings = asdict(labels_of(config))
             settings |= {"recipe": recipe, "correlation_threshold": threshold}
             part = measure(made, windows, truth, settings, arguments.workers)
             found.setdefault((recipe, threshold), ByClass()).merge(part)
@@ -150,7 +149,7 @@ def draw(rows: Rows, path: Path) -> None:
     axes[0].legend(fontsize=7, loc="lower right")
     figure.supxlabel("hidden pixels labelled, % (at the points: threshold)", fontsize=9)
     figure.supylabel("visible pixels labelled, %", fontsize=9)
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         figure.savefig(scratch, dpi=80)
 
 

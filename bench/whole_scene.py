@@ -19,21 +19,22 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from whole_images import match
 
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.error_statistics import ErrorSum
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.matching.benchmark.predictions import peak_memory_mb
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
 from stereotruth.matching.scenes.surface_model import Raster, write_dsm
-from stereotruth.matching.scenes.whole_images import match
-from stereotruth.products.grids import Layer, blocks, building, create_grid, require_complete
+from stereotruth.numerics.error_sums import ErrorSum
+from stereotruth.numerics.robust import median_and_nmad
+from stereotruth.products.grids import Layer, atomic_store, blocks, create_grid, require_complete
 from stereotruth.products.pictures import colours, stretch
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
 from stereotruth.simulate.control_points import simulate_points
@@ -85,7 +86,7 @@ def crop(source: Path, out: Path, model: EpipolarModel, first: tuple[int, int]) 
     image, attrs = require_complete(source)["image"], dict(require_complete(source).attrs)
     attrs |= {"epipolar": model.to_dict(), "content": f"{attrs['content']} {first}"}
     layer = Layer("uint16", 0, dict(image.attrs))
-    with building(out) as scratch:
+    with atomic_store(out) as scratch:
         grids = {"image": layer}
         arrays = create_grid(scratch, model.shape, grids, chunk=256, shard=1024, attrs=attrs)
         for rows, cols in blocks(model.shape, 1024):
@@ -272,12 +273,12 @@ def surface_errors(dsm: np.ndarray, truth: np.ndarray, kinds: np.ndarray, inside
         error = error[np.isfinite(error)].astype(float)
         if not error.size:
             continue
-        median = np.median(error)
+        median, nmad = median_and_nmad(error)
         found[name] = {
             "cells": int(chosen.sum()),
             "known": error.size / int(chosen.sum()),
-            "median": float(median),
-            "nmad": float(1.4826 * np.median(np.abs(error - median))),
+            "median": median,
+            "nmad": nmad,
             "mean_absolute": float(np.abs(error).mean()),
             "rms": float(np.sqrt(np.mean(error**2))),
             "over_2m": float((np.abs(error) > 2).mean()),

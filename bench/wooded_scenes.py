@@ -24,7 +24,7 @@ from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.matching.image_faults import as_images
-from stereotruth.products.files import whole_folder
+from stereotruth.products.files import atomic_folder
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.cities import Canopy, CitySpec, SceneSpec, ViewSpec, lidar_files
 from stereotruth.simulate.control_points import simulate_points
@@ -144,7 +144,7 @@ class Scene:
         """left.tif and right.tif."""
         made = self.folder / "images" / self.draw.key("density")
         if not made.is_dir():
-            with whole_folder(made) as scratch:
+            with atomic_folder(made) as scratch:
                 for view in VIEWS:
                     simulate_image(self.city, self.spec, view, scratch / f"{view}.tif",
                                    seed=self.draw.seed)  # fmt: skip
@@ -173,7 +173,7 @@ class Scene:
         looks = "noise", "gain", "later", "brightness", "ground_look"
         made = self.folder / "lidar" / self.draw.key(*looks)
         if not _readable(made):
-            with whole_folder(made) as scratch:
+            with atomic_folder(made) as scratch:
                 for file in lidar_files(self.city, self.spec):
                     simulate_lidar_tile(
                         self.city, self.spec, file, scratch / file,

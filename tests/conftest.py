@@ -8,12 +8,13 @@ import pytest
 pytest.register_assert_rewrite("tests.synthetic")
 
 # One thread for linear algebra: two test processes would fight for two cores (measured: 84 s
-# against 32 s for the same tests).
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# against 32 s for the same tests). OpenMP's threads would wait for each other by spinning.
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 
 # Test files that processes begin with: the first makes the city of the workflow's tests and all
 # that follows from it, which the others wait for; the next ones need nothing of it.
-FIRST = ("test_audit", "test_command", "test_plans")
+FIRST = ("test_audit", "test_plans", "test_job_start", "test_without_pytorch")
 
 
 def pytest_collection_modifyitems(items):

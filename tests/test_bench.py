@@ -43,18 +43,16 @@ def check(source: str) -> int:
 
 
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
-def test_what_is_taken_from_the_package_exists(program: Path, monkeypatch) -> None:
+def test_what_is_taken_from_the_package_exists(program: Path) -> None:
     if "stereotruth.matching.networks" in program.read_text():
         pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-    monkeypatch.syspath_prepend(program.parent)  # they import each other
     assert check(program.read_text())
     names = runpy.run_path(str(program), run_name=program.stem)
     taken = f"from {program.stem} import"
     assert callable(names.get("main")) or any(taken in p.read_text() for p in PROGRAMS)
 
 
-def test_the_rates_of_rectification_are_measured(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.syspath_prepend(PROGRAMS[0].parent)
+def test_the_rates_of_rectification_are_measured(tmp_path: Path) -> None:
     throughput = importlib.import_module("throughput")
     size = (300, 200)
     views = [camera(place, angle=90.0, size=size) for place in (BACKWARD, FORWARD)]

@@ -1,7 +1,7 @@
 """The whole configuration: every key with its type, limits, default and meaning, from the stages.
 
-``config/config.yaml`` holds the same defaults, with remarks for who edits it. The reference tables
-of ``config/README.md`` are written from the classes by
+The defaults stand in the classes alone. ``config/config.yaml``, for who edits it, and the reference
+tables of ``config/README.md`` are written from them by
 
     python -m stereotruth.configuration
 """
@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import re
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
+import yaml
 from pydantic import Field
 
 from .alignment.settings import Settings as Alignment
@@ -24,13 +26,14 @@ from .epipolar.settings import Settings as Rectify
 from .errors import InputError
 from .evaluation.audit.settings import Settings as Audit
 from .lidar.settings import Settings as Ingest
+from .matching.benchmark.settings import DATASETS, METHODS
 from .matching.benchmark.settings import Settings as Benchmark
 from .matching.networks.training_settings import Training
 from .matching.scenes.settings import Predict
 from .report.settings import Settings as Report
 from .settings import Flag, Text, Unit, Whole, settings
-from .settings_text import Key, check, fields_of, nested, values_of
-from .sheets import City, Scene
+from .settings_text import Key, attributes_of, check, fields_of, meaning, nested, values_of
+from .sheets import City, Image, Scene
 from .simulate.settings import Settings as Simulate
 
 Strips = Annotated[Whole, Field(ge=1, le=1000)]
@@ -67,6 +70,9 @@ class Configuration:
 
     cities: Annotated[Text, Unit("path")] = "config/cities.tsv"
     """the cities sheet, see below"""
+
+    images: Annotated[Text, Unit("path")] = ""
+    """the images sheet of sites, see below; empty: scenes name files"""
 
     strict: Flag = False
     """true: warnings about the alignment (any ground control point left out), the splits or a limit
@@ -105,7 +111,17 @@ class Configuration:
     def of(cls, config: Mapping[str, Any], file: str | Path = "config") -> Configuration:
         """What the user wrote. Raises InputError that names ``file`` and the first wrong key."""
         _refuse_replaced(config, file)
-        return check(config, cls, file)
+        return check(_without_unnamed(config), cls, file)
+
+
+def _without_unnamed(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The configuration without built-in datasets, if it names others and none of the built-in."""
+    benchmark = config.get("benchmark")
+    datasets = benchmark.get("datasets") if isinstance(benchmark, Mapping) else None
+    if not isinstance(datasets, Mapping) or not datasets or set(datasets) & set(DATASETS):
+        return config
+    unnamed = dict.fromkeys(DATASETS)
+    return {**config, "benchmark": {**benchmark, "datasets": {**unnamed, **datasets}}}
 
 
 def _refuse_replaced(config: Mapping[str, Any], file: str | Path) -> None:
@@ -117,6 +133,7 @@ def _refuse_replaced(config: Mapping[str, Any], file: str | Path) -> None:
             raise InputError(f"{name}: there is no such key any more", file=file, remedy=remedy)
 
 
+BY_NAME = {"datasets": DATASETS, "methods": METHODS}
 BELOW = ("training", "benchmark.methods")  # have tables of their own
 TABLE = re.compile(r"(<!-- keys: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -151,6 +168,7 @@ def with_tables(guide: str) -> str:
         "training": [*head, *rows(Training, "training.")],
         "scenes": columns(Scene),
         "cities": columns(City),
+        "images": columns(Image),
     }
 
     def table(found: re.Match[str]) -> str:
@@ -159,6 +177,56 @@ def with_tables(guide: str) -> str:
     return TABLE.sub(table, guide)
 
 
+HEAD = """\
+# Every key with its default; units and effects are in config/README.md. Written by
+# python -m stereotruth.configuration. Your own scenes: write a file that overrides what differs,
+# and pass it with --configfile.
+"""
+LONGEST_LINE = 130  # characters
+SHORTEST_REMARK = 20
+
+
+def defaults_text() -> str:
+    """The text of ``config/config.yaml``: every key with its default and what it is."""
+    lines = list(_default_lines(Configuration, Configuration(), ""))
+    return HEAD + "\n".join(lines) + "\n"
+
+
+def _default_lines(of: Any, values: Any, indent: str) -> Iterator[str]:
+    """Lines of a section; a blank one before each section of the whole."""
+    for name, key in attributes_of(of).items():
+        value, (inner, by_name) = getattr(values, name), nested(key.type)
+        if not indent and inner is not None:
+            yield ""
+        if inner is not None and not by_name and key.name != "strips":
+            yield f"{indent}{key.name}:"
+            yield from _default_lines(inner, value, indent + "  ")
+        elif inner is not None:
+            yield f"{indent}{key.name}: # by name; null takes one of these away"
+            entries = BY_NAME[key.name].items()
+            yield from (f"{indent}  {entry}: {_yaml(given)}" for entry, given in entries)
+        else:
+            yield _with_remark(f"{indent}{key.name}: {_yaml(value)}", key)
+
+
+def _yaml(value: Any) -> str:
+    """A value on one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=10_000, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _with_remark(line: str, key: Key) -> str:
+    """A line with what the key is behind it, cut at a word where it is long."""
+    remark = meaning(key).replace("`", "")
+    room = LONGEST_LINE - len(line) - len(" # ")
+    if not remark or room < SHORTEST_REMARK:
+        return line
+    return f"{line} # {textwrap.shorten(remark, room, placeholder=' …')}"
+
+
 if __name__ == "__main__":
-    file = Path(*sys.argv[1:] or ["config/README.md"])
-    file.write_text(with_tables(file.read_text(encoding="utf-8")), encoding="utf-8")
+    config = Path(*sys.argv[1:] or ["config"])
+    guide = config / "README.md"
+    guide.write_text(with_tables(guide.read_text(encoding="utf-8")), encoding="utf-8")
+    (config / "config.yaml").write_text(defaults_text(), encoding="utf-8")

@@ -30,6 +30,11 @@ def _shown(rest: str) -> str:
     return (HIDDEN + at if who else at) + place[0] + ("?" + HIDDEN if len(place) > 1 else "")
 
 
+def in_number(count: int, noun: str) -> str:
+    """``1 pair``, ``2 pairs``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 class InputError(ValueError):
     """Input that cannot be used: names the file (and scene), what is wrong, and the remedy.
 

@@ -11,7 +11,7 @@ import pickle
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -170,16 +170,11 @@ def block_progress(total: int, what: str) -> Any:
     return Callback(posttask=count)
 
 
-def scheduler_address(config: Mapping[str, Any]) -> str | None:
-    """Of a configuration as a user has it: ``dask.scheduler_address``, None where it has none."""
-    return config.get("dask", {}).get("scheduler_address")
-
-
 @contextmanager
 def dask_scheduler(address: str | None, seconds: float = 30.0) -> Iterator[Any]:
     """What Dask's compute takes as its scheduler; it is waited for so many ``seconds``.
 
-    ``address`` of a running Dask scheduler (``tcp://host:8786``), or None for threads. Its workers
+    ``address`` of a running Dask scheduler (``tcp://host:8786``), or none for threads. Its workers
     need this package and must see the files under the same paths.
 
     Raises InputError if nothing answers there, or if `distributed` is not installed.

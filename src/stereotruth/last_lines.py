@@ -10,6 +10,8 @@ from typing import Any
 
 from .evaluation.surface_models.page import describe as describe_surface_model
 from .matching.benchmark.score_method import describe
+from .products.provenance import file_sha256
+from .products.records import read_record
 
 
 def last_lines(products: Iterable[str]) -> list[str]:
@@ -35,12 +37,24 @@ def _lines(say: Callable[..., Iterator[str]], product: str, *groups: str) -> lis
     """What to say of a product; where its figures cannot be read, that it is damaged."""
     try:
         return list(say(product, *groups))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except Exception:  # whatever a damaged file makes of them
         return [f"Look at {product}: its figures cannot be read; delete it and run again"]
 
 
 def _read(*parts: str) -> Mapping[str, Any]:
-    return json.loads(Path(*parts).read_text(encoding="utf-8"))
+    file = Path(*parts)
+    if not _is_as_made(file):
+        raise ValueError(f"{file} is not what was made")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _is_as_made(file: Path) -> bool:
+    """Whether a file is what a job has made, by itself or in a folder; true without a record."""
+    for product in map(str, (file, *file.parents[:-1])):
+        if record := read_record(product):
+            known = record.files.get(product, {".": record.outputs[product]})
+            return file_sha256(file).startswith(known.get(str(file.relative_to(product)), ""))
+    return True
 
 
 def _tiles(product: str, city: str) -> Iterator[str]:

@@ -1,8 +1,9 @@
-"""What a folder is worked with: configuration over the package's defaults, its sheets and LiDAR."""
+"""What a folder is worked with: configuration, its sheets and LiDAR."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import yaml
 
 from . import sheets
 from .configuration import Configuration
-from .errors import InputError, in_words
+from .errors import InputError, in_words, told_by_system
 from .products.remote_files import (
     FOLDER,
     bring_files,
@@ -22,6 +23,7 @@ from .products.remote_files import (
     place_of,
     stand_in,
 )
+from .settings import merged
 from .simulate.cities import CITIES as SYNTHETIC
 from .simulate.cities import lidar_files
 
@@ -31,40 +33,39 @@ _PACKAGE = Path(__file__).parent
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
 SYNTHETIC_FOLDER = "data/synthetic"
 CONFIG = "config.yaml"  # of a user's own project
+SHARED = Path("config") / CONFIG  # of a clone: the Snakefile reads it
 MOST_BYTES = 1_000_000  # of a configuration
 MOST_VALUES = 200_000
-
-
-def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys of both; where both have one, ``above``'s, unless both are mappings themselves."""
-    found = dict(below)
-    for key, value in above.items():
-        under = found.get(key)
-        both = isinstance(under, Mapping) and isinstance(value, Mapping)
-        found[key] = merged(under, value) if both else value
-    return found
-
-
-def with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration over the package's ``config/config.yaml``."""
-    defaults = (FILES / "config" / "config.yaml").read_text(encoding="utf-8")
-    return merged(yaml.safe_load(defaults), config)
 
 
 def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration, str]:
     """The configuration of this folder as a run reads it, and the names of the files it is from.
 
     ``files`` stand in the place of the folder's ``config.yaml``. Raises InputError that names file
-    and key.
+    and key, and where there is no configuration.
     """
+    require_project(files)
     own = [Path(CONFIG)] if Path(CONFIG).is_file() else []
-    shared = Path("config") / CONFIG  # read by the Snakefile itself
-    read = [*([shared] if shared.is_file() else []), *(map(Path, files) if files else own)]
+    read = [*([SHARED] if SHARED.is_file() else []), *(map(Path, files) if files else own)]
     values: dict[str, Any] = {}
     for file in read:
         values = merged(values, read_mapping(file))
     names = ", ".join(map(str, read)) or "the defaults"
-    return Configuration.of(with_defaults(values), names), names
+    return Configuration.of(values, names), names
+
+
+def require_project(files: Sequence[str | Path] | None = None) -> None:
+    """Raise InputError if this folder has no configuration, and no ``files`` of one are given.
+
+    A clone has that of the six synthetic cities.
+    """
+    if files or Path(CONFIG).is_file() or SHARED.is_file():
+        return
+    above = next((folder for folder in Path.cwd().parents if (folder / CONFIG).is_file()), None)
+    remedies = ["begin a project: stereotruth init FOLDER", "the built-in cities: --example"]
+    if above is not None:
+        remedies.insert(0, f"did you mean: cd {os.path.relpath(above)}")
+    raise InputError(f"no {CONFIG} here", file=Path.cwd(), remedy="; or ".join(remedies))
 
 
 def read_mapping(file: Path) -> dict[str, Any]:
@@ -81,6 +82,7 @@ def read_mapping(file: Path) -> dict[str, Any]:
             )
         loader = yaml.SafeLoader(file.read_text(encoding="utf-8-sig"))
         node = loader.get_single_node()
+        _refuse_repeated(node, file)
         _refuse_multiplied(node, file)
         found = None if node is None else loader.construct_document(node)
     except FileNotFoundError:
@@ -89,7 +91,11 @@ def read_mapping(file: Path) -> dict[str, Any]:
         raise InputError(f"is no UTF-8 ({error})", file=file, remedy="save it as UTF-8") from None
     except RecursionError:
         raise InputError("is nested too deeply", file=file, remedy="write it flat") from None
-    except (OSError, yaml.YAMLError) as error:
+    except OSError as error:
+        raise told_by_system(error) or InputError(
+            f"cannot be read: {error.strerror}", file=file, remedy="see what lies there"
+        ) from None
+    except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
         raise InputError(
             f"cannot be read as YAML ({problem})", file=file, remedy="correct what it names"
@@ -99,6 +105,32 @@ def read_mapping(file: Path) -> dict[str, Any]:
             "is no mapping of keys to values", file=file, remedy="write it as key: value"
         )
     return found or {}
+
+
+def _refuse_repeated(top: yaml.Node | None, file: Path) -> None:
+    """Raise InputError if a key stands twice in one mapping: YAML itself takes the last."""
+    waiting, seen = [top], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or not isinstance(node, yaml.CollectionNode):
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.MappingNode):
+            lines: dict[str, int] = {}
+            for key, _ in node.value:
+                line = key.start_mark.line + 1
+                name = key.value if isinstance(key, yaml.ScalarNode) else ""
+                if name in lines and name != "<<":
+                    raise InputError(
+                        f"{name!r} stands twice, in lines {lines[name]} and {line}",
+                        file=file,
+                        remedy="put what both have under one of them",
+                    )
+                if name:
+                    lines[name] = line
+            waiting += [value for _, value in node.value]
+        else:
+            waiting += node.value
 
 
 def _refuse_multiplied(top: yaml.Node | None, file: Path) -> None:
@@ -150,13 +182,33 @@ def read_scenes(
     ``ask``: ask their servers what they are now; else take what a call before has found.
     """
     cities = sheets.read_cities(sheet(settings, "cities"))
-    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities)
+    images = read_images(settings, cities)
+    scenes = sheets.read_scenes(
+        sheet(settings, "scenes"), cities, images, cities_sheet=sheet(settings, "cities")
+    )
     for name, scene in scenes.items():
         if is_synthetic(scene):
             scenes[name] = replace(scene, gcps=here_or_shipped(scene.gcps))
         else:
             scenes[name] = _with_stand_ins(scene, ask=ask)
     return cities, scenes
+
+
+def read_images(
+    settings: Configuration, cities: Mapping[str, sheets.City]
+) -> dict[str, sheets.Image]:
+    """The images of sites by name; none if the project has no such sheet."""
+    return sheets.read_images(settings.images, cities) if settings.images else {}
+
+
+def names_in_pair(scene: sheets.Scene, images: Mapping[str, sheets.Image]) -> tuple[str, str]:
+    """Names of a scene's left and right image in the images sheet; empty if it has them not."""
+
+    def key(file: str) -> str:
+        return sheets.file_key(str(place_of(file)) if is_remote(file) else file)
+
+    by_file = {key(image.file): name for name, image in images.items()}
+    return by_file.get(key(scene.left_image), ""), by_file.get(key(scene.right_image), "")
 
 
 def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
@@ -197,6 +249,26 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
         return sheets.store_names([Path(scene.lidar) / file for file in made])
     sheets.require_files(scene, rows, sheets.FILES)
     return sheets.store_names(sheets.find_lidar(scene, rows))
+
+
+def stores_of(
+    scenes: Mapping[str, sheets.Scene], lidar: Mapping[str, Mapping[str, Path]]
+) -> dict[str, list[tuple[str, str]]]:
+    """The point stores of each scene: (scene that they are made for, name of the LiDAR file).
+
+    A file is read once by all scenes of a city that take it by the same coordinate system and
+    geoid: its store is that of the first of them in the sheet. ``lidar``: files of each scene by
+    the names of their stores.
+    """
+    made: dict[tuple[str, ...], tuple[str, str]] = {}
+    found: dict[str, list[tuple[str, str]]] = {}
+    for name, scene in scenes.items():
+        how = scene.city, scene.lidar_crs, sheets.file_key(scene.geoid) if scene.geoid else ""
+        found[name] = [
+            made.setdefault((*how, sheets.file_key(str(file))), (name, store))
+            for store, file in lidar[name].items()
+        ]
+    return found
 
 
 @in_words()

@@ -9,12 +9,13 @@ the reference table from them.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Field,
     StrictBool,
@@ -38,6 +39,16 @@ Text = StrictStr
 LONGEST_NAME = 100  # characters; a file's name has 255 bytes, with what is added to it
 PATTERN = re.compile(r"\{[^{}]*\w[^{}]*\}")
 REPEATED = re.compile(r"(.+)\1{18}$")  # once more, and Snakemake takes it for an endless recursion
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of both; where both have one, ``above``'s, unless both are mappings themselves."""
+    found = dict(below)
+    for key, value in above.items():
+        under = found.get(key)
+        both = isinstance(under, Mapping) and isinstance(value, Mapping)
+        found[key] = merged(under, value) if both else value
+    return found
 
 
 @dataclass(frozen=True)
@@ -81,21 +92,50 @@ def name_of(characters: str) -> Any:
     return Annotated[Text, limits, AfterValidator(not_repeated)]
 
 
+def over(defaults: Mapping[str, Any]) -> BeforeValidator:
+    """What lays a given mapping over ``defaults``: a key that is not given keeps its value."""
+
+    def laid_over(given: Any) -> Any:
+        return merged(defaults, given) if isinstance(given, Mapping) else given
+
+    return BeforeValidator(laid_over)
+
+
 FilePath = Annotated[Text, AfterValidator(no_pattern)]
 Odd = Annotated[Whole, AfterValidator(is_odd)]
 Share = Annotated[Number, Field(ge=0, le=1), Unit("share")]
 Range = Annotated[tuple[Whole, Whole], Unit("px, px")]  # the second is excluded
 
 
+class WrongValues(InputError):
+    """Values that a class of settings refuses: what :mod:`.settings_text` says in the user's words.
+
+    Its own text is plain: stages take checked values, and the user's words stay out of the code
+    digests of the stages.
+    """
+
+    def __init__(self, error: ValidationError, of: type) -> None:
+        self.error, self.of = error, of
+        first = error.errors(include_url=False)[0]
+        cause = first.get("ctx", {}).get("error")
+        name = ".".join(map(str, first["loc"]))
+        if isinstance(cause, InputError):
+            problem, remedy = cause.problem, cause.remedy
+        else:
+            problem = f"{first['input']!r}: {first['msg']}"
+            remedy = f"correct it in the {of.__name__} of {of.__module__}"
+        super().__init__(f"{name}: {problem}" if name else problem, remedy=remedy)
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(Field,))
 def settings(made: Class | None = None, *, more: bool = False) -> Any:
-    """Class decorator: a frozen dataclass whose values are checked; InputError tells what is wrong.
+    """Class decorator: a frozen dataclass whose values are checked. Raises WrongValues.
 
-    ``more``: keys that it does not know are let through to others, unchecked.
+    ``more``: keys that it does not know are kept unchecked, as attributes, for others to check.
     """
     if made is None:
         return lambda given: settings(given, more=more)
-    config = ConfigDict(extra="ignore" if more else "forbid", populate_by_name=True)
+    config = ConfigDict(extra="allow" if more else "forbid", populate_by_name=True)
     found = validated(made, frozen=True, config=config)
     init = found.__init__
 
@@ -103,10 +143,7 @@ def settings(made: Class | None = None, *, more: bool = False) -> Any:
         try:
             init(self, *args, **values)
         except ValidationError as error:
-            # by its name, so that the words of errors do not enter the code digests of stages
-            words = import_module("stereotruth.settings_text")
-            problem, remedy = words.complaint(error, found)
-            raise InputError(problem, remedy=remedy) from None
+            raise WrongValues(error, found) from None
 
     __init__.__signature__ = getattr(init, "__signature__", None)
     found.__init__ = __init__

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import ValidationError
 
 from .errors import InputError
-from .settings import Unit, is_odd
+from .settings import Unit, WrongValues, is_odd
 
 LONGEST_VALUE = 300  # characters of a value in messages
 AT_FIRST = re.compile("^(Input|String|Tuple|Dictionary|Value error,) ")  # of pydantic's messages
@@ -45,13 +45,17 @@ def _said(of: type) -> dict[str, str]:
 
 def fields_of(of: Any) -> dict[str, Key]:
     """The keys of a class of settings by the names that the user writes."""
+    return {key.name: key for key in attributes_of(of).values()}
+
+
+def attributes_of(of: Any) -> dict[str, Key]:
+    """The keys of a class of settings by the names of its attributes."""
     found = {}
     for name, info in of.__pydantic_fields__.items():
         key = info.alias or name
         classes = (c for c in of.__mro__ if "__pydantic_fields__" in vars(c))
         said = next((_said(c)[name] for c in classes if name in _said(c)), "")
-        meaning = " ".join(said.split())
-        found[key] = Key(key, info.annotation, info.metadata, meaning)
+        found[name] = Key(key, info.annotation, info.metadata, " ".join(said.split()))
     return found
 
 
@@ -166,32 +170,39 @@ def complaint(error: ValidationError, of: Any) -> tuple[str, str]:
     one = max(reversed(of_first), key=lambda e: len(e["loc"]))  # of alternatives the last
     place = _located(of, one["loc"])
     name = ".".join(place.names)
-    told = one.get("ctx", {}).get("error")
-    if isinstance(told, InputError):
-        return (f"{name}: " if name else "") + told.problem, told.remedy
+    cause = one.get("ctx", {}).get("error")
+    if isinstance(cause, InputError):
+        problem, remedy = in_words(cause)
+        return (f"{name}: " if name else "") + problem, remedy
     if one["type"] == "dataclass_type":
         keys = ", ".join(fields_of(place.inside))
         return f"{name}: {one['input']!r} has no keys", f"its keys are {keys}"
     if one["type"] == "missing":
-        return f"{name}: is required", f"add it: {_meaning(place.key)}"
+        return f"{name}: is required", f"add it: {meaning(place.key)}"
     said = AT_FIRST.sub("", one["msg"])
     given = repr(one["input"])
     given = given if len(given) <= LONGEST_VALUE else f"{given[:LONGEST_VALUE]} …"
     problem = f"{name or 'value'}: {given} {said}"
     if place.key is None:
         return problem, "see config/README.md"
-    return problem, f"{place.known} is: {_meaning(place.key)}"
+    return problem, f"{place.known} is: {meaning(place.key)}"
 
 
-def _meaning(key: Key) -> str:
+def in_words(error: InputError) -> tuple[str, str]:
+    """Problem and remedy of an error, in the user's words."""
+    if isinstance(error, WrongValues):
+        return complaint(error.error, error.of)
+    return error.problem, error.remedy
+
+
+def meaning(key: Key) -> str:
+    """What a key is, in a line: its unit and values, and what it does."""
     return ": ".join(filter(None, (values_of(key), _first(key.meaning))))
 
 
 def _first(meaning: str) -> str:
-    """What stands before the first full stop or semicolon of a meaning."""
-    for mark in (". ", "; "):
-        meaning = meaning.split(mark)[0]
-    return meaning
+    """What stands before the first full stop of a meaning, without links."""
+    return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", meaning.split(". ")[0])
 
 
 def check(values: Mapping[str, Any], of: Callable[..., Any], file: Any) -> Any:
@@ -199,4 +210,5 @@ def check(values: Mapping[str, Any], of: Callable[..., Any], file: Any) -> Any:
     try:
         return of(**values)
     except InputError as error:
-        raise InputError(error.problem, file=file, remedy=error.remedy) from None
+        problem, remedy = in_words(error)
+        raise InputError(problem, file=file, remedy=remedy) from None

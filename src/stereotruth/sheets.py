@@ -9,10 +9,12 @@ from __future__ import annotations
 import csv
 import difflib
 import hashlib
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,6 +26,7 @@ from .settings import (
     PATTERN,
     REPEATED,
     FilePath,
+    Number,
     Text,
     Whole,
     name_of,
@@ -72,10 +75,10 @@ class Scene:
     """a row of the cities sheet"""
 
     left_image: Given
-    """backward view (reference): GeoTIFF, or another format that holds its pixels (JPEG 2000, NITF,
-    PNG, HFA, ENVI …), with RPC metadata in the TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside
-    it. In this and the columns below that name files, URLs may stand, too (`s3://`, `https://`; see
-    docs/how-to/object_storage.md)"""
+    """an image of the [images sheet](#imagestsv), or a file: backward view (reference), GeoTIFF, or
+    another format that holds its pixels (JPEG 2000, NITF, PNG, HFA, ENVI …), with RPC metadata in
+    the TIFF, `_RPC.TXT`, `.RPB` or GF-7's `.rpb` beside it. In this and the columns below that name
+    files, URLs may stand, too (`s3://`, `https://`; see docs/how-to/object_storage.md)"""
 
     right_image: Given
     """forward view (target), likewise"""
@@ -107,6 +110,36 @@ class Scene:
     """likewise, of the right image"""
 
 
+@settings
+class Image:
+    """One row of the images sheet: an image of a site, which any scene of its city may name."""
+
+    image: name_of("A-Za-z0-9_-")
+    """unique name of letters, digits, `-` and `_`"""
+
+    city: Given
+    """a row of the cities sheet: the site"""
+
+    file: Given
+    """the image with its RPC metadata, as in `left_image` of the scenes sheet; each file stands in
+    one row"""
+
+    acquired: Text = ""
+    """optional: date (`2020-10-25`), or time with its zone (`2020-10-25T03:12:45Z`, `…+08:00`);
+    empty: as the delivery says it (IMD, DIMAP, GF-7 XML, STAC, tags of the file)"""
+
+    sun_azimuth: Number | None = None
+    """optional: direction to the sun, degrees from north over east; empty: as the delivery says it,
+    or else computed from `acquired` and the image's place"""
+
+    sun_elevation: Number | None = None
+    """optional: likewise, degrees above the horizon"""
+
+    mask: FilePath = ""
+    """optional: as `left_mask` of the scenes sheet; holds in every scene that names the image and
+    no mask of its own"""
+
+
 def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     """(line number, cells) of each row of a tab-separated sheet; a cell is empty where none is."""
     columns = [f.name for f in fields(sheet)]
@@ -125,7 +158,8 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
         ) from None
     except (UnicodeDecodeError, IsADirectoryError) as error:
         raise InputError(str(error), file=path, remedy="save it as UTF-8 text") from None
-    rows = csv.reader(text.splitlines(), delimiter="\t")
+    lines = text.splitlines(keepends=True)
+    rows = csv.reader(lines, delimiter="\t")
     try:
         numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
     except csv.Error as error:
@@ -157,6 +191,12 @@ def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
                 file=path,
                 remedy="remove the surplus tab",
             )
+        if len(row) < len(header) and number == len(lines) and not lines[-1].endswith("\n"):
+            raise InputError(
+                f"line {number} ends after {len(row)} of {len(header)} columns, and the file there",
+                file=path,
+                remedy="see that the file is whole, and end the line",
+            )
         row += [""] * (len(header) - len(row))
         table.append((number, dict.fromkeys(columns, "") | dict(zip(header, row))))
     return table
@@ -180,7 +220,7 @@ def read_cities(path: str | Path) -> dict[str, City]:
     for number, cells in rows:
         values: dict[str, Any] = dict(cells)
         for count in ("training", "validation", "testing"):
-            if not re.fullmatch(r"[0-9]+", cells[count]):
+            if not re.fullmatch(r"[0-9]{1,9}", cells[count]):
                 raise InputError(
                     f"line {number}: {count} is {cells[count]!r}",
                     file=path,
@@ -193,8 +233,141 @@ def read_cities(path: str | Path) -> dict[str, City]:
     return cities
 
 
-def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene]:
-    """The scenes sheet by id of the scene. Raises InputError as described in the module."""
+def acquisition_time(text: str) -> datetime | date:
+    """The time, UTC, or the date that a cell ``acquired`` names. ValueError says what is wrong."""
+    if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
+        return date.fromisoformat(text)
+    if not re.match(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", text):
+        raise ValueError("is not of the form 2020-10-25T03:12:45Z")
+    time = datetime.fromisoformat(text)
+    if time.tzinfo is None:
+        raise ValueError("has no time zone: Z of UTC, or an offset such as +08:00")
+    return time.astimezone(UTC)
+
+
+def read_images(
+    path: str | Path, cities: Mapping[str, City], cities_sheet: str | Path = "the cities sheet"
+) -> dict[str, Image]:
+    """The images sheet by name of the image. Raises InputError as described in the module."""
+    path = Path(path)
+    images: dict[str, Image] = {}
+    first: dict[str, tuple[int, str]] = {}
+    for number, cells in _read_table(path, Image):
+        name, where = cells["image"], f"line {number}: image {cells['image']!r}"
+        values: dict[str, Any] = dict(cells)
+        values["sun_azimuth"], values["sun_elevation"] = _sun(cells, where, path)
+        image = check(values, Image, f"{path}, line {number}")
+        _known_city(cells["city"], where, cities, path, cities_sheet)
+        if name in images:
+            _unique([name, name], "image", path)
+        if image.acquired:
+            try:
+                acquisition_time(image.acquired)
+            except ValueError as error:
+                raise InputError(
+                    f"{where}: acquired {image.acquired!r} {error}",
+                    file=path,
+                    remedy="write the date, 2020-10-25, or the time with its zone, "
+                    "2020-10-25T03:12:45Z or 2020-10-25T11:12:45+08:00",
+                ) from None
+        before, other = first.setdefault(file_key(image.file), (number, name))
+        if before != number:
+            raise InputError(
+                f"{where}: its file is that of image {other!r} in line {before}",
+                file=path,
+                remedy="keep one of the two rows; scenes may name the image as often as they like",
+            )
+        images[name] = image
+    return images
+
+
+def _sun(cells: Mapping[str, str], where: str, path: Path) -> tuple[float | None, float | None]:
+    """Azimuth and elevation in a row of the images sheet, degrees; None where they are empty."""
+    given = cells["sun_azimuth"], cells["sun_elevation"]
+    if given == ("", ""):
+        return None, None
+    remedy = "write both in degrees, or leave both empty"
+    try:
+        azimuth, elevation = map(float, given)
+    except ValueError:
+        raise InputError(
+            f"{where}: sun_azimuth {given[0]!r}, sun_elevation {given[1]!r} are not two numbers",
+            file=path,
+            remedy=remedy,
+        ) from None
+    if not (0 <= azimuth <= 360 and 0 < elevation <= 90):
+        raise InputError(
+            f"{where}: a sun of azimuth {azimuth:g} and elevation {elevation:g} degrees is not in "
+            "the sky",
+            file=path,
+            remedy="azimuth is 0 to 360, from north over east, elevation above 0 to 90",
+        )
+    return azimuth, elevation
+
+
+def file_key(file: str) -> str:
+    """What two cells that name one file have in common."""
+    return file if "://" in file else os.path.realpath(file)
+
+
+def _known_city(
+    city: str, where: str, cities: Iterable[str], path: Path, cities_sheet: str | Path
+) -> None:
+    """Raise InputError if the city of a row is none of the cities sheet."""
+    if city in cities:
+        return
+    close = difflib.get_close_matches(city, cities, n=1)
+    raise InputError(
+        f"{where} is of city {city!r}, which is not in {cities_sheet}",
+        file=path,
+        remedy=f"did you mean {close[0]!r}?" if close else "add a row to the cities sheet",
+    )
+
+
+def with_images(
+    cells: dict[str, str], images: Mapping[str, Image], where: str, path: Path
+) -> dict[str, str]:
+    """A row of the scenes sheet with the files and masks of the images that it names.
+
+    A cell that names the file of an image means that image. Raises InputError for an image of
+    another city, and for a name that is neither an image nor a file.
+    """
+    by_file = {file_key(image.file): image for image in images.values()}
+    found = dict(cells)
+    for view in ("left", "right"):
+        cell = cells[f"{view}_image"]
+        image = images.get(cell) or by_file.get(file_key(cell))
+        if image is None:
+            if images and cell and not re.search(r"[./\\]", cell) and not Path(cell).is_file():
+                close = difflib.get_close_matches(cell, images, n=1)
+                raise InputError(
+                    f"{where}: {view}_image {cell!r} is no image of the images sheet, and no file",
+                    file=path,
+                    remedy=f"did you mean {close[0]!r}?" if close else "add its row to that sheet",
+                )
+            continue
+        if image.city != cells["city"]:
+            raise InputError(
+                f"{where}: {view}_image {image.image!r} is an image of {image.city}, the scene is "
+                f"of {cells['city']}",
+                file=path,
+                remedy="name two images of the scene's own city",
+            )
+        found[f"{view}_image"] = image.file
+        found[f"{view}_mask"] = cells[f"{view}_mask"] or image.mask
+    return found
+
+
+def read_scenes(
+    path: str | Path,
+    cities: Mapping[str, City],
+    images: Mapping[str, Image] | None = None,
+    cities_sheet: str | Path = "the cities sheet",
+) -> dict[str, Scene]:
+    """The scenes sheet by id of the scene. Raises InputError as described in the module.
+
+    Images that rows name are replaced by their files and masks.
+    """
     path = Path(path)
     scenes = {}
     rows = _read_table(path, Scene)
@@ -206,18 +379,14 @@ def read_scenes(path: str | Path, cities: Mapping[str, City]) -> dict[str, Scene
             "among several sheets that key scenes names in turn",
         )
     for number, cells in rows:
+        check(cells, Scene, f"{path}, line {number}")
+        where = f"line {number}: scene {cells['scene']!r}"
+        _known_city(cells["city"], where, cities, path, cities_sheet)
+        cells = with_images(cells, images or {}, where, path)
         scene = check(cells, Scene, f"{path}, line {number}")
-        if cells["city"] not in cities:
-            close = difflib.get_close_matches(cells["city"], cities, n=1)
+        if file_key(scene.left_image) == file_key(scene.right_image):
             raise InputError(
-                f"line {number}: scene {cells['scene']!r} is of city {cells['city']!r}, which is "
-                "not in the cities sheet",
-                file=path,
-                remedy=f"did you mean {close[0]!r}?" if close else "add a row to the cities sheet",
-            )
-        if cells["left_image"] == cells["right_image"]:
-            raise InputError(
-                f"line {number}: scene {cells['scene']!r} names one image twice",
+                f"{where} names one image twice",
                 file=path,
                 remedy="left_image is the backward view, right_image the forward view",
             )
@@ -233,7 +402,7 @@ def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> No
     """Raise InputError if a file that the scene's row names does not exist."""
     for column in columns:
         value = getattr(scene, column)
-        if value and not Path(value).is_file():
+        if value and (_too_long(value) or not Path(value).is_file()):
             raise InputError(
                 f"scene {scene.scene!r}: {column} {value!r} does not exist",
                 file=sheet,
@@ -241,20 +410,35 @@ def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> No
             )
 
 
+def _too_long(path: str) -> bool:
+    """Whether no file system has files of such a name."""
+    return len(os.fsencode(path)) > 4000 or any(
+        len(os.fsencode(part)) > 255 for part in Path(path).parts
+    )
+
+
 def lidar_files(pattern: str) -> list[Path]:
     """The LAS/LAZ files of a folder or a glob, sorted. Raises InputError if there is none."""
     path = Path(pattern)
-    if path.is_dir():
+    if _too_long(pattern):
+        found = []
+    elif path.is_dir():
         found = [f for f in path.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES]
     elif path.is_file():
         found = [path]
     else:
         anchor = Path(path.anchor)
-        found = [f for f in anchor.glob(str(path.relative_to(anchor))) if f.is_file()]
+        found = [f for f in anchor.glob(str(path.relative_to(anchor))) if not f.is_dir()]
     if not found:
         raise InputError(
             f"no LiDAR file at {pattern!r}",
             remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
+        )
+    if gone := [file for file in found if not file.is_file()]:
+        raise InputError(
+            "is a folder, or a link to what is not there",
+            file=gone[0],
+            remedy="put the file there, or take it out of the folder",
         )
     if patterns := [file for file in found if PATTERN.search(str(file))]:
         raise InputError(
@@ -270,7 +454,8 @@ def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
     try:
         return lidar_files(scene.lidar)
     except InputError as error:
-        problem = f"scene {scene.scene!r}: {error.problem}"
+        place = f"{error.file}: " if error.file else ""
+        problem = f"scene {scene.scene!r}: {place}{error.problem}"
         raise InputError(problem, file=sheet, remedy=error.remedy) from None
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from stereotruth.disparity import project
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.simulate.__main__ import make_scene
 
@@ -208,7 +209,8 @@ def test_dask_workers_come_and_go_while_project_runs(
     points = sorted((made / "ingest/East/East-1").glob("*.points"))
 
     def label(out: Path, **how: object) -> None:
-        project.project_scene(*images, points, out, Settings(), code="the same", **how)
+        inputs = SceneInputs.of(*images, points, Settings())
+        project.project_scene(inputs, out, code="the same", **how)
 
     label(tmp_path / "threads.zarr", workers=2)
     telling, out = tmp_path / "told.txt", tmp_path / "dask.zarr"

@@ -15,7 +15,7 @@ from stereotruth.evaluation.surface_models.reference import BUILDING, GROUND, TR
 from .exact_surface import write_heights
 
 EPSG = 32650
-WEST, NORTH, SIDE = 500_000.0, 3_300_000.0, 220.0  # m
+WEST, NORTH, SIDE = 500_000.0, 3_300_000.0, 176.0  # m
 CELL_M = 0.5
 TO_WGS84 = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True)
 
@@ -24,7 +24,7 @@ TO_WGS84 = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True)
 class Town:
     """``boxes``: rows of them, none without; ``hills_m``: their amplitude; ``trees``: or none."""
 
-    boxes: int = 5
+    boxes: int = 4
     hills_m: float = 1.0
     trees: bool = False
 
@@ -76,7 +76,7 @@ class Points:
 
     name, classified = "points", True
 
-    def __init__(self, town: Town, spacing_m: float = 0.4) -> None:
+    def __init__(self, town: Town, spacing_m: float = 0.5) -> None:
         rng = np.random.default_rng(1)
         self.spacing = spacing_m
         n = round(SIDE / spacing_m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,12 @@ import pyproj
 
 from stereotruth.alignment.aligned_pair import Alignment, ViewFit
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.grids import Layer, building, create_grid, open_grid
+from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from .images import pattern
@@ -79,13 +81,20 @@ def seen(model: EpipolarModel, view: str, box: bool) -> tuple[np.ndarray, ...]:
     return east, north, height
 
 
+@cache
+def surfaces_of(box: bool) -> tuple[EpipolarModel, tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """The model, and what the left and the right rectified image show."""
+    model = model_of()
+    return model, seen(model, "left", box), seen(model, "right", box)
+
+
 def image_of(surface: tuple[np.ndarray, ...]) -> np.ndarray:
     east, north, height = surface
     return np.round(pattern(east + 3.0 * height, north - 2.0 * height)).astype(np.uint16)
 
 
 def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray) -> Path:
-    with building(path) as scratch:
+    with atomic_store(path) as scratch:
         layer = Layer("uint16", 0, {"units": "1", "long_name": "image"})
         array = create_grid(
             scratch,
@@ -124,13 +133,15 @@ def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path
     return folder / f"{name}.points"
 
 
-RUN = ("code", "alignment", "view", "workers", "scheduler", "scene", "max_points", "strip")
+RUN = ("code", "workers", "scheduler", "scene", "max_points", "strip")
 
 
 def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):
-    """project_scene; ``options`` are its own and those of its settings."""
+    """project_scene; ``options`` are its own, view and alignment, and those of its settings."""
     run = {name: options.pop(name) for name in RUN if name in options}
-    return project_scene(left, right, stores, out, Settings(**options), **{"code": "test", **run})
+    pair = {name: options.pop(name) for name in ("view", "alignment") if name in options}
+    inputs = SceneInputs.of(left, right, stores, Settings(**options), **pair)
+    return project_scene(inputs, out, **{"code": "test", **run})
 
 
 class Scene:
@@ -138,13 +149,11 @@ class Scene:
 
     def __init__(self, folder: Path, box: bool, **options: float) -> None:
         self.folder = folder
-        self.model = model_of()
-        self.surface = seen(self.model, "left", box)
+        self.model, *surfaces = surfaces_of(box)
+        self.surface = surfaces[0]
         self.images = [
-            write_image(folder / "left.zarr", self.model, image_of(self.surface)),
-            write_image(
-                folder / "right.zarr", self.model, image_of(seen(self.model, "right", box))
-            ),
+            write_image(folder / f"{view}.zarr", self.model, image_of(surface))
+            for view, surface in zip(("left", "right"), surfaces)
         ]
         self.points = points_on(box, **options)
         self.store = write_points(folder, self.points)

@@ -198,7 +198,7 @@ FAULTS = [
         lambda f: write_settings(f, tiles={"size": 1024, "stride": 1023, "min_labelled": 0}),
     ),
     Fault("column", "column 'lidar_crs' is missing", _replaced("scenes.tsv", "lidar_crs", "crs")),
-    Fault("unknown city", "not in the cities sheet", lambda f: write_sheet(f, city="God")),
+    Fault("unknown city", "not in cities.tsv", lambda f: write_sheet(f, city="God")),
     Fault("one image twice", "one image twice", lambda f: write_sheet(f, right_image="left.tif")),
     Fault("no scene", "no scene in it",
           lambda f: (f / "scenes.tsv").write_text("\t".join(SHEET_COLUMNS))),

@@ -4,6 +4,11 @@
 
 prints the table of docs/damaged_input.md; ``--log`` keeps a line for every mutant. Every mutant is
 made by the number of its round alone, so that ``--only LAZ:1234`` does one again.
+
+    python -m tests.synthetic.damage_rounds --products scratch/folder --mutants 120
+
+does so with sheets, control points and what a run has made, so many mutants of each kind; the small
+city is made in the folder, if it is not there.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +45,9 @@ from stereotruth.lidar.point_store import PointStore
 
 from . import damage
 from .damaged_cases import Case, synthetic_cases
+from .damaged_products import READERS as PRODUCTS
+from .damaged_products import cannot_be_told, product_cases, read_product
+from .project import make_tiny
 
 MEMORY = 2 << 30  # bytes beyond what the process has before it meets a damaged file
 SECONDS = 30.0
@@ -154,6 +162,8 @@ class Reader:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def _read(self, case: Case, file: Path) -> tuple[Any, list[str]]:
+        if case.reader in PRODUCTS:
+            return read_product(case, file, self.folder)
         return READERS.get(case.reader, _misbehave)(case, file, self.folder)
 
     def outcome(self, name: str, number: int) -> Outcome:
@@ -171,7 +181,9 @@ class Reader:
             value, remarks = self._read(case, file)
         except InputError as error:
             says = str(error)
-            came = "refused" if file.name in says and "Remedy" in says else "other file named"
+            place = Path(case.options.get("place", file.name))
+            named = file.name in says or (place.parent.suffix and place.parent.name in says)
+            came = "refused" if named and "Remedy" in says else "other file named"
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
@@ -181,7 +193,10 @@ class Reader:
             new = [text for text in remarks if text not in usual]
             came, says = "right" if value == good else "remarked", "; ".join(new)
             if came == "remarked" and not new:
-                hidden = case.reader in READERS and case.cannot_be_told(data, value, good)
+                if case.reader in PRODUCTS:
+                    hidden = cannot_be_told(case, data)
+                else:
+                    hidden = case.reader in READERS and case.cannot_be_told(data, value, good)
                 came = "cannot be told" if hidden else "other values"
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # the most so far
         most = max(_kib("VmHWM:"), children) - before
@@ -305,10 +320,16 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--cases", default="", help="part of the names of those to take")
     parser.add_argument("--only", default="", help="case:round, done once in this process")
     parser.add_argument("--log", type=Path)
+    parser.add_argument("--products", type=Path, help="folder for the city that a run makes")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as stack:
         folder = Path(scratch)
         cases = synthetic_cases(folder / "good", given.lidar, given.images)
+        if given.products:
+            gcps = [
+                replace(case, format="control points") for case in cases if case.format == "GCP CSV"
+            ]
+            cases = [*product_cases(make_tiny(given.products.absolute()).folder), gcps[0]]
         cases = [case for case in cases if given.cases in case.name]
         if given.only:
             name, _, number = given.only.rpartition(":")
@@ -317,10 +338,13 @@ def main(arguments: list[str]) -> None:
             return None
         log = stack.enter_context(given.log.open("w")) if given.log else None
         outcomes = []
-        for outcome in rounds(cases, given.mutants, given.seed, folder):
-            outcomes.append(outcome)
-            if log:
-                print(json.dumps(asdict(outcome)), file=log, flush=True)
+        kinds = sorted({case.format for case in cases}) if given.products else [None]
+        for kind in kinds:
+            some = [case for case in cases if kind in (None, case.format)]
+            for outcome in rounds(some, given.mutants, given.seed, folder):
+                outcomes.append(outcome)
+                if log:
+                    print(json.dumps(asdict(outcome)), file=log, flush=True)
         print(table(outcomes))
     return None
 

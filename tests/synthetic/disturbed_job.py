@@ -2,7 +2,7 @@
 
     python -m tests.synthetic.disturbed_job --rounds 3000 scratch/folder
 
-Hundreds of rounds a minute, so that moments within the publishing are met, too. A plan is that of
+Hundreds of rounds a minute, so that moments between two products are met, too. A plan is that of
 the workflow: a job runs if its records say so, or a product is absent.
 """
 
@@ -22,25 +22,25 @@ from pathlib import Path
 
 from stereotruth.errors import InputError
 from stereotruth.products import records
-from stereotruth.products.files import replacing, whole_folder
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.files import atomic_file, atomic_folder
 from stereotruth.products.records import mark_begun, why_due
-from stereotruth.products.runs import begin_run, end_older_jobs
+from stereotruth.products.runs import begin_run
 
 SOURCE, FILE, FOLDER = Path("in.csv"), Path("out/a.json"), Path("out/b")
 KINDS = ("edit", "replace", "revert", "touch back", "setting", "late")
-ENDS = ("none", "orphan", "stop", "stop elsewhere", "kill")
+ENDS = ("none", "orphan", "stop", "kill")
 
 
 def _work(setting: str, slow: float) -> None:
     """Both products say what was read, and a setting of the run."""
-    with publication([str(SOURCE)], [str(FILE), str(FOLDER)], {"setting": setting}):
+    with atomic_outputs([str(SOURCE)], [str(FILE), str(FOLDER)], {"setting": setting}):
         first = SOURCE.read_text()
         time.sleep(slow)
-        with replacing(FILE) as scratch:
+        with atomic_file(FILE) as scratch:
             scratch.write_text(first + setting)
             time.sleep(slow / 4)
-        with whole_folder(FOLDER) as scratch:
+        with atomic_folder(FOLDER) as scratch:
             (scratch / "1").write_text(SOURCE.read_text() + setting)
             time.sleep(slow / 4)
 
@@ -112,7 +112,7 @@ class Rounds:
         begin_run()
         job = _start(self.setting, slow)
         time.sleep(rng.uniform(0.0, 0.012 + 1.6 * slow))
-        if end.startswith("stop"):
+        if end == "stop":
             os.kill(job, signal.SIGSTOP)
         if end == "kill":
             os.kill(job, signal.SIGKILL)
@@ -126,17 +126,12 @@ class Rounds:
         if end == "none":
             _ended(job)
         else:
-            if (
-                end == "stop elsewhere"
-            ):  # no process of this machine: it holds its locks until later
-                awake = threading.Timer(rng.uniform(0.0, 0.1), _wake, (job,))
-                awake.start()
-            else:
-                end_older_jobs()
+            if end == "stop":  # it holds its locks until later
+                threading.Timer(rng.uniform(0.0, 0.1), _wake, (job,)).start()
             self.run()
             _wake(job)
             _ended(job)
-        if kind == "late":  # after the publishing, before anybody looks
+        if kind == "late":  # after the products are there, before anybody looks
             _write(new, rng.choice(("edit", "replace", "touch back")))
         for _ in range(5):
             if not self.run():

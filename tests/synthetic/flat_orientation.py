@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from stereotruth.dataset.orientation import GROUND_TOLERANCE
-from stereotruth.dataset.pixel_size import DEGREE_M
 from stereotruth.dataset.polynomials import fit
+from stereotruth.numerics.degrees import DEGREE_M
 
 GSD, RATIO, LAT = 0.7, 0.62, 30.0  # m, base to height, degrees
 

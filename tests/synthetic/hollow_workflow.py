@@ -1,6 +1,6 @@
 """The workflow with all of its rules and none of its numerics: each job writes what it has read.
 
-Rules, plans, records and publication are the project's own. The scripts are replaced by
+Rules, plans, records and the writing of products are the project's own. The scripts are replaced by
 :func:`work`, so that all rules run in seconds, and each product says of which inputs and settings
 it was made: whether one is stale can be read from it. A file ``fault.json`` makes jobs of some
 rules fail, each in its way (:data:`WAYS`) and at a moment of its work (:data:`MOMENTS`).
@@ -14,6 +14,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,10 @@ import yaml
 
 from stereotruth.errors import InputError
 from stereotruth.job import job
-from stereotruth.products.files import replacing, whole_folder
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.files import atomic_file, atomic_folder
 from stereotruth.products.inputs import checksum
-from stereotruth.products.publication import publication
-from stereotruth.products.records import contents_of, plain
+from stereotruth.products.records import contents_of, plain, read_record
 
 from .project import Project, copy_project, row_of
 
@@ -103,20 +104,20 @@ def set_seed(project: Project, seed: int) -> None:
 
 def work(snakemake: Any) -> None:
     """Write into each product what it is made of; or fail, if that is asked."""
-    fail_at = _fault(snakemake.rule)
+    fail_at = fault_of(snakemake.rule)
     with job(snakemake.log[0], snakemake.rule):
         fail_at("start")
-        with publication(snakemake.input, snakemake.output, snakemake.params):
+        with atomic_outputs(snakemake.input, snakemake.output, snakemake.params):
             fail_at("begun")
             inputs = {path: checksum(path) for path in contents_of(snakemake.input)}
             settings = plain(snakemake.params)
             text = json.dumps({"inputs": inputs, "settings": settings}, sort_keys=True)
             for path in snakemake.output:
                 if Path(path).suffix in SUFFIXES:
-                    with replacing(path) as scratch:
+                    with atomic_file(path) as scratch:
                         scratch.write_text(text)
                 else:
-                    with whole_folder(path) as scratch:
+                    with atomic_folder(path) as scratch:
                         (scratch / "content.json").write_text(text)
                         (scratch / "more").mkdir()
                         (scratch / "more/1").write_text("1")
@@ -125,7 +126,8 @@ def work(snakemake: Any) -> None:
         fail_at("recorded")
 
 
-def _fault(rule: str) -> Callable[[str], None]:
+def fault_of(rule: str) -> Callable[[str], None]:
+    """Fails the job of a rule at the moment that is asked for, if one is."""
     try:
         fault = json.loads(FAULT.read_text()).get(rule, {})
     except FileNotFoundError:
@@ -162,18 +164,29 @@ def contents(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def stale(folder: Path, seed: int) -> list[str]:
-    """Products that are not of the inputs and settings that are there, or are not whole."""
+    """Products that are not of the inputs and settings that are there, or are not whole.
+
+    A product in the middle that was deleted stands for what its record says, if that is of what is
+    there.
+    """
     found, here = [], Path.cwd()
     os.chdir(folder)
-    sums: dict[str, str] = {}
+
+    @cache
+    def now(path: str) -> str:
+        if Path(path).exists():
+            return checksum(path)
+        record = read_record(path)
+        if record is None or record.settings.get("seed", seed) != seed:
+            return ""
+        if any(now(name) != was for name, was in record.inputs.items()):
+            return ""
+        return record.outputs[path]
+
     try:
         for product, content in contents(folder):
-            for path, was in content["inputs"].items():
-                if Path(path).exists():
-                    sums[path] = sums.get(path) or checksum(path)
-                    found += [f"{product} of {path}"] if sums[path] != was else []
-                else:
-                    found.append(f"{product} of {path}, which is absent")
+            wrong = [path for path, was in content["inputs"].items() if now(path) != was]
+            found += [f"{product} of {path}" for path in wrong]
             if seed not in (content["settings"].get("seed", seed),):
                 found.append(f"{product}: seed")
     finally:

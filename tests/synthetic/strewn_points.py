@@ -7,14 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereotruth.disparity.pixel_scale import PixelScale
 from stereotruth.disparity.rays import Rays
-from stereotruth.disparity.smooth_triangles import GroundSurface, Scale, ground_surface
-from stereotruth.disparity.vertices import VertexBuilder
 from stereotruth.lidar.lattice import LATTICE_M
+from stereotruth.surface.scale import SurfaceScale
+from stereotruth.surface.surface import GroundSurface, ground_surface
+from stereotruth.surface.vertices import VertexBuilder
 
 Array = np.ndarray
-FLAT = Rays(np.zeros((2, 2, 3)), (3000, 3000), 1.0)  # cells of 0.33 m at the equator
-CELL_M = 0.33
+CELL = (3000, 3000)  # lattice steps
+CELL_M = 0.33  # at the equator
 NOISE_M = 0.03
 
 
@@ -27,9 +29,14 @@ class Parts(NamedTuple):
     area: Array
 
 
-def parts(found: GroundSurface, corner: Array) -> Parts:
+def scale_of(points_per_m2: float, cell: tuple[int, int] = CELL) -> SurfaceScale:
+    """Of points of a density; 1 px of disparity per m."""
+    return PixelScale.of(points_per_m2, Rays(np.zeros((2, 2, 3)), cell, 1.0)).surface
+
+
+def parts(surface: GroundSurface, corner: Array) -> Parts:
     """Triangles ``corner`` [n, 3] of a surface."""
-    v = found.vertices
+    v = surface.vertices
     x, y = (q[corner] / 3000 * CELL_M for q in (v.lon_q, v.lat_q))
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
     return Parts(x, y, v.h_q[corner] * LATTICE_M, 0.5 * np.abs(area))
@@ -53,8 +60,8 @@ def surface_of(
     if within is not None:
         kept = (x > within[0]) & (y > within[1]) & (x < within[2]) & (y < within[3])
     lon, lat = (np.rint(c[kept] / CELL_M * 3000).astype(np.int64) for c in (x, y))
-    builder = VertexBuilder(FLAT, (0, 0), (1_000_000, 1_000_000))
+    scale = scale_of(spacing**-2)
+    builder = VertexBuilder(scale, (0, 0), (1_000_000, 1_000_000))
     h = np.rint(height[kept] / LATTICE_M).astype(np.int64)
     builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
-    scale = Scale.of(spacing**-2, CELL_M)
-    return ground_surface(builder.built(), scale, 1.0, FLAT.cell)
+    return ground_surface(builder.built(), scale)

@@ -11,7 +11,7 @@ from stereotruth.epipolar.rpc import SensorModel
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, camera
 
-SIZE = (760, 700)  # cols, rows of both images
+SIZE = (660, 610)  # cols, rows of both images
 TRUE = (camera(BACKWARD, size=SIZE), camera(FORWARD, angle=2.0, gsd=0.8, size=SIZE))
 
 

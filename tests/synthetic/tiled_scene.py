@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import rasterio
 
-from stereotruth.dataset.export import export_city
+from stereotruth.dataset.export import City, Extras, export_city
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.settings import Limits, Settings
 from stereotruth.epipolar.colours import COLOURS
 from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rpc import RPC, SensorModel
-from stereotruth.products.grids import Layer, building, create_grid
+from stereotruth.products.grids import Layer, atomic_store, create_grid
 
 SIZE = 64
 PIXELS = 360  # side of the original images
@@ -56,12 +59,33 @@ def texture(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
 
 
 def surface(sensor: SensorModel, col: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Ground point of each pixel's ray on the terrain, by fixed-point iteration."""
+    """Ground point of each pixel's ray on the terrain, by fixed-point iteration.
+
+    A step leaves a fifth of the error, at most: the slope of the terrain times that of the ray.
+    """
     height = np.full(col.shape, 40.0)
-    for _ in range(12):
+    for _ in range(9):
         lon, lat = sensor.localize(col, row, height)
         height = terrain(lon, lat)
     return lon, lat, height
+
+
+@cache
+def geometry(turn: float, row_shift: float) -> tuple[EpipolarModel, list[tuple], np.ndarray]:
+    """The model; what each view sees (inside, lon, lat, height); the disparity [h, w]."""
+    left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
+    model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
+    views = []
+    for to_sensor, sensor, shift in (
+        (model.epipolar_to_left, left, 0.0),
+        (model.epipolar_to_right, right, row_shift),
+    ):
+        col, row = to_sensor(x, y - shift)
+        inside = (abs(col - PIXELS / 2) < PIXELS / 2) & (abs(row - PIXELS / 2) < PIXELS / 2)
+        views.append((inside, *surface(sensor, col, row)))
+    ground = model.ground_to_epipolar(*(values.ravel() for values in views[0][1:]))
+    return model, views, (ground[0] - ground[2]).reshape(model.shape)
 
 
 def make_scene(
@@ -79,34 +103,23 @@ def make_scene(
     Planted errors: of the labels (px), and of the right image's rows (px, down). ``colour``: with
     red, green and blue beside the grey images.
     """
-    left, right = camera(0.09, turn, 0.70), camera(-0.48, -0.03, 0.75)
-    model = fit_epipolar(left, right, (PIXELS, PIXELS), (PIXELS, PIXELS), 40.0)
-    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
+    model, views, disparity = geometry(turn, row_shift)
     attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
     layer = Layer("uint16", 0, {"units": "1", "long_name": "grey value"})
     layers = dict.fromkeys(("image", *(COLOURS if colour else ())), layer)
-    frames = []
-    for name, to_sensor, sensor, shift in (
-        ("left", model.epipolar_to_left, left, 0.0),
-        ("right", model.epipolar_to_right, right, row_shift),
-    ):
-        col, row = to_sensor(x, y - shift)
-        lon, lat, height = surface(sensor, col, row)
-        inside = (abs(col - PIXELS / 2) < PIXELS / 2) & (abs(row - PIXELS / 2) < PIXELS / 2)
+    for name, (inside, lon, lat, _) in zip(("left", "right"), views):
         grey = np.where(inside, np.rint(texture(lon, lat)), 0).astype(np.uint16)
-        with building(folder / f"{name}.zarr") as path:
+        with atomic_store(folder / f"{name}.zarr") as path:
             array = create_grid(path, model.shape, layers, chunk=64, shard=128, attrs=attrs)
             array["image"][:] = grey
             for k, band in enumerate(COLOURS if colour else ()):
                 array[band][:] = grey + np.uint16(300 * k) * (grey > 0)
-        frames.append((inside, lon, lat, height))
-    inside, lon, lat, height = frames[0]
-    ground = model.ground_to_epipolar(lon.ravel(), lat.ravel(), height.ravel())
-    disparity = (ground[0] - ground[2]).reshape(model.shape)
+    inside, _, _, height = views[0]
+    y = np.arange(model.shape[0])[:, None]
     rng = np.random.default_rng(3)
     known = inside & (rng.random(model.shape) < 0.9) & (y < bare_from)
     meta = {"units": "px", "long_name": "test"}
-    with building(folder / "scene.zarr") as path:
+    with atomic_store(folder / "scene.zarr") as path:
         arrays = create_grid(
             path,
             model.shape,
@@ -131,7 +144,7 @@ def make_scene(
 
 
 NO_LIMITS = Limits(*[None] * 7)
-COUNTS = {"training": 600, "validation": 80, "testing": 200}
+TOWN = City("Town", "TN", training=600, validation=80, testing=200)
 
 
 def run(scenes, out: Path, **options) -> dict:
@@ -139,7 +152,11 @@ def run(scenes, out: Path, **options) -> dict:
     given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
     known = Settings.__dataclass_fields__
     settings = {name: given.pop(name) for name in list(given) if name in known}
-    return export_city("Town", "TN", scenes, out, settings=Settings(**settings), **COUNTS | given)
+    city = {name: given.pop(name) for name in list(given) if name in TOWN.__dataclass_fields__}
+    extras = {n: given.pop(n) for n in list(given) if n in Extras.__dataclass_fields__}
+    return export_city(
+        replace(TOWN, **city), scenes, out, Settings(**settings), extras=Extras(**extras), **given
+    )
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -13,17 +15,30 @@ ROOT = Path(__file__).parents[2]
 HOUSE = ROOT / "src" / "stereotruth"
 TESTS = ROOT / "tests"
 MOST_LINES = 520
+MOST_FUNCTION_LINES, MOST_PARAMETERS = 100, 10  # ``self`` and ``cls`` apart
+# Functions beyond, to be emptied: (lines, parameters).
+LONG_FUNCTIONS = {
+    "command.main.pairs": (44, 12),  # the options of a command are its parameters
+}
+# The rooms that are held to the glossary of CONTRIBUTING.md, and words that no variable, argument
+# or function has as a part of its name there.
+GLOSSARY_ROOMS = ("surface", "disparity")
+BANNED_WORDS = re.compile(
+    r"(^|_)(behind|firm|found|handed|marks|outlines|placed?|porous|pull|said|sheets?|shown|smooth|"
+    r"standing|told|trust)(_|$)"
+)
+BANNED_NAMES = {"of", "way", "look", "outline", "STEP_PX", "CELL_PX"}  # as a whole name
 # Each may import what stands in the lines above its own; what shares a line does not know each
 # other.
 ORDER = (
     {"errors", "kernel_cache"},
     {"kernels"},
-    {"error_statistics", "job", "settings"},
+    {"job", "numerics", "settings"},
     {"settings_text"},
     {"sheets"},
     {"products"},
     {"lidar", "epipolar", "simulate"},
-    {"alignment", "dataset"},
+    {"alignment", "dataset", "surface"},
     {"disparity", "report"},
     {"evaluation", "matching"},
     {"configuration", "last_lines"},
@@ -134,6 +149,90 @@ def test_no_file_is_long():
         for file in HOUSE.rglob("*.py")
     }
     assert {file: n for file, n in lengths.items() if n > MOST_LINES} == {}
+
+
+def functions(file: Path) -> Iterator[ast.FunctionDef]:
+    """Functions and methods of a file, inner ones too."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def size_of(function: ast.FunctionDef) -> tuple[int, int]:
+    """Lines with the docstring, without decorators; parameters without self and cls."""
+    given = function.args
+    names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    lines = function.end_lineno - function.lineno + 1
+    return lines, len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def test_no_function_is_long_or_has_many_parameters():
+    """But for those that are listed; one that has become short leaves the list."""
+    beyond = {}
+    for file in sorted(HOUSE.rglob("*.py")):
+        module = ".".join(file.relative_to(HOUSE).with_suffix("").parts)
+        for function in functions(file):
+            lines, parameters = size_of(function)
+            if lines > MOST_FUNCTION_LINES or parameters > MOST_PARAMETERS:
+                beyond[f"{module}.{function.name}"] = lines, parameters
+    assert set(beyond) == set(LONG_FUNCTIONS)
+    longer = {
+        name: (size, LONG_FUNCTIONS[name])
+        for name, size in beyond.items()
+        if any(now > before for now, before in zip(size, LONG_FUNCTIONS[name]))
+    }
+    assert longer == {}
+
+
+def names_given(file: Path) -> set[str]:
+    """Names that a file gives to variables, arguments and functions; methods ``of`` apart."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, ast.arg):
+            names.add(node.arg)
+        elif isinstance(node, ast.FunctionDef) and node.name != "of":
+            names.add(node.name)
+    return names
+
+
+def is_banned(name: str) -> bool:
+    return name in BANNED_NAMES or BANNED_WORDS.search(name.lower()) is not None
+
+
+@pytest.mark.parametrize("room", GLOSSARY_ROOMS)
+def test_names_are_those_of_the_glossary(room):
+    wrong = {
+        f"{file.name}: {name}"
+        for file in sorted((HOUSE / room).rglob("*.py"))
+        for name in names_given(file)
+        if is_banned(name)
+    }
+    assert wrong == set()
+    assert is_banned("_sheet_h") and is_banned("of") and not is_banned("offset")
+
+
+def test_one_constant_has_one_meaning():
+    """In the rooms of the glossary no two modules give one name to a constant."""
+    homes: dict[str, list[str]] = {}
+    for room in GLOSSARY_ROOMS:
+        for file in sorted((HOUSE / room).rglob("*.py")):
+            for node in ast.parse(file.read_text(encoding="utf-8")).body:
+                for target in node.targets if isinstance(node, ast.Assign) else ():
+                    for name in ast.walk(target):
+                        if isinstance(name, ast.Name) and name.id.isupper():
+                            homes.setdefault(name.id, []).append(f"{room}/{file.name}")
+    assert {name: files for name, files in homes.items() if len(files) > 1} == {}
+
+
+def test_the_glossary_says_what_is_said_no_more():
+    """Each term's row of CONTRIBUTING.md; the terms themselves are not banned."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = text.partition("## Glossary")[2].partition("\n## ")[0].splitlines()
+    terms = [row.split("|")[1].strip() for row in rows if row.startswith("| ")][1:]
+    assert len(terms) > 20
+    assert [term for term in terms if any(map(is_banned, re.split(r"\W+", term)))] == []
 
 
 def test_no_test_imports_from_another_test():

@@ -12,11 +12,12 @@ from stereotruth.errors import InputError
 from stereotruth.project import (
     FILES,
     configured,
-    merged,
     read_mapping,
     read_scenes,
-    with_defaults,
+    stores_of,
 )
+from stereotruth.settings import merged
+from stereotruth.sheets import Scene
 
 
 def test_a_mapping_is_laid_over_another():
@@ -26,13 +27,8 @@ def test_a_mapping_is_laid_over_another():
     assert below["a"]["c"]["d"] == 2
 
 
-def test_the_defaults_are_those_of_the_classes():
-    assert Configuration.of(with_defaults({})) == Configuration()
-
-
 def test_files_of_the_folder_lie_over_the_defaults(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert configured()[1] == "the defaults"
     Path("config").mkdir()
     Path("config/config.yaml").write_text("seed: 1\nstrict: true\n")
     Path("config.yaml").write_text("seed: 2\ntiles: {size: 512}\n")
@@ -102,3 +98,42 @@ def test_aliases_that_do_not_multiply_are_taken(tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text("a: &a {b: 1}\nc: *a\nd:\n  <<: *a\n  e: 2\n")
     assert read_mapping(file) == {"a": {"b": 1}, "c": {"b": 1}, "d": {"b": 1, "e": 2}}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "tiles: {size: 256}\nseed: 1\ntiles: {stride: 3}\n",
+            "'tiles' stands twice, in lines 1 and 3",
+        ),
+        ("tiles:\n  size: 256\n  size: 512\n", "'size' stands twice, in lines 2 and 3"),
+    ],
+)
+def test_a_key_that_stands_twice_is_refused_with_both_lines(tmp_path, text, words):
+    (tmp_path / "my.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_mapping(tmp_path / "my.yaml")
+
+
+def test_a_lidar_file_is_read_once_for_the_scenes_that_take_it_alike():
+    row = {"left_image": "l.tif", "right_image": "r.tif", "lidar": "lidar", "gcps": ""}
+    how = {"lidar_crs": "", "geoid": ""}
+    scenes = {
+        name: Scene(scene=name, **row | {"city": "A"} | how | changes)
+        for name, changes in {
+            "A-2": {},
+            "A-1": {},
+            "A-3": {"geoid": "g.gtx"},
+            "A-4": {"lidar_crs": "EPSG:32650"},
+            "B-1": {"city": "B"},
+        }.items()
+    }
+    files = {"one": Path("lidar/one.laz"), "two": Path("lidar/two.laz")}
+    lidar = {name: dict(files) for name in scenes}
+    lidar["A-1"] = {"one-1a2b": Path("lidar/../lidar/one.laz"), "three": Path("three.laz")}
+    found = stores_of(scenes, lidar)
+    assert found["A-2"] == [("A-2", "one"), ("A-2", "two")]
+    assert found["A-1"] == [("A-2", "one"), ("A-1", "three")]
+    for name in ("A-3", "A-4", "B-1"):
+        assert found[name] == [(name, "one"), (name, "two")]

@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 import re
+from datetime import UTC, date, datetime
 from pathlib import Path
 
 import pytest
 
 from stereotruth import sheets
-from stereotruth.configuration import REPLACED, Configuration, with_tables
+from stereotruth.configuration import REPLACED, Configuration, defaults_text, with_tables
 from stereotruth.errors import InputError
-from stereotruth.settings_text import fields_of, nested
 
 ROOT = Path(__file__).parents[2]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"
@@ -130,32 +130,29 @@ def test_the_default_configuration_is_valid_and_documented():
             assert f"`{name}`" in guide, name
 
 
-def test_the_file_of_defaults_holds_every_key_with_the_default_of_its_class():
-    def keys(values: dict, before: str = "") -> set[str]:
-        found = set()
-        for key, value in values.items():
-            found.add(f"{before}{key}")
-            if isinstance(value, dict) and key not in ("datasets", "methods", "fixed"):
-                found |= keys(value, f"{before}{key}.")
-        return found
-
-    def written(of: object, before: str = "") -> set[str]:
-        found = set()
-        for name, key in fields_of(type(of)).items():
-            found.add(f"{before}{name}")
-            inner, by_name = nested(key.type)
-            if inner is not None and not by_name:
-                found |= written(getattr(of, name), f"{before}{name}.")
-        return found
-
+def test_the_file_of_defaults_follows_from_the_classes():
+    text = (ROOT / "config" / "config.yaml").read_text()
+    assert defaults_text() == text, "run: python -m stereotruth.configuration"
     assert Configuration.of(default_config()) == Configuration()
-    assert keys(default_config()) == written(Configuration())
+
+
+def test_entries_by_name_lie_over_those_that_are_not_written():
+    mine = {"kind": "sgm", "mode": "hh", "training": {"epochs": 3}}
+    methods = {"mine": mine, "psmnet": None}
+    datasets = {"synthetic": {"methods": ["mine"]}}
+    found = Configuration.of({"benchmark": {"methods": methods, "datasets": datasets}}).benchmark
+    assert list(found.methods) == ["sgm", "stereonet", "psmnet", "hmsmnet", "mine"]
+    assert found.methods["psmnet"] is None
+    assert found.methods["mine"].entry == mine
+    assert found.methods["sgm"].entry == {"kind": "sgm"}
+    assert found.datasets["synthetic"].root == "dataset"
+    assert found.datasets["synthetic"].methods == ("mine",)
 
 
 def test_the_reference_follows_from_the_classes():
     guide = (ROOT / "config" / "README.md").read_text()
     assert with_tables(guide) == guide, "run: python -m stereotruth.configuration"
-    assert guide.count("<!-- keys: ") == guide.count("<!-- end -->") == 4
+    assert guide.count("<!-- keys: ") == guide.count("<!-- end -->") == 5
 
 
 def with_key(path: str, value: object) -> dict:
@@ -268,6 +265,33 @@ def test_lidar_files_that_snakemake_takes_for_patterns_are_refused(tmp_path):
         sheets.lidar_files(str(tmp_path))
 
 
+def test_a_lidar_file_that_is_none_is_refused_with_its_name(tmp_path):
+    (tmp_path / "a.laz").touch()
+    (tmp_path / "b.laz").symlink_to("nowhere")
+    for lidar in (tmp_path, tmp_path / "*.laz"):
+        with pytest.raises(InputError, match=r"b\.laz: is a folder, or a link"):
+            sheets.find_lidar(scene_with_lidar(lidar), "scenes.tsv")
+
+
+def test_names_longer_than_file_systems_have_are_refused():
+    for name in ("é" * 200, "a/" * 2500):
+        with pytest.raises(InputError, match="no LiDAR file"):
+            sheets.lidar_files(name)
+        with pytest.raises(InputError, match=r"scenes\.tsv: .* does not exist"):
+            sheets.require_files(scene_with_lidar(name), "scenes.tsv", ["lidar"])
+
+
+def test_a_sheet_that_is_cut_short_is_refused(tmp_path, cities):
+    text = scenes_text(ROW)
+    for end in (-2, -10):  # in the last cell, which nothing tells, and before it
+        file = write(tmp_path / "scenes.tsv", text[:end])
+        if end == -2:
+            assert len(sheets.read_scenes(file, cities)) == 1
+        else:
+            with pytest.raises(InputError, match=r"scenes\.tsv: line 2 ends after 5 of 8 columns"):
+                sheets.read_scenes(file, cities)
+
+
 def test_more_scenes_than_are_planned_are_refused_by_number(tmp_path, cities):
     rows = [with_cell("scene", f"Q-{k}") for k in range(20_000)]
     file = write(tmp_path / "s.tsv", scenes_text(*rows))
@@ -277,3 +301,99 @@ def test_more_scenes_than_are_planned_are_refused_by_number(tmp_path, cities):
         sheets.read_scenes(write(tmp_path / "s.tsv", '"' + "x" * 200_000), cities)
     with pytest.raises(InputError, match="25 MB are no sheet"):
         sheets.read_scenes(write(tmp_path / "s.tsv", "x" * 25_000_000), cities)
+
+
+# ------------------------------------------------------------------------------------- images
+
+IMAGES = ("image", "city", "file", "acquired", "sun_azimuth", "sun_elevation", "mask")
+TWO_CITIES = CITIES + "Wuhan\tWH\t1\t1\t1\n"
+
+
+def images_of(folder: Path, *rows: str, columns: tuple[str, ...] = IMAGES):
+    cities = sheets.read_cities(write(folder / "c.tsv", TWO_CITIES))
+    text = "\n".join(["\t".join(columns), *rows]) + "\n"
+    return sheets.read_images(write(folder / "i.tsv", text), cities), cities
+
+
+def test_columns_of_an_image_that_is_not_known_may_be_left_out(tmp_path):
+    images, _ = images_of(tmp_path, "A_1\tQichun\ta.tif", columns=IMAGES[:3])
+    assert images["A_1"] == sheets.Image("A_1", "Qichun", "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("2020-10-25", date(2020, 10, 25)),
+        ("2020-10-25T03:12:45Z", datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)),
+        ("2020-10-25T11:12:45+08:00", datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)),
+        ("2020-10-25 03:12Z", datetime(2020, 10, 25, 3, 12, tzinfo=UTC)),
+    ],
+)
+def test_times_of_images(text, time):
+    assert sheets.acquisition_time(text) == time
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (["A\tQuichun\ta.tif"], ["line 2: image 'A'", "did you mean 'Qichun'"]),
+        (["A\tQichun\ta.tif", "A\tQichun\tb.tif"], ["image 'A'", "more than one row"]),
+        (["A\tQichun\ta.tif", "B\tQichun\t./a.tif"], ["line 3: image 'B'", "image 'A' in line 2"]),
+        (["A\tQichun\ta.tif\t25.10.2020"], ["line 2: image 'A'", "25.10.2020", "2020-10-25T"]),
+        (["A\tQichun\ta.tif\t2020-10-25T03:12:45"], ["image 'A'", "no time zone"]),
+        (["A\tQichun\ta.tif\t2020-13-25"], ["image 'A'", "2020-13-25"]),
+        (["A\tQichun\ta.tif\t\t150\t"], ["image 'A'", "are not two numbers"]),
+        (["A\tQichun\ta.tif\t\t150\t-5"], ["image 'A'", "is not in the sky"]),
+        (["A b\tQichun\ta.tif"], ["line 2", "A b"]),
+    ],
+)
+def test_faults_of_images_name_the_row_and_the_remedy(tmp_path, rows, words):
+    with pytest.raises(InputError) as caught:
+        images_of(tmp_path, *rows)
+    assert all(word in str(caught.value) for word in (*words, "i.tsv", "Remedy"))
+
+
+STACK = ("A\tQichun\ta.tif\t\t\t\tclouds.tif", "B\tQichun\tb.tif", "C\tWuhan\tc.tif")
+
+
+@pytest.mark.parametrize(
+    ("cells", "files", "masks"),
+    [
+        (("B", "A"), ("b.tif", "a.tif"), ("", "clouds.tif")),
+        (("a.tif", "B"), ("a.tif", "b.tif"), ("clouds.tif", "")),
+        (("./a.tif", "x.tif"), ("a.tif", "x.tif"), ("clouds.tif", "")),
+        (("x.tif", "y.tif"), ("x.tif", "y.tif"), ("", "")),
+    ],
+)
+def test_scenes_name_images_or_their_files(tmp_path, cells, files, masks):
+    images, cities = images_of(tmp_path, *STACK)
+    row = ("Qichun-1", "Qichun", *cells, "lidar", "", "", "g.csv")
+    scene = sheets.read_scenes(write(tmp_path / "s.tsv", scenes_text(row)), cities, images)[
+        "Qichun-1"
+    ]
+    assert (scene.left_image, scene.right_image) == files
+    assert (scene.left_mask, scene.right_mask) == masks
+
+
+def test_a_scene_s_own_mask_goes_before_the_image_s(tmp_path):
+    images, cities = images_of(tmp_path, *STACK)
+    text = scenes_text((*ROW[:2], "A", "B", *ROW[4:], "mine.tif"), columns=(*COLUMNS, "left_mask"))
+    scene = sheets.read_scenes(write(tmp_path / "s.tsv", text), cities, images)["Qichun-1"]
+    assert scene.left_mask == "mine.tif"
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        (("A", "A"), ["names one image twice"]),
+        (("A", "a.tif"), ["names one image twice"]),
+        (("A", "C"), ["right_image 'C' is an image of Wuhan", "scene is of Qichun"]),
+        (("A", "D"), ["'D' is no image of the images sheet, and no file"]),
+    ],
+)
+def test_scenes_of_images_that_are_no_pair_are_refused(tmp_path, cells, words):
+    images, cities = images_of(tmp_path, *STACK)
+    row = ("Qichun-1", "Qichun", *cells, "lidar", "", "", "g.csv")
+    with pytest.raises(InputError) as caught:
+        sheets.read_scenes(write(tmp_path / "s.tsv", scenes_text(row)), cities, images)
+    assert all(w in str(caught.value) for w in (*words, "line 2: scene 'Qichun-1'", "s.tsv"))

@@ -41,7 +41,7 @@ from .killing import family, kill
 NOT_CONTENT = ".snakemake_timestamp"  # of Snakemake, in folders whose job has ended
 KINDS = ("edit", "replace", "revert", "stop")
 KILLS = ("none", "snakemake", "tree")
-LONGEST = 240.0  # s, that a run may wait for a stopped job before that goes on
+LONGEST = 60.0  # s, that a run may wait for a stopped job before that goes on
 
 
 @dataclass
@@ -164,11 +164,13 @@ def _fork_jobs() -> None:
     snakemake.script.PythonScript.execute_script = execute
 
 
-def _import_stages() -> None:
+def import_stages() -> None:
+    """Import what the scripts do, before they are forked."""
     for script in (ROOT / "workflow" / "scripts").glob("*.py"):
         for node in ast.walk(ast.parse(script.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth"):
-                importlib.import_module(node.module)
+                with suppress(ModuleNotFoundError):  # without PyTorch
+                    importlib.import_module(node.module)
     for name in ("xarray", "rasterio", "matplotlib.figure", "rioxarray", "cv2", "scipy.optimize"):
         importlib.import_module(name)
 
@@ -431,7 +433,7 @@ def main() -> None:
     if given.fork_jobs:
         global FORK_JOBS
         FORK_JOBS = True
-        _import_stages()
+        import_stages()
     project = make_cities(given.folder.absolute(), given.cities, given.data)
     harness, found = Harness(project, city_names(given.cities), given.seed), []
     for one in harness.rounds(given.stages or list(STAGES), given.rounds, given.kinds):

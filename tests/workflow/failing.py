@@ -8,6 +8,11 @@ users' files and settings, and damage to products and records, come between. The
 must have the failed job again. After a run that ends well, each product must be of the inputs and
 settings that are there. A line per round goes to failures.jsonl in the folder, and at the end the
 table of all that stand there.
+
+    python -m tests.workflow.failing --numerics --rounds 20 scratch/folder
+
+does so with the numerics (:mod:`..synthetic.faulty_workflow`): jobs are killed at any time of their
+work, too, and each product must have the bytes that a run from scratch gives it.
 """
 
 from __future__ import annotations
@@ -23,7 +28,10 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+from ..synthetic import faulty_workflow
+from ..synthetic.faulty_workflow import FaultyProject
 from ..synthetic.hollow_workflow import (
     FAULT,
     GIVEN,
@@ -35,16 +43,22 @@ from ..synthetic.hollow_workflow import (
     set_seed,
     stale,
 )
-from ..synthetic.project import ROOT, Project
+from ..synthetic.project import ROOT, Project, make_tiny
 from . import disturbing
 
 NO_RULES = ("all", "predict", "benchmark", "report", "evaluate")  # without a job of their own
 EDITS = (*(f"in/{name}" for name in GIVEN), "mine.py", "helper.py", "geoid.tif")
+AT_WORK, KILLS = "at work", ("kill", "node")
 EDITS = (*EDITS, "config/gcps/Wuhan-1.csv", "seed")
 
 
 class Failures:
     """Rounds in a project, one after the other."""
+
+    call: Sequence[str] = (*TARGETS, "--configfile", "my.yaml", "--cores", "16")
+    edits: Sequence[str] = EDITS
+    moments: Sequence[str] = MOMENTS
+    tops: Sequence[str] = ("results/.records/made", "results", "tiles", "benchmark", "data")
 
     def __init__(self, project: Project, seed: int) -> None:
         self.project, self.folder = project, project.folder
@@ -56,8 +70,7 @@ class Failures:
 
     def run(self, *more: str) -> tuple[int, set[str]]:
         """A run's exit status, and the rules that it planned."""
-        quick = ("--cores", "16", "--scheduler", "greedy")
-        run = disturbing.Run(self.folder, [*TARGETS, "--configfile", "my.yaml", *quick, *more])
+        run = disturbing.Run(self.folder, [*self.call, "--scheduler", "greedy", *more])
         run.wait()
         return run.returncode, self.planned()
 
@@ -69,12 +82,12 @@ class Failures:
         found = re.findall(r"^(\w+)\s+\d+$", tables[-1], flags=re.MULTILINE)
         return {*found} - {"total", *NO_RULES} if len(tables) > 1 else set()
 
-    def prepare(self, edits: Sequence[str] = EDITS) -> None:
+    def prepare(self, edits: Sequence[str] | None = None) -> None:
         """Make all, and find out which rules edits reach."""
         status, rules = self.run()
         assert status == 0, self.said()[-4000:]
         self.rules = sorted(rules)
-        for edit in edits:
+        for edit in self.edits if edits is None else edits:
             file = self.folder / (edit if edit != "seed" else "my.yaml")
             before, seed = file.read_bytes(), self.seed
             self.edit(edit)
@@ -99,7 +112,7 @@ class Failures:
 
     def damage(self) -> str:
         """Damage or delete a product or a record; returns which."""
-        tops = self.rng.choice(("results/.records/made", "results", "tiles", "benchmark", "data"))
+        tops = self.rng.choice(self.tops)
         files = [
             file
             for file in sorted((self.folder / tops).rglob("*"))
@@ -123,26 +136,40 @@ class Failures:
             return ""
         if self.rng.random() < 0.2:
             return self.damage()
-        edit = self.rng.choice([e for e in EDITS if rule in self.reached.get(e, ())] or EDITS)
+        known = [edit for edit in self.edits if rule in self.reached.get(edit, ())]
+        edit = self.rng.choice(known or self.edits)
         self.edit(edit)
         return edit
 
     def fail(self, rules: Sequence[str]) -> dict[str, dict[str, str]]:
         """A run in which jobs of the rules fail; those that did."""
-        rng = self.rng
-        faults = {rule: {"way": rng.choice(WAYS), "moment": rng.choice(MOMENTS)} for rule in rules}
+        faults = {rule: self.fault() for rule in rules}
         (self.folder / FAULT).write_text(json.dumps(faults))
         struck = self.folder / STRUCK
         struck.unlink(missing_ok=True)
         for more in ((), ("--forcerun", *rules)):
             status, _ = self.run("--keep-going", *more)
-            if struck.exists():
+            hit = {*struck.read_text().split()} & {*faults} if struck.exists() else set()
+            if hit:  # not by a job of an earlier run that has lost its node
                 break
-        else:
-            raise AssertionError(f"{rules} did not run: {self.said()[-4000:]}")
-        assert status != 0, self.said()[-4000:]
         (self.folder / FAULT).unlink()
-        return {rule: faults[rule] for rule in struck.read_text().split()}
+        if not hit:  # a job may end before it fails at work
+            assert AT_WORK in {fault["moment"] for fault in faults.values()}, self.said()[-4000:]
+            return {}
+        assert status != 0, self.said()[-4000:]
+        return {rule: faults[rule] for rule in sorted(hit)}
+
+    def fault(self) -> dict[str, Any]:
+        """How and when a job fails; after so many ``seconds``, if that is at work."""
+        moment = self.rng.choice(self.moments)
+        if moment == AT_WORK:
+            seconds = self.rng.uniform(0.01, 2.0)
+            return {"way": self.rng.choice(KILLS), "moment": moment, "seconds": seconds}
+        return {"way": self.rng.choice(WAYS), "moment": moment}
+
+    def stale(self) -> list[str]:
+        """Products that are not of what is there."""
+        return stale(self.folder, self.seed)
 
     def round(self) -> dict:
         """One round: what was done, and what is wrong."""
@@ -159,13 +186,13 @@ class Failures:
         for number in range(5):
             status, planned = self.run()
             for rule, fault in failed.items() if number == 0 and not one["edits"][-1] else ():
-                if fault["moment"] != "recorded" and rule not in planned:
+                if fault["moment"] not in ("recorded", AT_WORK) and rule not in planned:
                     one["wrong"].append(f"{rule} is not planned after it failed")
             if status == 0:
                 break
         else:
             one["wrong"].append(f"does not end well: {self.said()[-2000:]}")
-        one["wrong"] += stale(self.folder, self.seed)
+        one["wrong"] += self.stale()
         return one | {"seconds": round(time.monotonic() - begin, 1)}
 
     def rounds(self, count: int) -> Iterator[dict]:
@@ -174,6 +201,31 @@ class Failures:
             yield self.round()
         status, planned = self.run()
         assert status == 0 and not planned, planned
+
+
+class RealFailures(Failures):
+    """Rounds with the numerics."""
+
+    call = (*faulty_workflow.TARGETS, "--configfile", "tiny.yaml", "--cores", "2")
+    edits = tuple(faulty_workflow.INPUTS)
+    moments = (*MOMENTS, AT_WORK, AT_WORK, AT_WORK)
+    tops = ("results/.records/made", "results", "tiles", "dataset")
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.faulty = FaultyProject(make_tiny(folder), folder)
+        super().__init__(self.faulty.project, seed)
+        disturbing.import_stages()
+
+    def prepare(self, edits: Sequence[str] | None = None) -> None:
+        """Make all; every edit may come before every rule."""
+        super().prepare(edits=())
+
+    def edit(self, what: str) -> None:
+        self.faulty.edit(what)
+
+    def stale(self) -> list[str]:
+        """Products that a run from scratch makes otherwise."""
+        return self.faulty.stale()
 
 
 def table(rounds: Sequence[dict]) -> str:
@@ -196,11 +248,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--numerics", action="store_true")
     parser.add_argument("folder", type=Path)
     given = parser.parse_args()
     folder = given.folder.absolute()
-    shutil.rmtree(folder / "project", ignore_errors=True)
-    failures = Failures(make_hollow(folder / "project"), given.seed)
+    failures: Failures
+    if given.numerics:
+        failures = RealFailures(folder / "numerics", given.seed)
+    else:
+        shutil.rmtree(folder / "project", ignore_errors=True)
+        failures = Failures(make_hollow(folder / "project"), given.seed)
     failures.prepare()
     wrong = False
     for one in failures.rounds(given.rounds):

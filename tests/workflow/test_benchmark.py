@@ -45,6 +45,16 @@ def test_a_threshold_or_the_seed_scores_again_but_matches_nothing(later, tmp_pat
     assert jobs == {"match": 1, "score": 1}
 
 
+OWN = "benchmark: {datasets: {faulty: null}}\n"
+
+
+def test_only_what_is_not_there_is_made_for_a_comparison(later):
+    (later.folder / "own.yaml").write_text(OWN)
+    jobs = later.plan("benchmark", *ARGUMENTS, "own.yaml")
+    assert jobs == {"match": 2, "score": 2, "benchmark_tables": 1, "benchmark": 1}
+
+
+@pytest.mark.slow
 def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     """The results in the folder are SGM's as they are submitted, so that scores are the same."""
     scored = later.copy(tmp_path / "scored")
@@ -52,7 +62,7 @@ def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     assert (submission / "submission.json").is_file()
     shutil.copytree(submission, scored.folder / "theirs", dirs_exist_ok=True)
     own = [*ARGUMENTS, "own.yaml"]
-    (scored.folder / "own.yaml").write_text("benchmark: {datasets: {faulty: null}}\n")
+    (scored.folder / "own.yaml").write_text(OWN)
     run = scored.snakemake("benchmark", *own)
     assert run.status == 0, run.text[-4000:]
     assert run.jobs == {"match": 2, "score": 2, "benchmark_tables": 1, "benchmark": 1}

@@ -12,10 +12,11 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import yaml
 
 from stereotruth.command.main import main
 
-from ..synthetic.project import ROOT, Project, Run
+from ..synthetic.project import ROOT, SIZE, Project, Run
 
 COMMAND = [sys.executable, "-m", "stereotruth.command.main"]
 
@@ -33,15 +34,42 @@ def call(*arguments: str, folder: Path, command: list[str] = COMMAND) -> Run:
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> Path:
-    """The example, checked and made in a folder that was empty."""
-    empty = tmp_path_factory.mktemp("empty")
-    run = call("init", "--example", "demo", folder=empty)
+def own(made, tmp_path_factory) -> Path:
+    """A project of the command: a city's files, and copies of what was made of them elsewhere."""
+    folder = tmp_path_factory.mktemp("empty") / "own"
+    assert call("init", "own", folder=folder.parent).status == 0
+    for name in ("in", "results", "tiles"):
+        shutil.copytree(made.folder / name, folder / name)
+    for name in ("scenes", "cities"):
+        shutil.copy(made.folder / f"tiny_{name}.tsv", folder / f"{name}.tsv")
+    with (folder / "config.yaml").open("a") as stream:
+        yaml.safe_dump(SIZE, stream)
+    return folder
+
+
+def test_a_project_is_checked_and_carried_on(own):
+    """With tiles of another size; what was copied serves, and is not made again."""
+    checked = call("check", folder=own)
+    assert checked.status == 0, checked.text
+    assert "0 errors" in checked.text and "a run can begin" in checked.text
+    Project(own).edit("config.yaml", "size: 128", "size: 192")
+    made = call("run", "tiles/Tiny", "--cores", "2", folder=own)
+    assert made.status == 0, made.text[-4000:]
+    assert made.jobs == {"export": 1}
+    assert "Look at tiles/Tiny/manifest.csv" in made.text
+    tiles = list((own / "tiles/Tiny/disp").glob("*.tiff"))
+    assert tiles
+    assert {p.name for p in own.iterdir()} >= {"config.yaml", "tiles", "results", "logs"}
+    status = call("status", folder=own)
+    assert "up to date" in status.text and f"{len(tiles)} tiles" in status.text, status.text
+
+
+@pytest.mark.slow
+def test_the_example_is_checked_and_made(tmp_path):
+    """In a folder that was empty."""
+    demo = tmp_path / "demo"
+    run = call("init", "--example", "demo", folder=tmp_path)
     assert run.status == 0, run.text
-    return empty / "demo"
-
-
-def test_the_example_is_checked_and_made(demo):
     checked = call("check", folder=demo)
     assert checked.status == 0, checked.text
     assert "0 errors, 0 doubts: a run can begin" in checked.text
@@ -49,7 +77,6 @@ def test_the_example_is_checked_and_made(demo):
     assert made.status == 0, made.text[-4000:]
     assert "Look at tiles/Demo/manifest.csv" in made.text
     assert len(list((demo / "tiles/Demo/disp").glob("DM_*.tiff"))) >= 3
-    assert {p.name for p in demo.iterdir()} >= {"config.yaml", "tiles", "results", "logs"}
     status = call("status", folder=demo)
     assert "up to date" in status.text and "4 tiles" in status.text, status.text
 
@@ -73,14 +100,14 @@ def module() -> str:
     return textwrap.dedent(block) + OWN_RULE
 
 
-def test_a_module_of_another_workflow_makes_the_same(demo):
+def test_a_module_of_another_workflow_makes_the_same(own):
     """What the command has made stays; the other workflow's own rule goes on from it."""
-    (demo / "Snakefile").write_text(module())
-    project = Project(demo)
+    (own / "Snakefile").write_text(module().replace("Demo", "Tiny"))
+    project = Project(own)
     assert project.plan() == {"mine": 1}
     run = project.snakemake()
     assert run.status == 0, run.text[-4000:]
-    assert "DM_disparity" in (demo / "mine.txt").read_text()
+    assert "_disparity" in (own / "mine.txt").read_text()
     assert project.plan("report", "evaluate")["report_city"] == 1
 
 
@@ -94,27 +121,27 @@ def test_a_module_without_settings_has_the_defaults(tmp_path):
     assert benchmark["match"] == benchmark["dataset"] == 1
 
 
-def test_snakemake_from_elsewhere_reads_the_defaults_and_the_folder(demo, tmp_path):
+def test_snakemake_from_elsewhere_reads_the_defaults_and_the_folder(own, tmp_path):
     snakefile = ("--snakefile", str(ROOT / "Snakefile"))
     elsewhere = Project(tmp_path)
     (tmp_path / "w").mkdir()
     jobs = elsewhere.plan(*snakefile, "--directory", "w", "tiles/Qichun")
     assert jobs["export"] == 1 and jobs["align"] == 2
-    there = ("--directory", str(demo), "--configfile", str(demo / "config.yaml"))
-    assert elsewhere.plan("tiles/Demo", *snakefile, *there) == {}
+    there = ("--directory", str(own), "--configfile", str(own / "config.yaml"))
+    assert elsewhere.plan("tiles/Tiny", *snakefile, *there) == {}
     (tmp_path / "w/config").mkdir()
     (tmp_path / "w/config/config.yaml").write_text("tile: 3\n")
     run = elsewhere.snakemake("--dry-run", *snakefile, "--directory", "w", "tiles/Qichun")
     assert run.status != 0 and "unknown key 'tile'" in run.text
 
 
-def test_what_is_out_of_date_is_said_with_the_cause(demo):
-    gcps = demo / "gcps/Demo-1.csv"
+def test_what_is_out_of_date_is_said_with_the_cause(own):
+    gcps = own / "in/gcps.csv"
     text = gcps.read_text()
     try:
         gcps.write_text(text.replace(text.splitlines()[3] + "\n", ""))
-        status = call("status", "Demo", folder=demo)
-        assert "out of date" in status.text and "gcps/Demo-1.csv" in status.text, status.text
+        status = call("status", "Tiny", folder=own)
+        assert "out of date" in status.text and "in/gcps.csv" in status.text, status.text
         assert "align 1, refine 1, rectify 1, project 1, export 1" in status.text
     finally:
         gcps.write_text(text)
@@ -129,8 +156,8 @@ def in_process(monkeypatch, capsys, *arguments: str) -> Run:
     return Run(int(end.value.code or 0), said.out + said.err)
 
 
-def test_errors_of_what_is_not_there(demo, monkeypatch, capsys):
-    monkeypatch.chdir(demo)
+def test_errors_of_what_is_not_there(own, monkeypatch, capsys):
+    monkeypatch.chdir(own)
     run = in_process(monkeypatch, capsys, "status", "Qichun")
     assert run.status == 1 and "no city 'Qichun'" in run.text
     run = in_process(monkeypatch, capsys, "open")
@@ -200,7 +227,7 @@ def test_the_wheel_brings_the_workflow_to_an_empty_environment(tmp_path):
     (site / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
     assert str(site) in do(python, "-c", "import stereotruth; print(stereotruth.__file__)")
-    plan = do("stereotruth", "run", "tiles/Qichun", "--dry-run", "--cores", "1")
+    plan = do("stereotruth", "run", "--example", "tiles/Qichun", "--dry-run", "--cores", "1")
     assert "simulate_lidar       12" in plan and "shipped/profiles/default" in plan
     do("stereotruth", "init", "mine")
     assert (empty / "mine/config.yaml").is_file()

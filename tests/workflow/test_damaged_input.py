@@ -1,10 +1,8 @@
-"""Mutants of good files of every format, and environments with little in them."""
+"""Mutants of good files of every format."""
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from ..synthetic import damage_rounds
 from ..synthetic.damage import BYTES, TEXT, damaged
 from ..synthetic.damage_rounds import REST, Worker, rounds
 from ..synthetic.damaged_cases import synthetic_cases
-from ..synthetic.project import SIZE, row_of
+from ..synthetic.damaged_products import KINDS, product_cases
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +30,17 @@ def test_mutants_are_refused_or_right_or_cannot_be_told(cases, tmp_path) -> None
     assert max(o.seconds for o in outcomes) < 30
     assert max(o.mib for o in outcomes) < 2048
     assert {"refused", "right", "cannot be told"} <= {o.came for o in outcomes}
+
+
+@pytest.mark.slow
+def test_mutants_of_what_runs_have_made_are_refused_or_right(made, tmp_path) -> None:
+    """The second table, with a seed of its own; only sheets may be what their user has meant."""
+    cases = list(product_cases(made.folder))
+    assert {case.format for case in cases} == set(KINDS)
+    outcomes = list(rounds(cases, 20 * len(cases), 20261, tmp_path))
+    assert [o for o in outcomes if o.came in REST] == []
+    assert {o.format for o in outcomes if o.came == "cannot be told"} <= {"sheets"}
+    assert {o.format for o in outcomes if o.came == "refused"} == set(KINDS)
 
 
 @pytest.mark.slow
@@ -64,16 +73,3 @@ def test_ids_with_signs_of_formulas_do_not_break_the_figure(cases, tmp_path) -> 
     found = align(gcps.with_name("left.tif"), gcps.with_name("right.tif"), tmp_path / "gcps.csv")
     write_alignment(found, *(tmp_path / f"a.{kind}" for kind in ("json", "csv", "png")))
     assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_a_run_without_utf8_says_all_it_has_to_say(data, project, monkeypatch) -> None:
-    """LC_ALL=C ended right runs in UnicodeEncodeError."""
-    monkeypatch.setenv("LC_ALL", "C")
-    monkeypatch.setenv("PYTHONUTF8", "0")
-    shutil.copytree(data, project.folder / "in")
-    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
-    run = project.snakemake("tiles/Tiny", "report", "evaluate", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    assert "Look at tiles/Tiny/manifest.csv" in run.text
-    assert "UnicodeEncodeError" not in run.text

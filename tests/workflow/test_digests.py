@@ -26,9 +26,10 @@ REACH = {
     "refine": {"alignment", "epipolar", "lidar", "products"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
-    "project": {"disparity", "alignment", "epipolar", "lidar", "products"},
-    "project_right": {"disparity", "alignment", "epipolar", "lidar", "products"},
-    "project_strip": {"disparity", "alignment", "epipolar", "lidar", "products"},
+    "project": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
+    "project_right": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
+    "project_strip": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
+    "image_heights": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
     "export": {"dataset", "epipolar", "products"},
     "originals": {"dataset", "epipolar", "products"},
     "dataset": {"dataset", "epipolar", "products"},
@@ -67,9 +68,9 @@ REACH = {
 }
 # Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
 # there are, and a scene more is no other scene.
-ANYWHERE = {"errors", "error_statistics", "job", "kernel_cache", "kernels", "settings"}
+ANYWHERE = {"errors", "job", "kernel_cache", "kernels", "numerics", "settings"}
 # Who reports and records does not change what is computed.
-NOT_COVERED = {"job", "products.provenance", "products.publication", "report.index_page"}
+NOT_COVERED = {"job", "products.provenance", "products.atomic_outputs", "report.index_page"}
 
 
 def covered(rule) -> set[str]:
@@ -137,9 +138,9 @@ def test_every_script_has_its_rule_and_log(script):
     assert ast.unparse(work.items[0].context_expr).startswith("job(snakemake.log[0], ")
     assert not any(isinstance(node, ast.Expr) for node in main.body)
     if makes_something(rule):
-        publication = "publication(snakemake.input, snakemake.output, snakemake.params)"
+        held_by = "atomic_outputs(snakemake.input, snakemake.output, snakemake.params)"
         held = [n for n in ast.walk(main) if isinstance(n, ast.With)]
-        assert publication in {ast.unparse(i.context_expr) for node in held for i in node.items}
+        assert held_by in {ast.unparse(i.context_expr) for node in held for i in node.items}
 
 
 @pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])

@@ -20,6 +20,7 @@ REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the ve
     [
         (PersistenceBase.params_changed, ["self", "job", "file"]),
         (PersistenceBase.has_metadata, ["self", "job"]),
+        (PersistenceBase.incomplete, ["self", "job"]),
         (PersistenceBase.has_outdated_metadata, ["self", "job"]),
         (PersistenceBase.input_changed, ["self", "job", "file"]),
         (PersistenceBase.code_changed, ["self", "job", "file"]),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from stereotruth.command.check import check_project
 from stereotruth.command.findings import Level
 from stereotruth.dataset.sure_labels import TOO_UNCERTAIN
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings as ProjectSettings
 from stereotruth.disparity.status import Status
 from stereotruth.epipolar.image_reader import open_pair
@@ -33,10 +33,11 @@ from stereotruth.lidar.point_store import PointStore
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
 STAGES = {"align", "refine", "rectify", "project", "export"}
+ARGUMENTS = ("tiles/Tiny", "--configfile", "tiny.yaml")
 
 
 def plan(project: Project, *arguments: str) -> dict[str, int]:
-    return project.plan("tiles/Tiny", "--configfile", "tiny.yaml", *arguments)
+    return project.plan(*ARGUMENTS, *arguments)
 
 
 def manifest(project: Project) -> list[dict[str, str]]:
@@ -82,18 +83,6 @@ def test_disparity_agrees_with_the_exact_truth(made, tmp_path):
     assert len(result.tiles) >= 4
 
 
-def test_a_second_call_runs_nothing(made):
-    assert plan(made) == {}
-
-
-def test_touching_inputs_runs_nothing(made, tmp_path):
-    other = made.copy(tmp_path / "other")
-    for file in (other.folder / "in").rglob("*"):
-        if file.is_file() and "truth" not in str(file):
-            os.utime(file)
-    assert plan(other) == {}
-
-
 def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made, tmp_path):
     other = made.copy(tmp_path / "other")
     file = other.folder / "in/gcps.csv"
@@ -104,14 +93,6 @@ def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made, tmp_pa
     file.write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
     assert set(plan(other)) == STAGES
     file.write_text(before)
-    assert plan(other) == {}
-
-
-def test_another_tile_size_runs_export_only(made, tmp_path):
-    other = made.copy(tmp_path / "other")
-    other.edit("tiny.yaml", "size: 128", "size: 96")
-    assert set(plan(other)) == {"export"}
-    other.edit("tiny.yaml", "size: 96", "size: 128")
     assert plan(other) == {}
 
 
@@ -167,8 +148,7 @@ def both_views(made, tmp_path_factory) -> Project:
     other = made.copy(tmp_path_factory.mktemp("both") / "project")
     config = other.folder / "tiny.yaml"
     config.write_text(config.read_text() + "project: {right_view: true}\n")
-    assert plan(other) == {"project_right": 1, "export": 1}
-    run = other.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
+    run = other.snakemake(*ARGUMENTS)
     assert run.status == 0, run.text[-4000:]
     return other
 
@@ -197,6 +177,12 @@ def test_the_store_of_a_scene_opens_by_xarray_alone(made):
     assert tiles
 
 
+def test_the_right_view_asked_for_later_is_made_and_cut(made):
+    (made.folder / "both.yaml").write_text("project: {right_view: true}\n")
+    assert plan(made, "both.yaml") == {"project_right": 1, "export": 1}
+
+
+@pytest.mark.slow
 def test_the_right_view_is_a_second_product(made, both_views):
     """Asked for later, it adds files and leaves the others; both views name each other's pixels."""
     other = both_views
@@ -217,9 +203,9 @@ def test_the_right_view_is_a_second_product(made, both_views):
     assert (miss < 0.2).mean() > 0.95
 
 
-def test_verify_finds_an_edited_tile(both_views, tmp_path):
+def test_verify_finds_an_edited_tile(made, tmp_path):
     """That one alone; of a city whose tiles are whole, the stages after the tiles verify them."""
-    other = both_views.copy(tmp_path / "other")
+    other = made.copy(tmp_path / "other")
     tile = next((other.folder / "tiles/Tiny/left").iterdir())
     tile.write_bytes(tile.read_bytes()[:-1] + b"x")
     run = other.snakemake("verify", "--configfile", "tiny.yaml")
@@ -388,7 +374,8 @@ def run_stages(row: dict[str, str], good: Project, folder: Path) -> None:
             outputs = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
             rectify(left, right, model, *outputs, provenance={})
     sides = (rectified / "left.zarr", rectified / "right.zarr")
-    project_scene(*sides, stores, folder / "labels.zarr", ProjectSettings(), code="")
+    inputs = SceneInputs.of(*sides, stores, ProjectSettings())
+    project_scene(inputs, folder / "labels.zarr", code="")
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=name_of)

@@ -66,6 +66,7 @@ def test_a_job_that_is_killed_after_an_edit_is_due_with_all_that_follows(made, t
 
 
 @linux
+@pytest.mark.slow
 def test_failures_of_jobs_of_any_rule_leave_nothing_stale(tmp_path):
     """Without the numerics, edits and damage before, between and after; see failing.py."""
     failures = Failures(make_hollow(tmp_path / "project"), seed=10)

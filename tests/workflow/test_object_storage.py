@@ -6,7 +6,6 @@ behind; images and LiDAR read by their parts.
 
 from __future__ import annotations
 
-import base64
 import shutil
 import time
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ import pytest
 from stereotruth.errors import InputError
 from stereotruth.products import remote_files
 from stereotruth.products.grids import open_grid
+from stereotruth.products.records import BEGUN
 from stereotruth.products.ungeoreferenced import open_raster
 
 from ..synthetic.object_storage import BUCKET, Server, serving
@@ -124,10 +124,10 @@ def test_a_fresh_checkout_plans_nothing_and_then_what_an_edit_touches(stored, da
 def test_a_mark_of_a_killed_upload_has_the_product_made_again(server, stored, data, tmp_path):
     """As another machine left it that was killed while it wrote the tiles to the bucket."""
     fresh = checkout(tmp_path / "elsewhere", data)
-    product = base64.urlsafe_b64encode(f"s3://{BUCKET}/tiny/tiles/Tiny".encode()).decode()
-    assert f".records/made/{BUCKET}/tiny/tiles/Tiny.json" in stored.files
-    name = f".records/incomplete/{product}"
-    server.put(f"tiny/{name}", b'{"external_jobid": null}')
+    record = f".records/made/{BUCKET}/tiny/tiles/Tiny.json"
+    assert record in stored.files
+    name = f"{record}{BEGUN}"
+    server.put(f"tiny/{name}", b"")
     assert fresh.plan(*CALL, *STORED) == {"export": 1}
     server.client.delete_object(Bucket=BUCKET, Key=f"tiny/{name}")
     assert fresh.plan(*CALL, *STORED) == {}

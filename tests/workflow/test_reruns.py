@@ -89,13 +89,6 @@ def test_what_changed_in_a_clone_runs_what_it_touches(cloned, tmp_path, file, ol
     assert set(plan(other)) == jobs
 
 
-def test_a_clone_is_carried_on(cloned, tmp_path):
-    other = cloned.copy(tmp_path / "other")
-    other.edit("tiny.yaml", "size: 128", "size: 96")
-    assert other.snakemake(*ARGUMENTS).status == 0
-    assert plan(other) == {}
-
-
 def test_deleted_results_are_made_again(cloned, tmp_path):
     other = cloned.copy(tmp_path / "other")
     assert plan(other) == {}
@@ -144,7 +137,7 @@ DAMAGE = [
 
 
 @pytest.mark.parametrize(("file", "rule"), DAMAGE)
-def test_a_product_that_is_damaged_is_made_again_and_said_to_be(cloned, file, rule):
+def test_a_product_that_is_damaged_is_made_again_and_the_file_is_named(cloned, file, rule):
     """By a bit, or by a file that is gone from a folder; nobody takes it for an edit."""
     place = sorted(cloned.folder.glob(file))[0]
     whole = place.read_bytes()
@@ -152,7 +145,7 @@ def test_a_product_that_is_damaged_is_made_again_and_said_to_be(cloned, file, ru
         place.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
         run = cloned.snakemake("--dry-run", *ARGUMENTS)
         assert list(run.jobs) == FROM[rule]
-        assert re.search(r"is not what was made: made again", run.text)
+        assert f"{place.relative_to(cloned.folder)} is not what was made: made again" in run.text
         place.unlink()
         alone = "*" not in file and not re.search(r"\.(zarr|points)/|^tiles/", file)
         assert list(plan(cloned)) == ([] if alone else FROM[rule])  # an absent one is not damaged
@@ -173,6 +166,23 @@ def test_a_damaged_record_means_make_it_again(cloned, rule):
         assert f"damaged record results/.records/made/{name}.json" in run.text
     finally:
         record.write_bytes(whole)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="no such file here")
+@pytest.mark.parametrize("file", ["left.tif", "gcps.csv", "lidar/Tiny-1_0_0.laz"])
+def test_an_input_that_cannot_be_read_ends_the_plan_with_one_sentence(cloned, file):
+    place = cloned.folder / "in" / file
+    kept = place.rename(cloned.folder / "kept")
+    try:
+        place.symlink_to("/proc/self/mem")  # can be opened, and not be read
+        said = cloned.refuse("--dry-run", *ARGUMENTS).text.rstrip().splitlines()
+        assert said[-2:] == [
+            "Refused:",
+            f"in/{file}: cannot be read: Input/output error. Remedy: see that it is there, and "
+            "that you may read it",
+        ]
+    finally:
+        kept.rename(place)
 
 
 def test_a_file_beside_an_image_that_comes_later_is_an_input(cloned):

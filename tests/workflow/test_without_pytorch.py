@@ -21,7 +21,9 @@ def test_a_network_says_what_to_install(project: Project) -> None:
     methods = {"ready": {"kind": "psmnet", "weights": "weights.pt"}}
     config = {"benchmark": {"datasets": {"mine": of}, "methods": methods}}
     (project.folder / "my.yaml").write_text(yaml.safe_dump(config))
-    for target in ("results/train/mine/stereonet/best.pt", "results/match/mine/ready"):
-        run = project.snakemake(target, "--configfile", "my.yaml")
-        assert run.status != 0
-        assert "not installed. Remedy: pip install '.[networks]'" in run.text, run.text
+    targets = ("results/train/mine/stereonet/best.pt", "results/match/mine/ready")
+    run = project.snakemake("--keep-going", *targets, "--configfile", "my.yaml")
+    assert run.status != 0
+    for log in ("train/mine/stereonet", "match/mine/ready"):
+        said = (project.folder / f"logs/{log}.log").read_text()
+        assert "not installed. Remedy: pip install '.[networks]'" in said, run.text

@@ -29,6 +29,7 @@ rule align:
         runtime=10,
     params:
         script=content_of("../scripts/align.py"),
+        names=lambda wildcards: IMAGE_NAMES[wildcards.scene],
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
         code=source_digest("alignment.align", "alignment.align_report"),

@@ -2,23 +2,22 @@
 
 from dataclasses import asdict
 from pathlib import Path
-
-from snakemake.exceptions import WorkflowError
+from types import SimpleNamespace
 
 from stereotruth.configuration import Configuration
-from stereotruth.errors import InputError
+from stereotruth.errors import InputError, in_words
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.project import (
     FILES,
     check_fixed,
     is_synthetic,
     lidar_of,
+    names_in_pair,
+    read_images,
     read_scenes,
-    with_defaults,
+    stores_of,
 )
 
-# of the defaults, what neither a file of this folder nor the command line says other
-config.update(with_defaults(config))
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
@@ -32,10 +31,13 @@ def synthetic_scenes(city):
 try:
     SETTINGS = Configuration.of(config)
     CITIES, SCENES = read_scenes(SETTINGS, ask=workflow.is_main_process)
+    images = read_images(SETTINGS, CITIES)
+    IMAGE_NAMES = {name: names_in_pair(scene, images) for name, scene in SCENES.items()}
     LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
+    STORES = stores_of(SCENES, LIDAR)
     check_fixed(SETTINGS, SCENES)
 except InputError as error:
-    raise WorkflowError(str(error))
+    raise Refused(str(error))
 
 
 wildcard_constraints:
@@ -55,7 +57,7 @@ def no_scenes(sheet, what, remedy):
         remedy = f"add --configfile FILE if it was forgotten; or else {remedy}"
     own = "config/config.yaml" if Path("config/config.yaml").is_file() else "the defaults"
     read = ", ".join([own, *given])
-    return WorkflowError(f"{sheet}: no {what} (configuration: {read}). Remedy: {remedy}")
+    return Refused(f"{sheet}: no {what} (configuration: {read}). Remedy: {remedy}")
 
 
 def scenes_of(city):

@@ -46,9 +46,10 @@ def instead(of, name, answer):
 
 def due(persistence, job, file=None):
     try:
-        why = why_due(job.output, job.input, job.params)
+        with in_words():
+            why = why_due(job.output, job.input, job.params)
     except InputError as error:
-        raise WorkflowError(str(error))
+        raise Refused(str(error))
     if why:
         logger.info(f"{job.output[0]}: {why}")
     return Due(why, job.output)
@@ -59,6 +60,10 @@ async def never(*_):
 
 
 async def none(*_):
+    return []
+
+
+async def none_in_turn(*_):
     for output in ():
         yield output
 
@@ -83,9 +88,10 @@ def if_possible(persistence, before=PersistenceBase.save_iocache):
 instead(PersistenceBase, "params_changed", due)
 instead(PersistenceBase, "has_metadata", lambda *_: True)
 instead(PersistenceBase, "has_outdated_metadata", lambda *_: False)
+instead(PersistenceBase, "incomplete", none)  # our marks tell
 instead(PersistenceBase, "input_changed", lambda *_, **__: [])
 instead(PersistenceBase, "code_changed", lambda *_, **__: [])
-instead(Job, "outputs_older_than_script_or_notebook", none)  # without profiles/default
+instead(Job, "outputs_older_than_script_or_notebook", none_in_turn)  # without profiles/default
 instead(_IOFile, "is_newer", never)
 instead(DAG, "check_output_mtime", never)
 PersistenceBase.started = started

@@ -68,12 +68,11 @@ def lidar_file(wildcards):
 
 
 def point_stores(wildcards):
-    return expand(
-        "results/ingest/{city}/{scene}/{lidar}.points",
-        city=wildcards.city,
-        scene=wildcards.scene,
-        lidar=LIDAR[wildcards.scene],
-    )
+    """The points of a scene; files that another scene of the city reads, too, are read once."""
+    return [
+        f"results/ingest/{wildcards.city}/{scene}/{lidar}.points"
+        for scene, lidar in STORES[wildcards.scene]
+    ]
 
 
 def cities_of_report():
@@ -86,7 +85,7 @@ def cities_of_report():
         return list(CITIES)
     if made := [city for city in CITIES if Path(f"tiles/{city}").is_dir()]:
         return made
-    raise WorkflowError(
+    raise Refused(
         f"{SETTINGS.cities}: no city of it has tiles to report on. Remedy: add --configfile FILE "
         "if it was forgotten; or make tiles first (snakemake --cores 2 tiles/<City>), or ask for "
         "all these cities by --configfile config/config.yaml"

@@ -11,9 +11,9 @@ from stereotruth.matching.scenes.settings import Settings as PredictionSettings
 
 def dataset_settings(name):
     """The entry of a dataset in the configuration's section benchmark."""
-    known = {n: of for n, of in config["benchmark"]["datasets"].items() if of}
+    known = {n: of for n, of in SETTINGS.benchmark.datasets.items() if of}
     if name not in known:
-        raise WorkflowError(
+        raise Refused(
             f"benchmark.datasets: no dataset {name!r}. "
             f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
         )
@@ -23,15 +23,16 @@ def dataset_settings(name):
 def dataset_entry(name):
     """What a dataset is: its entry without the methods that are compared on it, and how."""
     asked = ("methods", "protocol")
-    return {key: value for key, value in dataset_settings(name).items() if key not in asked}
+    entry = asdict(dataset_settings(name)).items()
+    return {key: value for key, value in entry if key not in asked}
 
 
 def dataset_folder(name):
     """The root of a dataset; the workflow makes its own, and those of training cities."""
-    root = str(Path(dataset_settings(name)["root"]))
+    root = str(Path(dataset_settings(name).root))
     made_here = root == "dataset" or re.fullmatch("results/training_cities/[1-9][0-9]*", root)
     if not made_here and not Path(root).is_dir():
-        raise WorkflowError(
+        raise Refused(
             f"benchmark.datasets.{name}.root: {root}: no such folder. "
             "Remedy: name the dataset's folder"
         )
@@ -45,9 +46,9 @@ def is_own_dataset(name):
 
 def method_settings(name):
     """The entry of a method in the configuration's section benchmark."""
-    known = {n: of for n, of in config["benchmark"]["methods"].items() if of}
+    known = {n: of for n, of in SETTINGS.benchmark.methods.items() if of}
     if name not in known:
-        raise WorkflowError(
+        raise Refused(
             f"benchmark.methods: no method {name!r}. "
             f"Remedy: take one of {', '.join(known)}, or add it to your configuration"
         )
@@ -56,8 +57,8 @@ def method_settings(name):
 
 def needs_training(method):
     """Whether a method is a network that the workflow has to train first."""
-    entry = method_settings(method)
-    return KINDS[entry["kind"]].is_network and not entry.get("weights")
+    of = method_settings(method)
+    return KINDS[of.kind].is_network and not of.weights
 
 
 LEFT_OUT = {}  # what to say of methods that are not compared, by dataset
@@ -66,9 +67,9 @@ LEFT_OUT = {}  # what to say of methods that are not compared, by dataset
 @cache
 def methods_of(dataset):
     """Names of the methods that are compared on a dataset; of all, those that need no training."""
-    if chosen := dataset_settings(dataset).get("methods"):
+    if chosen := dataset_settings(dataset).methods:
         return list(chosen)
-    known = [n for n, of in config["benchmark"]["methods"].items() if of]
+    known = [n for n, of in SETTINGS.benchmark.methods.items() if of]
     left_out = [name for name in known if needs_training(name)]
     if left_out:
         LEFT_OUT[dataset] = (
@@ -78,7 +79,7 @@ def methods_of(dataset):
         )
         logger.warning(LEFT_OUT[dataset])
     if known == left_out:
-        raise WorkflowError(
+        raise Refused(
             f"benchmark.datasets.{dataset}: no method that needs no training. "
             f"Remedy: name some of {', '.join(known)} in its entry methods"
         )
@@ -91,7 +92,7 @@ def method_entry(name, dataset):
     A network without weights takes those that it is trained to on the dataset.
     """
     names = ("label", "fine_tuned_of", "training")
-    entry = {key: value for key, value in method_settings(name).items() if key not in names}
+    entry = {key: value for key, value in method_settings(name).entry.items() if key not in names}
     if KINDS[entry["kind"]].is_network:
         entry["weights"] = entry.get("weights") or f"results/train/{dataset}/{name}/best.pt"
     return entry
@@ -103,26 +104,25 @@ def method_files(name, dataset):
     Ends the plan if the method has settings that its kind does not know.
     """
     try:
-        kind = kind_of(name, method_settings(name))
+        kind = kind_of(name, method_settings(name).entry)
         return [str(file) for file in kind.files(method_entry(name, dataset))]
     except InputError as error:
-        raise WorkflowError(f"benchmark.methods.{name}: {error}")
+        raise Refused(f"benchmark.methods.{name}: {error}")
 
 
 def training_of(name):
     """How a network is trained: section training, and what the method's entry has other."""
-    own = method_settings(name).get("training") or {}
-    return {"seed": SETTINGS.seed, **asdict(SETTINGS.training), **own}
+    return {"seed": SETTINGS.seed, **asdict(SETTINGS.training), **method_settings(name).training}
 
 
 def method_modules(name):
     """Modules of the package that hold a method's own code."""
-    return KINDS[method_settings(name)["kind"]].modules
+    return KINDS[method_settings(name).kind].modules
 
 
 def method_label(name):
     """How tables call a method."""
-    return method_settings(name).get("label") or KINDS.get(name, KINDS["function"]).label or name
+    return method_settings(name).label or KINDS.get(name, KINDS["function"]).label or name
 
 
 def products_of_own_dataset():
@@ -138,6 +138,6 @@ def products_of_own_dataset():
 def scene_prediction():
     """How methods go over whole scenes; the disparity range is that of their dataset."""
     settings = asdict(SETTINGS.predict)
-    known = dataset_settings(settings["dataset"])["disparity_range"]
+    known = dataset_settings(settings["dataset"]).disparity_range
     own = {key: settings[key] for key in PredictionSettings.__dataclass_fields__}
     return own | {"disparity_range": own["disparity_range"] or known}

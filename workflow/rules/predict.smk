@@ -17,6 +17,7 @@ rule predict_scene:
     resources:
         mem_mb=6000,
         runtime=720,
+        dask=SETTINGS.dask.scheduler_address or "",
     params:
         script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
@@ -45,6 +46,7 @@ rule dsm:
     resources:
         mem_mb=2000,
         runtime=240,
+        dask=SETTINGS.dask.scheduler_address or "",
     params:
         script=content_of("../scripts/dsm.py"),
         settings=asdict(SETTINGS.predict.dsm),

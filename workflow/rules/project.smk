@@ -1,6 +1,4 @@
-from stereotruth.disparity.settings import Settings as Projection
-
-PROJECTION = asdict(Projection.of(config))
+PROJECTION = {key: of for key, of in asdict(SETTINGS.project).items() if key != "right_view"}
 
 
 rule project:
@@ -22,6 +20,7 @@ rule project:
     resources:
         mem_mb=4000,
         runtime=240,
+        dask=SETTINGS.dask.scheduler_address or "",
     params:
         script=content_of("../scripts/project.py"),
         view="left",

@@ -5,7 +5,7 @@ import sys
 
 from stereotruth.products.locks import FileLock
 from stereotruth.products.records import all_records
-from stereotruth.products.runs import Run, begin_run, end_older_jobs
+from stereotruth.products.runs import Run, begin_run
 
 LOCKS = []  # held until this process ends
 
@@ -18,7 +18,7 @@ def refuse_second_run():
     """
     lock = FileLock(".snakemake/run.lock")
     if not lock.take(Path.cwd(), wait=False):
-        raise WorkflowError(
+        raise Refused(
             f"{Path.cwd()}: another run is at work here ({lock.holder}). "
             "Remedy: wait until it ends, or stop it"
         )
@@ -29,16 +29,15 @@ if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, m
     try:
         Run().refuse_older()
     except InputError as error:
-        raise WorkflowError(str(error))
+        raise Refused(str(error))
 elif STORAGE.default_storage_provider:
-    MIRROR = record_mirror()
+    BUCKET = bucket_records()
 
 
 onstart:
     refuse_second_run()
-    if MIRROR:
-        keep_mirrored(MIRROR)
-    end_older_jobs()
+    if BUCKET:
+        keep_in_bucket(BUCKET)
     begin_run()
 
 
@@ -85,12 +84,14 @@ def say(text):
 
 
 onsuccess:
-    keep_states()
+    if BUCKET:
+        BUCKET.keep_states(Run().name)
     tidy_copies()
     say(made())
 
 
 onerror:
-    keep_states()
+    if BUCKET:
+        BUCKET.keep_states(Run().name)
     list_pages()
     say(complaints(log))

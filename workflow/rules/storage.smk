@@ -17,37 +17,28 @@ def product_name(path):
     return path
 
 
-def record_mirror():
+def bucket_records():
     """The records of the products in the bucket, brought here; what differs there is marked."""
-    from stereotruth.products.record_mirror import RecordMirror
-    from stereotruth.products.stored_states import StoredStates
+    from stereotruth.products.bucket_records import BucketRecords
 
-    mirror = RecordMirror(STORAGE.default_storage_prefix, copies())
-    mirror.pull()
-    StoredStates(STORAGE.default_storage_prefix, copies()).mark_changed()
-    return mirror
-
-
-def keep_states():
-    """Keep what the bucket holds of the products that this run has made."""
-    from stereotruth.products.stored_states import StoredStates
-
-    if STORAGE.default_storage_provider:
-        StoredStates(STORAGE.default_storage_prefix, copies()).keep(Run().name)
+    records = BucketRecords(STORAGE.default_storage_prefix, copies())
+    records.pull()
+    records.mark_changed()
+    return records
 
 
-def keep_mirrored(mirror):
-    """Have each job's mark and records in the bucket before and after its products."""
+def keep_in_bucket(records):
+    """Have each job's mark and record in the bucket before and after its products."""
     persistence = workflow.persistence
     started, finished = persistence.started, persistence.finished
 
     def started_there(*job, **how):
         started(*job, **how)
-        mirror.push()
+        records.push()
 
     async def finished_there(*job, **how):
         await finished(*job, **how)
-        mirror.push()
+        records.push()
 
     persistence.started, persistence.finished = started_there, finished_there
 
@@ -58,9 +49,9 @@ def tidy_copies():
         shutil.rmtree(STORAGE.local_storage_prefix, ignore_errors=True)
 
 
-MIRROR = None
+BUCKET = None
 if STORAGE.default_storage_provider and SETTINGS.strips != 1:
-    raise WorkflowError(
+    raise Refused(
         "strips: jobs that write parts of one store need a file system that all see, and products "
         f"go to {STORAGE.default_storage_prefix}. Remedy: take strips out of the configuration"
     )

@@ -28,7 +28,7 @@ rule train:
     params:
         script=content_of("../scripts/train.py"),
         dataset=lambda w: dataset_entry(w.dataset),
-        kind=lambda w: method_settings(w.method)["kind"],
+        kind=lambda w: method_settings(w.method).kind,
         training=lambda w: training_of(w.method),
         code=lambda w: source_digest(
             "matching.networks.training", "matching.kinds", *method_modules(w.method)

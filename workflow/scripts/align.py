@@ -3,15 +3,15 @@
 from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     model, strict = snakemake.params.model, snakemake.params.strict
     with (
         job(snakemake.log[0], f"align {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
@@ -19,6 +19,7 @@ if __name__ == "__main__":
             alignment = align(
                 *images,
                 snakemake.input.gcps,
+                names=snakemake.params.names,
                 model=model,
                 scene=scene,
                 strict=strict,

@@ -3,13 +3,13 @@
 from stereotruth.dataset.other_layouts import write_layout
 from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output
     with (
         job(snakemake.log[0], "dataset"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):

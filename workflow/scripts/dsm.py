@@ -1,15 +1,15 @@
 """A scene's disparities to a surface model."""
 
-from stereotruth.job import dask_scheduler, job, scheduler_address
+from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.surface_model import write_dsm
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    address = scheduler_address(snakemake.config)
+    address = snakemake.resources.dask
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
         write_dsm(

@@ -2,14 +2,14 @@
 
 from stereotruth.evaluation.labels_against_images import evaluate_city
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     stores = zip(given.left, given.right, given.disparity)
     with (
         job(snakemake.log[0], f"evaluate {city}") as log,
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         table = evaluate_city(
             city,

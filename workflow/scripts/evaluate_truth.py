@@ -4,14 +4,14 @@ from pathlib import Path
 
 from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     made = (snakemake.input[key] for key in ("disparity", "truth", "tiles"))
     with (
         job(snakemake.log[0], f"evaluate {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         evaluate_truth(
             scene,

@@ -4,13 +4,13 @@ from pathlib import Path
 
 from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"evaluate {city}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         evaluate_truth(
             city,

@@ -3,46 +3,43 @@
 import json
 from pathlib import Path
 
-from stereotruth.dataset.export import export_city
+from stereotruth.dataset.export import City, Extras, export_city
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.settings import Settings
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.job import job
-from stereotruth.products.files import replacing
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.files import atomic_file
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
     with (
         job(snakemake.log[0], f"export {city['city']}") as log,
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
+        scenes = map(
+            SceneFiles,
+            snakemake.params.scenes,
+            given.disparity,
+            given.left,
+            given.right,
+            given.alignment,
+            of_right,
+        )
+        made = snakemake.output
         summary = export_city(
-            scenes=list(
-                map(
-                    SceneFiles,
-                    snakemake.params.scenes,
-                    given.disparity,
-                    given.left,
-                    given.right,
-                    given.alignment,
-                    of_right,
-                )
-            ),
-            out_dir=snakemake.output.tiles,
-            **city,
-            settings=Settings(**snakemake.params.settings),
+            City(**city),
+            scenes,
+            made.tiles,
+            Settings(**snakemake.params.settings),
+            extras=Extras(made.coverage, made.contact_sheet, made.matches, made.ground_looks),
             code=snakemake.params.code,
             workers=snakemake.threads,
-            coverage=snakemake.output.coverage,
-            contact_sheet=snakemake.output.contact_sheet,
-            matches=snakemake.output.matches,
-            ground_looks=snakemake.output.ground_looks,
-            work=Path(snakemake.output.summary).with_name(".tiles.work"),
+            work=Path(made.summary).with_name(".tiles.work"),
         )
         summary["lines"] = summary_lines(summary, snakemake.output.tiles)
-        with replacing(snakemake.output.summary) as scratch:
+        with atomic_file(snakemake.output.summary) as scratch:
             scratch.write_text(json.dumps(summary, indent=2) + "\n")
         for line in summary["lines"]:
             log.info(line)

@@ -2,8 +2,8 @@
 
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.products.publication import publication
 from stereotruth.simulate.cities import CITIES
 
 if __name__ == "__main__":
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"truth of {scene.name}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         write_grid_truth(
             city,

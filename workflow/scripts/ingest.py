@@ -2,8 +2,8 @@
 
 from stereotruth.job import in_own_process, job
 from stereotruth.lidar.ingest import ingest
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
@@ -13,7 +13,7 @@ if __name__ == "__main__":
     }
 
     def ingest_file() -> None:
-        with publication(snakemake.input, snakemake.output, snakemake.params):
+        with atomic_outputs(snakemake.input, snakemake.output, snakemake.params):
             ingest(
                 snakemake.input.lidar,
                 snakemake.output.store,

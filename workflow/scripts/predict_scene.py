@@ -1,16 +1,16 @@
 """A stereo method over a whole scene."""
 
-from stereotruth.job import dask_scheduler, job, scheduler_address
+from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    address = scheduler_address(snakemake.config)
+    address = snakemake.resources.dask
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
         predict_scene(

@@ -1,25 +1,29 @@
 """One scene's points to its disparity grid."""
 
 from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.job import dask_scheduler, job, scheduler_address
-from stereotruth.products.publication import publication
+from stereotruth.job import dask_scheduler, job
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
-    scene, address = snakemake.wildcards.scene, scheduler_address(snakemake.config)
+    scene, address = snakemake.wildcards.scene, snakemake.resources.dask
     with (
         job(snakemake.log[0], f"project {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
         dask_scheduler(address) as scheduler,
     ):
-        project_scene(
+        inputs = SceneInputs.of(
             snakemake.input.left,
             snakemake.input.right,
             snakemake.input.points,
-            snakemake.output.disparity,
             Settings(**snakemake.params.settings),
-            alignment=snakemake.input.alignment,
-            view=snakemake.params.view,
+            snakemake.params.view,
+            snakemake.input.alignment,
+        )
+        project_scene(
+            inputs,
+            snakemake.output.disparity,
             workers=snakemake.threads,
             scheduler=scheduler,
             code=snakemake.params.code,

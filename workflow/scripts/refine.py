@@ -6,14 +6,14 @@ from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import checksums, describe, digest
-from stereotruth.products.publication import publication
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     with (
         job(snakemake.log[0], f"refine {scene}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         given = snakemake.input
         masks = given.left_mask, given.right_mask

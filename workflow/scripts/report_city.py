@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.html_page import INDEX
-from stereotruth.products.publication import publication
+from stereotruth.report.city_files import CityFiles
 from stereotruth.report.index_page import write_index
 from stereotruth.report.page import write_report
 
@@ -17,26 +18,27 @@ if __name__ == "__main__":
 
     with (
         job(snakemake.log[0], f"report {city}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
-        write_report(
-            city,
-            given.tiles,
-            snakemake.output[0],
-            index=INDEX,
+        scenes = by_scene(given.alignments)
+        files = CityFiles(
+            tiles=given.tiles,
             coverage=given.coverage,
-            looks={
-                scene: Path(given.looks, f"{scene}_left.tif")
-                for scene in by_scene(given.alignments)
-            },
-            alignments=by_scene(given.alignments),
+            looks={scene: Path(given.looks, f"{scene}_left.tif") for scene in scenes},
+            alignments=scenes,
             refinements=by_scene(given.refinements),
             refinement_figures=by_scene(given.refinement_figures),
+            truth=given.truth[0] if given.truth else None,
+            truth_table=given.truth_table[0] if given.truth_table else None,
             table4=given.table4,
             sift=given.sift,
             sift_figure=given.sift_figure,
-            truth=given.truth[0] if given.truth else None,
-            truth_table=given.truth_table[0] if given.truth_table else None,
+        )
+        write_report(
+            city,
+            files,
+            snakemake.output[0],
+            index=INDEX,
             sliders=snakemake.params.sliders,
             workers=snakemake.threads,
             code=snakemake.params.code,

@@ -4,16 +4,16 @@ from pathlib import Path
 
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
-from stereotruth.matching.benchmark.score_method import score
+from stereotruth.matching.benchmark.score_method import ScoringPlan, score
 from stereotruth.matching.benchmark.strata import Products
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     own = (Path("tiles"), Path("results/project"), Path("results/truth"))
     with (
         job(snakemake.log[0], f"score {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         score(
             StereoDataset.of(of.dataset, params.dataset),
@@ -21,11 +21,9 @@ if __name__ == "__main__":
             params.label,
             snakemake.input.predictions,
             snakemake.output[0],
-            thresholds_px=params.thresholds_px,
-            bootstrap=params.bootstrap,
-            seed=params.seed,
-            panels=params.panels,
+            ScoringPlan(
+                params.thresholds_px, params.bootstrap, params.seed, params.panels, params.protocol
+            ),
             fine_tuned_of=params.fine_tuned_of,
-            protocol=params.protocol,
             products=Products(*own) if snakemake.input.strata else None,
         )

@@ -1,7 +1,7 @@
 """One image of a synthetic scene."""
 
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.render import simulate_image
 
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     view = snakemake.wildcards.view
     with (
         job(snakemake.log[0], f"simulate {scene.name} {view}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         simulate_image(
             city,

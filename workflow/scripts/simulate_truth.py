@@ -1,7 +1,7 @@
 """The exact truth of a synthetic scene: per pixel, and as points."""
 
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.simulate.cities import CITIES
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.truth import simulate_truth
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"simulate {scene.name} truth"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         simulate_points(
             city,

@@ -2,12 +2,12 @@
 
 from stereotruth.job import job
 from stereotruth.matching.benchmark.submission import pack
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     of = snakemake.wildcards
     with (
         job(snakemake.log[0], f"submission {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])

@@ -5,13 +5,13 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.kinds import need_pytorch
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with (
         job(snakemake.log[0], f"train {of.dataset} {of.method}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         need_pytorch(of.method, params.kind)
         from stereotruth.matching.networks.training import train

@@ -2,13 +2,13 @@
 
 from stereotruth.evaluation.exact_tiles import gather
 from stereotruth.job import job
-from stereotruth.products.publication import publication
+from stereotruth.products.atomic_outputs import atomic_outputs
 
 if __name__ == "__main__":
     count = snakemake.wildcards.tiles
     with (
         job(snakemake.log[0], f"training_cities {count}"),
-        publication(snakemake.input, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         gather(
             snakemake.input.training,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..epipolar.rpc import SensorModel
+from ..numerics.robust import TUKEY, robust_sigma, tukey_weights
 from .align import RPC_TILT
 from .aligned_pair import Alignment
 from .tie_points import Geometry, TiePoints
@@ -19,13 +20,13 @@ Floats = NDArray[np.float64]
 
 
 MATCHING = 0.01  # px, what even the best match may be off
+LEAST_SIGMA = 1e-4  # of observations, in units of their own deviation
 SYSTEMATIC = 0.01  # px that all tie points are taken to share, to weigh them against a prior
 CLASSES = 5  # of matches, from the best to the poorest
 FREE = 1e-4  # share of the prior's weight that keeps a fit without it determined
 STARTS = 300  # planes, and shifts, from which the adjustment starts
 START_PX = 0.03  # px of an observation, besides its own, when blunders are looked for
 BLUNDER_ODDS = 1.0  # px²: of no blunder to a blunder in a square pixel
-TUKEY = 4.685  # deviations at which an observation has lost all weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,27 @@ class Observations:
     before: Floats
     after: Floats
     used: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Observations [n] of what the corrections change: observed = design · parameters + errors.
+
+    ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
+    matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
+    and biased where the surface is not what the points say). Observations of one ``site`` int[n]
+    share errors. ``at`` [n, 2] px: place in the left image.
+    """
+
+    design: Floats
+    observed: Floats
+    own: Floats
+    site: NDArray[np.int64]
+    at: Floats
+
+    def part(self, chosen: Bools) -> Equations:
+        """Those that are ``chosen`` [n]."""
+        return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,20 +131,13 @@ def _root(covariance: Floats) -> Floats:
     return vectors[:, keep] * np.sqrt(values[keep])
 
 
-def robust_scale(residuals: Floats, used: Bools) -> float:
-    """Robust standard deviation about zero."""
-    return max(1.4826 * float(np.median(np.abs(residuals[used]))), 1e-4)
-
-
 def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s: float) -> float:
     """Standard deviation that the places of a site share, from the scatter of the sites' means."""
     total = np.bincount(sites, weights)
     full = total > 1.0
     mean = np.bincount(sites, weights * residuals)[full] / total[full]
     own = s**2 * np.bincount(sites, weights**2)[full] / total[full] ** 2
-    return float(
-        np.sqrt(max(robust_scale(mean, np.ones(mean.size, bool)) ** 2 - np.median(own), 0.0))
-    )
+    return float(np.sqrt(max(robust_sigma(mean, LEAST_SIGMA) ** 2 - np.median(own), 0.0)))
 
 
 def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
@@ -135,9 +150,9 @@ def _shared_sigma(residuals: Floats, information: Floats, own: Floats) -> float:
     """
     classes = np.argsort(np.argsort(own, kind="stable"), kind="stable") * CLASSES // own.size
     weight = np.bincount(classes, information)
-    told = weight > 0.0
-    mean = np.bincount(classes, information * residuals)[told] / weight[told]
-    weight = weight[told]
+    known = weight > 0.0
+    mean = np.bincount(classes, information * residuals)[known] / weight[known]
+    weight = weight[known]
     freedom = weight.size - 1
     if freedom < 3:  # of less, the variance of Student's t is infinite
         return 0.0
@@ -182,45 +197,33 @@ def _agreement(at: Floats, observed: Floats, scale: Floats) -> Floats:
     return observed - basis @ best
 
 
-def estimate(
-    design: Floats,
-    observed: Floats,
-    own: Floats,
-    sites: NDArray[np.int64],
-    prior: Floats,
-    at: Floats,
-    common_px: float = 0.0,
-) -> Estimate:
-    """Parameters [12] from observations [n, 2] = design [n, 2, 12] · parameters and the prior.
+def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Estimate:
+    """Parameters [12] from the equations and the prior, a covariance [12, 12] about zero.
 
-    ``at`` [n, 2] px: where in the left image. ``common_px``: standard deviation of an error
-    that all observations have in common and that no residual shows.
-
-    ``own`` [n]: the matches' own standard deviations in px, taken as ratios only (poor matches are
-    poorer than that, and biased where the surface is not what the points say). ``prior`` [12, 12]
-    is the covariance about zero. Observations of one site, int[n], share errors.
-
-    All are weighed as if they shared SYSTEMATIC px, which decides between them and the prior only;
-    the covariance is that of this estimate under the errors that the observations show.
+    ``common_px``: standard deviation of an error that all observations have in common and that no
+    residual shows. All are weighed as if they shared SYSTEMATIC px, which decides between them and
+    the prior only; the covariance is that of this estimate under the errors that the observations
+    show.
     """
+    design, observed, own = equations.design, equations.observed, equations.own
     root = _root(prior)
-    sites = np.unique(sites, return_inverse=True)[1]
+    sites = np.unique(equations.site, return_inverse=True)[1]
     counts = np.bincount(sites)[sites]
     expected = np.hypot(own, MATCHING)[:, None]
     inner = design @ root
     rank = root.shape[1]
-    residuals = _agreement(at, observed, np.hypot(expected[:, 0], START_PX))
+    residuals = _agreement(equations.at, observed, np.hypot(expected[:, 0], START_PX))
     used = np.hypot(*residuals.T) < 3.0 * np.hypot(expected[:, 0], START_PX)
     z = np.zeros(rank)
     sigma, site_sigma = np.ones(2), np.zeros(2)
     weights = np.ones(len(observed))
     for step in range(40):
         relative = residuals / expected
-        sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+        sigma = np.array([robust_sigma(relative[used, k], LEAST_SIGMA) for k in (0, 1)])
         length = np.hypot(*(relative / sigma).T)
-        weights = np.maximum(1.0 - (length / TUKEY) ** 2, 0.0) ** 2
+        weights = tukey_weights(length)
         used = weights > 0.0
-        sigma = np.array([robust_scale(relative[:, k], used) for k in (0, 1)])
+        sigma = np.array([robust_sigma(relative[used, k], LEAST_SIGMA) for k in (0, 1)])
         site_sigma = np.array(
             [_site_sigma(relative[:, k], weights, sites, sigma[k]) for k in (0, 1)]
         )
@@ -270,29 +273,21 @@ def estimate(
     )
 
 
-def agreement_of_halves(
-    design: Floats,
-    observed: Floats,
-    own: Floats,
-    sites: NDArray[np.int64],
-    prior: Floats,
-    at: Floats,
-) -> tuple[float, float]:
+def agreement_of_halves(equations: Equations, prior: Floats) -> tuple[float, float]:
     """Mean misfit of one half of the sites, in deviations: as they came, and by the other half.
 
-    A misfit counts TUKEY deviations at most, so that blunders say nothing. Arguments as in
-    :func:`estimate`.
+    A misfit counts TUKEY deviations at most, so that blunders say nothing.
     """
-    halves = np.unique(sites, return_inverse=True)[1] % 2
+    halves = np.unique(equations.site, return_inverse=True)[1] % 2
     before, after = 0.0, 0.0
     for half in (0, 1):
-        told, asked = halves != half, halves == half
-        found = estimate(design[told], observed[told], own[told], sites[told], prior, at[told])
-        scale = np.hypot(own[asked], MATCHING)[:, None] * found.ratio
-        left = observed[asked] - design[asked] @ found.parameters
-        before += float(np.minimum(np.hypot(*(observed[asked] / scale).T), TUKEY).sum())
-        after += float(np.minimum(np.hypot(*(left / scale).T), TUKEY).sum())
-    return before / len(observed), after / len(observed)
+        estimated = estimate(equations.part(halves != half), prior)
+        check = equations.part(halves == half)
+        scale = np.hypot(check.own, MATCHING)[:, None] * estimated.ratio
+        residuals = check.observed - check.design @ estimated.parameters
+        before += float(np.minimum(np.hypot(*(check.observed / scale).T), TUKEY).sum())
+        after += float(np.minimum(np.hypot(*(residuals / scale).T), TUKEY).sum())
+    return before / halves.size, after / halves.size
 
 
 def linearised_at(

@@ -2,7 +2,7 @@
 
 GCPs are projected by the RPC of each image, and an affine transformation (or a similarity, or a
 shift) is fitted that takes the projected to the measured image coordinates. Blunders are left out
-and named (see ``robust_fit``); ``estimator="opencv"`` is the paper's way.
+and named (see ``robust_fit``).
 
 Image coordinates are (col, row) in px, (0, 0) at the centre of the upper-left pixel; ground is
 WGS 84 longitude, latitude in degrees and ellipsoidal height in m.
@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +43,12 @@ from .robust_fit import (
     System,
     find_blunders,
     leave_one_out_residuals,
-    opencv_inliers,
-    studentised,
 )
 from .settings import Settings
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
 
 
 POOR_SIGMA = 2.0  # px
@@ -137,9 +136,9 @@ def align(
     right_image: str | Path,
     gcps_csv: str | Path,
     *,
+    names: tuple[str, str] | None = None,
     model: str = Settings.model,
     scene: str = "",
-    estimator: str = "robust",
     seed: int = 0,
     strict: bool = False,
     provenance: Mapping[str, Any] | None = None,
@@ -148,10 +147,10 @@ def align(
 
     ``model``: affine (6 parameters per image, at least 4 GCPs), similarity (4; 3) or shift (2; 2).
     A GCP is left out of a view if its studentised residual exceeds :data:`BLUNDER_FLOOR` px and 4.5
-    times the GCPs' robust deviation; up to a third of a view's GCPs. ``estimator`` "opencv" takes
-    the inliers of OpenCV's RANSAC at its defaults, as in the paper. ``seed`` is for the samples
-    among more than 23 GCPs. The result does not depend on the order of the GCPs. ``strict``
-    makes warnings errors.
+    times the GCPs' robust deviation; up to a third of a view's GCPs. ``names`` of both images in
+    the images sheet are what control points of the long form name. ``seed`` is for the samples
+    among more than 23 GCPs. The result does not depend on the order of the GCPs. ``strict`` makes
+    warnings errors.
 
     Raises InputError, naming scene, file and remedy: unreadable input, GCPs outside the images or
     elsewhere on the Earth, left and right swapped, too few or collinear GCPs for the model (naming
@@ -161,11 +160,9 @@ def align(
         raise InputError(
             f"unknown alignment model {model!r}", remedy=f"one of {', '.join(MINIMAL)}"
         )
-    if estimator not in ("robust", "opencv"):
-        raise InputError(f"unknown estimator {estimator!r}", remedy="one of robust, opencv")
     of = f" (scene {scene})" if scene else ""
     images = Path(left_image), Path(right_image)
-    points = read_gcps(gcps_csv, scene)
+    points = read_gcps(gcps_csv, scene, names)
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
     near = check_ground(points, [footprint(*item) for item in opened], images, of)
@@ -176,7 +173,7 @@ def align(
         if not ok:
             doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
 
-    views, systems, used, lengths, limits = [], [], [], [], []
+    trials = []
     for name, image, (sensor, size), measured in zip(
         ("left", "right"), images, opened, (points.left, points.right)
     ):
@@ -185,47 +182,99 @@ def align(
         index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
         view = View(name, image, size, sensor, index, projected[index], measured[index])
         check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
-        everything = np.ones(len(index), dtype=bool)
-        refuse_fit(model, view, points, everything, of)
+        trials.append(_Trial.of(model, view, points, seed, of))
+    _leave_out_of_both(trials)
+    out = [trial.left_out for trial in trials]
+    fits = [trial.fit(model, points, other, of) for trial, other in zip(trials, reversed(out))]
+    for fit in fits:
+        doubts += _doubts(fit, model)
+    _tell(fits, model, doubts)
+    if strict and doubts:
+        raise InputError(
+            f"{doubts[0]}" + (f"; {len(doubts) - 1} more" if len(doubts) > 1 else "") + of,
+            file=points.file,
+            remedy="correct the GCPs, or set strict to false",
+        )
+    heights = {g.id: g.height for fit in fits for g in fit.gcps if g.used}
+    if provenance is None:
+        settings = {"model": model, "blunder_floor_px": BLUNDER_FLOOR}
+        provenance = describe([points.file, *images], settings, source_digest("alignment.align"))
+    return Alignment(
+        scene=scene,
+        model=model,
+        left=SensorModel(sensors[0].rpc, fits[0].affine),
+        right=SensorModel(sensors[1].rpc, fits[1].affine),
+        left_fit=fits[0],
+        right_fit=fits[1],
+        reference_height=round(float(np.mean([heights[name] for name in sorted(heights)])), 3),
+        warnings=tuple(doubts),
+        provenance=dict(provenance),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """The fit of a view while its blunders are looked for.
+
+    ``used`` bool[n] of the view's points; ``lengths`` [n]: their studentised residuals, px;
+    ``limit`` px: above, a point is a blunder.
+    """
+
+    view: View
+    system: System
+    used: Bools
+    lengths: Floats
+    limit: float
+
+    @classmethod
+    def of(cls, model: str, view: View, points: ControlPoints, seed: int, of: str) -> _Trial:
+        """Without the blunders that the view shows by itself.
+
+        Raises InputError if its points are too few, or lie on one line.
+        """
+        refuse_fit(model, view, points, np.ones(len(view.index), dtype=bool), of)
         system = System.of(model, view.predicted, view.measured)
-        if estimator == "opencv":
-            kept = opencv_inliers(model, view.predicted, view.measured, BLUNDER_FLOOR)
-            length, limit = studentised(system, kept), np.inf
-        else:
-            kept, length, limit = find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)
-        views.append(view)
-        systems.append(system)
-        used.append(kept)
-        lengths.append(length)
-        limits.append(limit)
+        return cls(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed))
 
-    # A wrong ground coordinate may stand out in one view and be hardly seen in the other (a wrong
-    # height in the near-vertical one): what is out in one has to be twice as good in the other.
-    out = [set(view.index[~kept].tolist()) for view, kept in zip(views, used)]
-    for k in (0, 1):
-        for j, i in enumerate(views[k].index):
-            if int(i) in out[1 - k] and lengths[k][j] > limits[k] / 2:
-                used[k][j] = False
+    @property
+    def left_out(self) -> set[int]:
+        """Rows of the table that are left out."""
+        return set(self.view.index[~self.used].tolist())
 
-    fits = []
-    out = [set(view.index[~kept].tolist()) for view, kept in zip(views, used)]
-    for k, (view, system, kept) in enumerate(zip(views, systems, used)):
+    def fit(self, model: str, points: ControlPoints, out_in_other: set[int], of: str) -> ViewFit:
+        """The fit to what is used; InputError if that is too little, or does not fit."""
+        view, system, kept = self.view, self.system, self.used
         refuse_fit(model, view, points, kept, of)
         sigma = refuse_misfit(model, view, system, points, kept, of)
         misses = np.hypot(*system.residuals(system.solve(kept)).T)
         reasons = {}
         for j, i in enumerate(view.index):
             if not kept[j]:
-                both = int(i) in out[1 - k]
+                both = int(i) in out_in_other
                 cause = (
                     "off in both images: wrong ground coordinates?"
                     if both
-                    else ("off in this image only: wrong measurement?")
+                    else "off in this image only: wrong measurement?"
                 )
                 reasons[int(i)] = f"{misses[j]:.1f} px off; {cause}"
-        fits.append(_view_fit(view, system, points, kept, reasons, sigma))
-        doubts += _doubts(fits[-1], model)
+        return _view_fit(view, system, points, kept, reasons, sigma)
 
+
+def _leave_out_of_both(trials: Sequence[_Trial]) -> None:
+    """Hold points that one view leaves out to half the limit in the other.
+
+    A wrong ground coordinate may stand out in one view and be hardly seen in the other (a wrong
+    height in the near-vertical one).
+    """
+    out = [trial.left_out for trial in trials]
+    for trial, out_in_other in zip(trials, reversed(out)):
+        for j, i in enumerate(trial.view.index):
+            if int(i) in out_in_other and trial.lengths[j] > trial.limit / 2:
+                trial.used[j] = False
+
+
+def _tell(fits: Sequence[ViewFit], model: str, doubts: Sequence[str]) -> None:
+    """Residuals and doubts in the log."""
     for fit in fits:
         log.info(
             "%s image: %d of %d GCPs; rms %.3f px before, %.3f px after the %s, %.3f px leaving "
@@ -240,27 +289,6 @@ def align(
         )
     for text in doubts:
         log.warning("warning: %s", text)
-    if strict and doubts:
-        raise InputError(
-            f"{doubts[0]}" + (f"; {len(doubts) - 1} more" if len(doubts) > 1 else "") + of,
-            file=points.file,
-            remedy="correct the GCPs, or set strict to false",
-        )
-    heights = {g.id: g.height for fit in fits for g in fit.gcps if g.used}
-    if provenance is None:
-        settings = {"model": model, "estimator": estimator, "blunder_floor_px": BLUNDER_FLOOR}
-        provenance = describe([points.file, *images], settings, source_digest("alignment.align"))
-    return Alignment(
-        scene=scene,
-        model=model,
-        left=SensorModel(sensors[0].rpc, fits[0].affine),
-        right=SensorModel(sensors[1].rpc, fits[1].affine),
-        left_fit=fits[0],
-        right_fit=fits[1],
-        reference_height=round(float(np.mean([heights[name] for name in sorted(heights)])), 3),
-        warnings=tuple(doubts),
-        provenance=dict(provenance),
-    )
 
 
 def from_rpcs(

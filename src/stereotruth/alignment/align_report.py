@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..products.files import as_text, replacing
+from ..products.files import as_text, atomic_file
 from ..products.pictures import round_length
 from .aligned_pair import Alignment
 
@@ -16,9 +16,9 @@ def write_alignment(
     alignment: Alignment, json_file: str | Path, csv_file: str | Path, png_file: str | Path
 ) -> None:
     """Write the alignment (JSON), the residuals of every GCP (CSV, px) and their figure (PNG)."""
-    with replacing(csv_file) as scratch:
+    with atomic_file(csv_file) as scratch:
         _write_table(alignment, scratch)
-    with replacing(png_file) as scratch:
+    with atomic_file(png_file) as scratch:
         _draw(alignment, scratch)
     alignment.save(json_file)
 

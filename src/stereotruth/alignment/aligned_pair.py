@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..epipolar.rpc import SensorModel
-from ..errors import InputError
-from ..products.files import replacing
+from ..products.files import atomic_file, read_perhaps_edited, read_record, sealed
+
+log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
 
@@ -181,23 +182,24 @@ class Alignment:
 
     def save(self, path: str | Path) -> None:
         """Write JSON; the file appears when it is whole."""
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-        with replacing(path) as scratch:
-            scratch.write_text(text, encoding="utf-8")
+        with atomic_file(path) as scratch:
+            scratch.write_text(sealed(self.to_dict()), encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> Alignment:
-        """Read what :meth:`save` wrote. Raises InputError if it cannot be used."""
-        try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except FileNotFoundError as error:
-            raise InputError(
-                "no such alignment", file=path, remedy="run the align stage"
-            ) from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"not an alignment ({error})", file=path, remedy="run the align stage again"
-            ) from error
+        """Read what :meth:`save` wrote, or what a user made of it for ``alignment.fixed``.
+
+        A file that is not as it was written is told in the log. Raises InputError if it cannot be
+        used.
+        """
+
+        def read(file: str | Path) -> dict[str, Any]:
+            values, is_as_written = read_perhaps_edited(file)
+            if not is_as_written:
+                log.warning("%s: edited since it was made; its values are used as they are", file)
+            return values
+
+        return read_record(path, cls.from_dict, what="alignment", stage="align", read=read)
 
 
 def _fit_to_dict(fit: ViewFit) -> dict[str, Any]:

@@ -4,6 +4,9 @@ A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``
 and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each original image, pixel
 (0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
 see the point.
+
+Or the long form, one line per point and image, which serves all pairs of a site: ``id,lon,lat,
+height,image,col,row``, ``image`` being a name of the images sheet.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ Floats = NDArray[np.float64]
 
 
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
-MOST_POINTS = 20_000  # nobody measures as many in two images
+LONG = ("id", "lon", "lat", "height", "image", "col", "row")  # one line per point and image
+MOST_POINTS = 20_000  # lines; nobody measures as many
 MOST_BYTES = 20_000_000  # of their file
 LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
@@ -59,10 +63,13 @@ class ControlPoints:
         return np.isfinite(self.right[:, 0])
 
 
-def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
+def read_gcps(
+    file: str | Path, scene: str = "", images: tuple[str, str] | None = None
+) -> ControlPoints:
     """Read and check the ground control points (or check points) of a scene.
 
-    Takes a byte-order mark, CRLF, blank lines, spaces around cells and columns in any order.
+    Takes a byte-order mark, CRLF, blank lines, spaces around cells and columns in any order. Of the
+    long form, the points that the scene's ``images`` (names of the left and the right one) show.
 
     Raises InputError, naming the file and the line, for anything else that is not as it should be.
     """
@@ -73,6 +80,8 @@ def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
         return InputError(problem + of, file=file, remedy=remedy)
 
     rows = _rows(file, fail)
+    if rows and "image" in rows[0][1]:
+        rows = _as_pair(rows, images, fail)
     points: dict[str, tuple[int, list[float]]] = {}
     for line, cells in rows:
         name = of_text(cells["id"])
@@ -104,6 +113,69 @@ def read_gcps(file: str | Path, scene: str = "") -> ControlPoints:
         left=values[:, 3:5].copy(),
         right=values[:, 5:7].copy(),
     )
+
+
+def images_measured(file: str | Path) -> dict[str, int]:
+    """Names of images in a file of the long form, each with its first line; none in another form.
+
+    Raises InputError as :func:`read_gcps` for what is no table of control points.
+    """
+
+    def fail(problem: str, remedy: str) -> InputError:
+        return InputError(problem, file=file, remedy=remedy)
+
+    found: dict[str, int] = {}
+    for line, cells in _rows(Path(file), fail):
+        if "image" in cells:
+            found.setdefault(of_text(cells["image"]), line)
+    return found
+
+
+def _as_pair(
+    rows: list[tuple[int, dict[str, str]]], images: tuple[str, str] | None, fail
+) -> list[tuple[int, dict[str, str]]]:
+    """Lines of the long form as those of a pair: one for each point that either image shows."""
+    if images is None or not all(images):
+        raise fail(
+            "control points by image (column image), and the scene's images have no names",
+            "list both images in the images sheet (key images), or write the form of a pair: "
+            f"{','.join(COLUMNS)}",
+        )
+    views = dict(zip(images, ("left", "right")))
+    found: dict[str, tuple[int, dict[str, str]]] = {}
+    ground: dict[str, tuple[int, list[str]]] = {}
+    for line, cells in rows:
+        name, place = cells["id"], [cells[column] for column in ("lon", "lat", "height")]
+        before, there = ground.setdefault(name, (line, place))
+        if there != place:
+            raise fail(
+                f"lines {before} and {line}: point {name} has two places on the ground",
+                "give all lines of a point the same lon, lat and height",
+            )
+        view = views.get(of_text(cells["image"]))
+        if view is None:
+            continue
+        empty = dict.fromkeys(COLUMNS[4:], "")
+        of_pair = found.setdefault(name, (line, {**dict(zip(COLUMNS, (name, *place))), **empty}))
+        if of_pair[1][f"{view}_col"]:
+            raise fail(
+                f"lines {of_pair[0]} and {line}: point {name} is measured twice in image "
+                f"{cells['image']}",
+                "keep one of the two lines",
+            )
+        for axis in ("col", "row"):
+            if not cells[axis]:
+                raise fail(
+                    f"line {line}, point {name}: {axis} is empty",
+                    "give the point's position in the image, or remove the line",
+                )
+            of_pair[1][f"{view}_{axis}"] = cells[axis]
+    if not found:
+        raise fail(
+            f"no point is measured in {images[0]} or {images[1]}",
+            "measure some, or leave column gcps empty",
+        )
+    return list(found.values())
 
 
 def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
@@ -138,7 +210,7 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
     header: list[str] | None = None
     rows = []
     reader = csv.reader(text.splitlines())
-    expected = f"the header is {','.join(COLUMNS)}"
+    expected = f"the header is {','.join(COLUMNS)}, or {','.join(LONG)}"
     for cells in _readable(reader, fail):
         cells = [cell.strip() for cell in cells]
         if not any(cells):
@@ -149,8 +221,9 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
                 raise fail(
                     "columns are not separated by commas", "save it with commas, and decimal points"
                 )
-            missing = [c for c in COLUMNS if c not in header]
-            unknown = [c for c in header if c not in COLUMNS]
+            columns = LONG if "image" in header else COLUMNS
+            missing = [c for c in columns if c not in header]
+            unknown = [c for c in header if c not in columns]
             if missing or unknown or len(header) != len(set(header)):
                 wrong = [f"column {c!r} is missing" for c in missing]
                 wrong += [f"column {c[:40]!r} is unknown" for c in unknown[:8]]

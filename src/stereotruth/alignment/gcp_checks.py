@@ -12,7 +12,8 @@ from rasterio.errors import RasterioError
 
 from ..epipolar.rpc import SensorModel
 from ..epipolar.rpc_files import read_rpc, rpc_file
-from ..errors import InputError
+from ..errors import InputError, in_number
+from ..numerics.degrees import metres_per_degree
 from ..products.ungeoreferenced import open_raster
 from .control_points import ControlPoints
 from .robust_fit import MINIMAL, System
@@ -31,7 +32,6 @@ MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
 PIXEL_M = (0.01, 1000.0)  # m on the ground
 PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
-DEGREE_M = 111_320.0  # one degree of latitude, for judging pixels only
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
@@ -46,10 +46,6 @@ class View:
     index: NDArray[np.intp]
     predicted: Floats
     measured: Floats
-
-
-def _plural(n: int) -> str:
-    return f"{n} GCP" if n == 1 else f"{n} GCPs"
 
 
 def _some(ids: Sequence[str]) -> str:
@@ -69,7 +65,7 @@ def _defect(model: str, points: Floats) -> str:
     n, (along, across) = len(points), _spreads(points)
     if n < NEEDED[model]:
         return (
-            f"{_plural(n)}, the model {model!r} needs {NEEDED[model]} "
+            f"{in_number(n, 'GCP')}, the model {model!r} needs {NEEDED[model]} "
             f"({MINIMAL[model]} determine it, one more shows an error)"
         )
     if model == "shift":
@@ -132,7 +128,7 @@ def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
     sides = []
     for step in ((1.0, 0.0), (0.0, 1.0)):
         there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
-        side = DEGREE_M * np.hypot(there[0] * np.cos(np.radians(lat)), there[1])
+        side = np.hypot(*(there * metres_per_degree(lat)))
         sides.append(side[np.isfinite(side)])
         if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
             return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
@@ -228,27 +224,43 @@ def check_heights(points: ControlPoints, sensor: SensorModel) -> str:
     )
 
 
-def check_swapped(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
-) -> None:
-    """Refuse a pair whose GCPs fit only with left and right exchanged."""
-    both = near & points.in_left & points.in_right
+def misfits_of_sides(
+    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools | None = None
+) -> tuple[float, float]:
+    """How far GCPs miss a pair as it is given, and with both images exchanged, px.
+
+    Median distance from the median shift, the worse of both images; NaN of fewer than three GCPs
+    (``near`` [n], default all) that both images show.
+    """
+    both = points.in_left & points.in_right
+    both = both if near is None else both & near
     if both.sum() < 3:
-        return
+        return np.nan, np.nan
     ground = points.lon[both], points.lat[both], points.height[both]
     projected = [np.stack(sensor.project(*ground), axis=1) for sensor in sensors]
 
     def misfit(measured: tuple[Floats, Floats]) -> float:
-        """Median distance from the median shift, the worse of both images."""
         worst = 0.0
         for there, here in zip(projected, measured):
             delta = here - there
             worst = max(worst, float(np.median(np.hypot(*(delta - np.median(delta, axis=0)).T))))
         return worst
 
-    given = misfit((points.left[both], points.right[both]))
-    exchanged = misfit((points.right[both], points.left[both]))
-    if given > 10.0 and exchanged < given / 5:
+    left, right = points.left[both], points.right[both]
+    return misfit((left, right)), misfit((right, left))
+
+
+def fit_exchanged(given: float, exchanged: float) -> bool:
+    """Whether GCPs with these misfits (px) belong to the pair with left and right exchanged."""
+    return given > 10.0 and exchanged < given / 5
+
+
+def check_swapped(
+    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
+) -> None:
+    """Refuse a pair whose GCPs fit only with left and right exchanged."""
+    given, exchanged = misfits_of_sides(points, sensors, near)
+    if fit_exchanged(given, exchanged):
         raise InputError(
             "left_image and right_image seem to be swapped in the scenes sheet: the GCPs miss by "
             f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged{of}",

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..epipolar.model import EpipolarModel
-from ..kernels import kernel
+from ..kernels import inner, kernel
+from ..numerics.bilinear import between_four
 from .aligned_pair import Alignment
 
 Floats = NDArray[np.float64]
@@ -138,6 +139,15 @@ class LabelUncertainty:
         return out
 
 
+@inner
+def _variance_of_node(nodes: Floats, row: int, col: int, sx: float, sy: float) -> float:
+    """Of e_d - s_x e_x - s_y e_y at a node."""
+    dd, dx, dy = nodes[0, row, col], nodes[1, row, col], nodes[2, row, col]
+    xx, xy, yy = nodes[3, row, col], nodes[4, row, col], nodes[5, row, col]
+    along = sx * (sx * xx - 2.0 * dx) + sy * (sy * yy - 2.0 * dy)
+    return dd + along + 2.0 * sx * sy * xy
+
+
 @kernel
 def _variance(nodes: Floats, v: Floats, u: Floats, slope: Floats, out: Floats) -> None:
     """``out`` [v.size, u.size]: of e_d - s_x e_x - s_y e_y, from ``nodes`` [6, rows, cols]."""
@@ -149,15 +159,12 @@ def _variance(nodes: Floats, v: Floats, u: Floats, slope: Floats, out: Floats) -
             i = min(int(u[x]), max(last_col - 1, 0))
             beside, e = min(i + 1, last_col), u[x] - i
             sx, sy = slope[0, y, x], slope[1, y, x]
-            total = 0.0
-            for row, col, weight in (
-                (j, i, (1.0 - f) * (1.0 - e)),
-                (j, beside, (1.0 - f) * e),
-                (below, i, f * (1.0 - e)),
-                (below, beside, f * e),
-            ):
-                dd, dx, dy = nodes[0, row, col], nodes[1, row, col], nodes[2, row, col]
-                xx, xy, yy = nodes[3, row, col], nodes[4, row, col], nodes[5, row, col]
-                along = sx * (sx * xx - 2.0 * dx) + sy * (sy * yy - 2.0 * dy)
-                total += weight * (dd + along + 2.0 * sx * sy * xy)
-            out[y, x] = max(total, 0.0)  # nodes are rounded
+            variance = between_four(
+                _variance_of_node(nodes, j, i, sx, sy),
+                _variance_of_node(nodes, j, beside, sx, sy),
+                _variance_of_node(nodes, below, i, sx, sy),
+                _variance_of_node(nodes, below, beside, sx, sy),
+                e,
+                f,
+            )
+            out[y, x] = max(variance, 0.0)  # nodes are rounded

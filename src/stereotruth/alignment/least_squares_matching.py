@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.resampling import RADIUS, sample, tap_weights
+from ..epipolar.resampling import sample
 from ..kernels import inner, kernel
+from ..numerics.cubic_convolution import SIX_POINT_RADIUS, six_point_weights
+from ..numerics.robust import TUKEY, biweight, robust_sigma
 from .window_fit import gain_and_correlation, mean_slopes, misfit, shift, weighted_mean
 
 Floats = NDArray[np.float64]
@@ -15,7 +17,6 @@ Picture = NDArray[np.float32]
 
 ITERATIONS = 20
 CONVERGED = 0.003  # px
-TUKEY = 4.685  # deviations at which a pixel has lost all weight
 PARTS = 3  # along each side of a window, whose shifts are compared
 
 
@@ -24,8 +25,8 @@ def warp_patch(
     source: Picture, col: float, row: float, carry: Floats, scale: tuple[float, float], out: Picture
 ) -> None:
     """Fill ``out`` [odd, odd] by the source at (col, row) + carry · (offset from the middle)."""
-    across = np.empty(2 * int(np.ceil(RADIUS * scale[0])))
-    down = np.empty(2 * int(np.ceil(RADIUS * scale[1])))
+    across = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[0])))
+    down = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[1])))
     half_rows, half_cols = out.shape[0] // 2, out.shape[1] // 2
     for j in range(out.shape[0]):
         v = j - half_rows
@@ -35,8 +36,8 @@ def warp_patch(
             r = row + carry[1, 0] * u + carry[1, 1] * v
             first_col = int(np.floor(c)) + 1 - across.size // 2
             first_row = int(np.floor(r)) + 1 - down.size // 2
-            tap_weights(c, first_col, scale[0], across)
-            tap_weights(r, first_row, scale[1], down)
+            six_point_weights(c, first_col, scale[0], across)
+            six_point_weights(r, first_row, scale[1], down)
             out[j, i] = sample(source, first_row, first_col, down, across)
 
 
@@ -65,8 +66,8 @@ def _weigh(
     """Fill ``weight`` [n] of the pixels; standard deviation of their misfits, robust.
 
     No pixel counts for more than its neighbours because it stands out: the weight falls with the
-    slope of the grey values, and so does what the pixel tells about the shift from where the slope
-    is the usual one. Pixels that do not fit (moved, shaded) lose theirs (Tukey's biweight).
+    slope of the grey values, and the pixel's information about the shift saturates where the slope
+    is the median one. Pixels that do not fit (moved, shaded) lose theirs (Tukey's biweight).
     """
     n = 0
     for k in range(clear.size):
@@ -74,21 +75,20 @@ def _weigh(
             gx, gy = mean_slopes(left, right, gain, k)
             scratch[n] = gx * gx + gy * gy
             n += 1
-    usual = np.median(scratch[:n])
+    median_slope2 = np.median(scratch[:n])
     n = 0
     for k in range(clear.size):
         if clear[k] > 0.0:
             gx, gy = mean_slopes(left, right, gain, k)
-            weight[k] = usual / (usual + gx * gx + gy * gy)
+            weight[k] = median_slope2 / (median_slope2 + gx * gx + gy * gy)
             miss = misfit(left, right, means[0], means[1], gain, k)
             scratch[n] = abs(miss) * np.sqrt(weight[k])
             n += 1
-    scale = max(1.4826 * np.median(scratch[:n]), 1e-6 * np.sqrt(usual))
+    scale = robust_sigma(scratch[:n], 1e-6 * np.sqrt(median_slope2))
     n = 0
     for k in range(clear.size):
         if clear[k] > 0.0:
-            t = scratch[n] / (TUKEY * scale)
-            weight[k] *= (1.0 - t * t) ** 2 if t < 1.0 else 0.0
+            weight[k] *= biweight(scratch[n] / (TUKEY * scale))
             n += 1
     return scale
 
@@ -109,24 +109,24 @@ def _discord(
     meta-analysis (DerSimonian & Laird 1986).
     """
     side = int(np.sqrt(weight.size))
-    told, wanted = np.zeros(PARTS * PARTS), np.zeros(PARTS * PARTS)
+    information, gradient = np.zeros(PARTS * PARTS), np.zeros(PARTS * PARTS)
     squared, total = 0.0, 0.0
     for k in range(weight.size):
         part = (k // side) * PARTS // side * PARTS + (k % side) * PARTS // side
         gx, gy = mean_slopes(left, right, gain, k)
         slope = gx * along[0] + gy * along[1]
         miss = misfit(left, right, means[0], means[1], gain, k)
-        told[part] += weight[k] * slope * slope
-        wanted[part] += weight[k] * slope * miss
+        information[part] += weight[k] * slope * slope
+        gradient[part] += weight[k] * slope * miss
         squared += weight[k] * miss * miss
         total += weight[k]
     variance = squared / total  # of a misfit of unit weight
     whole, squares, scatter, parts = 0.0, 0.0, 0.0, 0
-    for p in range(told.size):
-        if told[p] > 0.0:
-            whole += told[p]
-            squares += told[p] ** 2
-            scatter += wanted[p] ** 2 / told[p] / variance
+    for p in range(information.size):
+        if information[p] > 0.0:
+            whole += information[p]
+            squares += information[p] ** 2
+            scatter += gradient[p] ** 2 / information[p] / variance
             parts += 1
     if parts < 3 or not whole > squares / whole:
         return np.inf
@@ -147,14 +147,13 @@ def least_squares_match(
     start: Floats,
     result: Floats,
 ) -> None:
-    """Fill ``result`` [6] with the match of a window: a robust least-squares match.
+    """Fill ``result`` [5] with the match of a window: a robust least-squares match.
 
     Shift (x, y) in template px; its sigma by the misfits; the correlation; the sigma by how much
-    the window's parts disagree along ``along`` [2]; the share of the clear pixels' weight that was
-    lost to misfits. ``template`` has a margin of one px for the slopes; ``clear`` [n] is 1 for the
-    pixels that take part. Unknowns are the shift, gain and offset; the slopes are the mean of both
-    windows', so that noise does not draw the shift. NaN where the match leaves the picture or does
-    not converge.
+    the window's parts disagree along ``along`` [2]. ``template`` has a margin of one px for the
+    slopes; ``clear`` [n] is 1 for the pixels that take part. Unknowns are the shift, gain and
+    offset; the slopes are the mean of both windows', so that noise does not draw the shift. NaN
+    where the match leaves the picture or does not converge.
     """
     count = (template.shape[0] - 2) ** 2
     warped = np.empty(template.shape, np.float32)
@@ -178,8 +177,8 @@ def least_squares_match(
         gain, correlation = gain_and_correlation(left, right, weight, means[0], means[1])
         if np.isnan(gain):
             return
-        usual = _weigh(left, right, clear, means, gain, weight, scratch)
-        if np.isnan(usual):
+        scatter = _weigh(left, right, clear, means, gain, weight, scratch)
+        if np.isnan(scatter):
             return
         means = weighted_mean(left, weight), weighted_mean(right, weight)
         gain, correlation = gain_and_correlation(left, right, weight, means[0], means[1])
@@ -197,16 +196,4 @@ def least_squares_match(
             result[2] = sigma
             result[3] = correlation
             result[4] = _discord(left, right, weight, means, gain, along)
-            result[5] = _lost(left, right, gain, clear, weight)
             return
-
-
-@inner
-def _lost(left: Floats, right: Floats, gain: float, clear: Floats, weight: Floats) -> float:
-    """Share of the clear pixels that the misfits have left without weight."""
-    total, gone = 0, 0
-    for k in range(clear.size):
-        if clear[k] > 0.0:
-            total += 1
-            gone += weight[k] == 0.0
-    return gone / total

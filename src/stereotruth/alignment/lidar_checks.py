@@ -20,6 +20,7 @@ from scipy.special import ndtri, stdtrit
 from ..epipolar.rpc import SensorModel
 from ..lidar.lattice import PER_M
 from ..lidar.point_store import PointStore, query_points
+from ..numerics.degrees import metres_per_degree
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
 from .aligned_pair import Alignment, GcpResidual
@@ -34,7 +35,6 @@ CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tel
 AROUND = 12  # points around a control point that are looked at, or all
 WIDEST_M = 5.0  # within this, or none
 FEWEST_GCPS = 3
-METRES_PER_DEGREE = 111_320.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _heights_around(
 
     None where there are fewer within WIDEST_M.
     """
-    metres = METRES_PER_DEGREE * np.array([np.cos(np.radians(gcp.lat)), 1.0])
+    metres = metres_per_degree(gcp.lat)
     widest = max(WIDEST_M, reach_m)
     east, north = widest / metres
     points = query_points(stores, gcp.lon - east, gcp.lat - north, gcp.lon + east, gcp.lat + north)
@@ -86,8 +86,7 @@ def pixel_m(alignment: Alignment) -> float:
         np.array(alignment.left.localize(cols / 2 + step, rows / 2, alignment.reference_height))
         for step in (-0.5, 0.5)
     ]
-    lon, lat = ends[1] - ends[0]
-    return METRES_PER_DEGREE * float(np.hypot(lon * np.cos(np.radians(ends[0][1])), lat))
+    return float(np.hypot(*(ends[1] - ends[0]) * metres_per_degree(ends[0][1])))
 
 
 def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:

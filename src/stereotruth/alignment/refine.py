@@ -29,10 +29,12 @@ from scipy.special import chdtrc
 
 from ..epipolar.image_reader import Source, open_pair
 from ..epipolar.settings import Settings as Bands
-from ..error_statistics import median_and_nmad
 from ..errors import InputError
 from ..lidar.point_store import PointStore, open_stores
+from ..numerics.robust import median_and_nmad, robust_sigma
 from .adjustment import (
+    LEAST_SIGMA,
+    Equations,
     Estimate,
     Observations,
     agreement_of_halves,
@@ -41,7 +43,6 @@ from .adjustment import (
     linearised_at,
     prior_of,
     pull_of,
-    robust_scale,
     with_corrections,
 )
 from .aligned_pair import Alignment, ViewFit
@@ -196,15 +197,10 @@ def _search(
             return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
-        found = estimate(
-            design,
-            observed + design @ parameters,
-            ties.sigma,
-            ties.site,
-            prior,
-            ties.left,
-            places.guard.common_px,
+        equations = Equations(
+            design, observed + design @ parameters, ties.sigma, ties.site, ties.left
         )
+        found = estimate(equations, prior, places.guard.common_px)
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
         last, parameters = parameters, found.parameters
@@ -219,16 +215,17 @@ def _search(
         observed + design @ (last - parameters),
         found.weights > 0.0,
     )
-    scatter = max(robust_scale(observations.after[:, k], found.weights > 0.0) for k in (0, 1))
+    scatter = max(
+        robust_sigma(observations.after[found.weights > 0.0, k], LEAST_SIGMA) for k in (0, 1)
+    )
     used = float(np.mean(found.weights > 0.0))
     if scatter > LOOSE or used < MIN_USED:
         return (
             f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
             "blunders): LiDAR and images do not show the same ground, or not at the same height"
         )
-    halves = agreement_of_halves(
-        design, observations.before, ties.sigma, ties.site, prior, ties.left
-    )
+    equations = replace(equations, design=design, observed=observations.before)
+    halves = agreement_of_halves(equations, prior)
     log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
     return observations, found, current, halves
 
@@ -317,31 +314,23 @@ def refine(
             )
         doubts = [f"not refined: {result}", *doubts]
         _warn(doubts, strict, left_image, of)
-        record = {"applied": False, "reason": result}
-        warnings = (*alignment.warnings, *doubts)
-        return (
-            replace(alignment, warnings=warnings, refinement=record, provenance=record_of),
-            None,
+        unrefined = replace(
+            alignment,
+            warnings=(*alignment.warnings, *doubts),
+            refinement={"applied": False, "reason": result},
+            provenance=record_of,
         )
-    observations, found, refined, (before, after) = result
-    reason = ""
-    if _chance(found) > SIGNIFICANT:
-        reason = "the tie points do not contradict the alignment"
-    elif after >= before and gcps:
-        reason = (
-            "the tie points of one half of the scene fit the other half's less well than the "
-            f"control points do ({after:.2f} deviations, {before:.2f} before)"
-        )
+        return unrefined, None
+    observations, found, refined, halves = result
+    reason = _objection(found, halves, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
-    record["misfit_of_one_half_by_the_other"] = {
-        "before": round(before, 3),
-        "after": round(after, 3),
-    }
+    misfits = [round(misfit, 3) for misfit in halves]
+    record["misfit_of_one_half_by_the_other"] = dict(zip(("before", "after"), misfits))
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
@@ -369,6 +358,28 @@ def refine(
         refinement=record,
         provenance=record_of,
     )
+    _tell(record)
+    return refined, observations
+
+
+def _objection(found: Estimate, halves: tuple[float, float], with_gcps: bool) -> str:
+    """Why a refinement is not applied, or an empty string.
+
+    ``halves``: misfit of one half of the sites, before and by the other half.
+    """
+    before, after = halves
+    if _chance(found) > SIGNIFICANT:
+        return "the tie points do not contradict the alignment"
+    if after >= before and with_gcps:
+        return (
+            "the tie points of one half of the scene fit the other half's less well than the "
+            f"control points do ({after:.2f} deviations, {before:.2f} before)"
+        )
+    return ""
+
+
+def _tell(record: Mapping[str, Any]) -> None:
+    """The figures of a refinement in the log."""
     for name in ("y_parallax", "disparity"):
         a, b = record["before"][name], record["after"][name]
         log.info(
@@ -379,9 +390,8 @@ def refine(
         )
     log.info(
         "refinement %s",
-        f"not applied: {reason}"
-        if reason
-        else f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "
-        f"{record['change_of_right']['largest']:.3f} px",
+        f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "
+        f"{record['change_of_right']['largest']:.3f} px"
+        if record["applied"]
+        else f"not applied: {record['reason']}",
     )
-    return refined, observations

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from ..products.files import replacing
+from ..products.files import atomic_file
 from ..products.pictures import DIFFERENCES, save_figure, stretch
 from ..products.rasters import open_raster
 from .adjustment import Observations
@@ -49,9 +49,9 @@ def write_refinement(
     The figure has the tie points over the left image, coloured by their residuals. Without
     observations the table is empty and the figure says why.
     """
-    with replacing(csv_file) as scratch:
+    with atomic_file(csv_file) as scratch:
         _write_table(observations, scratch)
-    with replacing(png_file) as scratch:
+    with atomic_file(png_file) as scratch:
         _draw(alignment, observations, scratch, left_image)
     alignment.save(json_file)
 

@@ -3,8 +3,8 @@
 Blunders are found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006,
 "Computing LTS regression for large data sets"), then by studentised residuals; the result is the
 exact least-squares solution (by ``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the
-usual way, draws random samples and refines its result only in part, so that it depends on the order
-of the points: :func:`opencv_inliers` takes no more than its choice of points.
+paper's way, draws random samples and refines its result only in part, so that it depends on the
+order of the points.
 """
 
 from __future__ import annotations
@@ -167,16 +167,6 @@ def find_blunders(system: System, *, floor: float, seed: int) -> tuple[Bools, Fl
             break
         used = again
     return used, lengths, threshold
-
-
-def opencv_inliers(model: str, predicted: Floats, measured: Floats, floor: float) -> Bools:
-    """The paper's way: inliers of OpenCV's RANSAC (a shift: those about the median)."""
-    if model == "shift":
-        delta = measured - predicted
-        return np.hypot(*(delta - np.median(delta, axis=0)).T) <= max(floor, 3.0)
-    estimate = cv2.estimateAffine2D if model == "affine" else cv2.estimateAffinePartial2D
-    _, inliers = estimate(predicted, measured)
-    return inliers.ravel() > 0 if inliers is not None else np.ones(len(measured), dtype=bool)
 
 
 def leave_one_out_residuals(system: System, used: Bools) -> Floats:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inner, kernel
+from ..numerics.robust import TUKEY, biweight, robust_sigma
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -148,13 +149,12 @@ def _robust_plane(u: Floats, v: Floats, h: Floats, plane: Floats) -> float:
         for k in range(h.size):
             distance[k] = abs(h[k] - plane[0] - plane[1] * u[k] - plane[2] * v[k])
         if step >= ROUNDS:
-            sigma = max(1.4826 * np.median(distance), 0.01)
+            sigma = robust_sigma(distance, 0.01)
         for k in range(h.size):
             if step < ROUNDS:
                 weight[k] = 1.0 / max(distance[k], NEAREST_M)
             else:
-                t = distance[k] / (4.685 * sigma)
-                weight[k] = (1.0 - t * t) ** 2 if t < 1.0 else 0.0
+                weight[k] = biweight(distance[k] / (TUKEY * sigma))
         if not _solve_plane(u, v, h, weight, plane):
             return np.nan
     return sigma

@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_reader import Source
-from ..epipolar.resampling import ANTIALIAS, RADIUS
+from ..epipolar.resampling import ANTIALIAS
 from ..epipolar.rpc import SensorModel
+from ..numerics.cubic_convolution import SIX_POINT_RADIUS
+from ..numerics.robust import median_and_nmad, robust_sigma
 from .least_squares_matching import least_squares_match, warp_patch
 from .tie_planes import HALF
 from .tie_sites import MIN_CLEAR, SITE, Places
@@ -143,7 +145,7 @@ def _even(picture: Picture) -> Picture:
     level = float(picture[known].mean())
     filled = np.where(known, picture - level, np.float32(0))
     detail = filled - cv2.GaussianBlur(filled, (0, 0), 3.0)
-    usual = 1.4826 * float(np.median(np.abs(detail[known]))) + 1e-6
+    usual = float(robust_sigma(detail[known], 0.0)) + 1e-6
     return np.where(known, np.clip(detail / usual, -1.5, 1.5), 0.0).astype(np.float32)
 
 
@@ -162,7 +164,7 @@ def _prepared(
         right = geometry.right[members]
         members = members[np.abs(right - np.median(right, axis=0)).max(axis=1) < 4 * SITE]
         left_window = _window(sources[0], geometry.left[members], HALF + 2.0)
-        reach = 1.5 * (HALF + radius + 3) * scales[members, 0].max() + 2 * RADIUS
+        reach = 1.5 * (HALF + radius + 3) * scales[members, 0].max() + 2 * SIX_POINT_RADIUS
         right_window = _window(sources[1], geometry.right[members], reach)
         if left_window is None or right_window is None:
             continue
@@ -212,7 +214,7 @@ def common_shift(
     # Models may be tilted, so that the places' own shifts lie some px apart.
     total = cv2.GaussianBlur(total, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT)
     y, x = np.unravel_index(int(np.argmax(total)), total.shape)
-    spread = 1.4826 * float(np.median(np.abs(total - np.median(total))))
+    spread = median_and_nmad(total)[1]
     height = float(total.max() - np.median(total)) / max(spread, 1e-12)
     return np.array([x - radius, y - radius], dtype=float), height
 
@@ -224,7 +226,7 @@ def match(
     radius: int,
 ) -> TiePoints:
     """Match every place within ``radius`` px (of the left image); places that fail are left out."""
-    results = np.full((len(places), 6), np.nan)
+    results = np.full((len(places), 5), np.nan)
     for w in _prepared(places, geometry, sources, radius):
         y, x = np.unravel_index(int(np.argmax(w.scores)), w.scores.shape)
         if 0 < x < 2 * radius and 0 < y < 2 * radius:

@@ -29,7 +29,7 @@ FLAT_PX = 0.3  # standard deviation of a place's points about their plane, as di
 MARGIN = 24  # px around a site whose points are looked at
 TRIED = 24  # windows of each part of a site that are looked at pixel by pixel
 MIN_CLEAR = 90  # pixels of a window, a fifth
-MIN_TOLD = 12.0  # smaller eigenvalue of what they tell, in pixels of the usual slope
+MIN_INFORMATION = 12.0  # smaller eigenvalue of a window, in pixels of the median slope
 ENOUGH = 120  # places of a scene
 NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
 
@@ -130,18 +130,18 @@ def choose_sites(
     return grid(max(coarse * np.sqrt(max(len(grid(coarse)), 1) / SITES), SITE))
 
 
-def _saturated(picture: Picture) -> tuple[Floats, Floats, Floats]:
-    """What each pixel [k, k] tells of a shift: products xx, xy, yy of its slopes, saturated.
+def _shift_information(picture: Picture) -> tuple[Floats, Floats, Floats]:
+    """Information of each pixel [k, k] about a shift: products xx, xy, yy of its slopes, saturated.
 
-    A pixel of the usual slope of its surroundings counts a half, none more than one: texture is
-    wanted, and an edge that stands out is not preferred. NaN where a slope is unknown.
+    A pixel of the median slope of the picture counts a half, none more than one: texture is wanted,
+    and an edge that stands out is not preferred. NaN where a slope is unknown.
     """
     gy, gx = np.gradient(picture.astype(np.float64))
     squared = gx * gx + gy * gy
     if not np.isfinite(squared).any():
         return squared, squared, squared
-    usual = float(np.nanmedian(squared))
-    weight = 1.0 / np.maximum(usual + squared, 1e-12)
+    median = float(np.nanmedian(squared))
+    weight = 1.0 / np.maximum(median + squared, 1e-12)
     return weight * gx * gx, weight * gx * gy, weight * gy * gy
 
 
@@ -153,13 +153,17 @@ def _window_sums(values: Floats) -> Floats:
     return cv2.boxFilter(values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
-def _candidates(told: tuple[Floats, Floats, Floats], share: Floats, at: NDArray[np.int64]) -> list:
+def _candidates(
+    information: tuple[Floats, Floats, Floats], share: Floats, at: NDArray[np.int64]
+) -> list:
     """For each of PER_SIDE² parts of a site, indices [≤ TRIED] of the most promising windows.
 
-    By what their pixels tell, and by the share of the points that lie on the plane. ``share``
-    [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
+    By the information of their pixels, and by the share of the points that lie on the plane.
+    ``share`` [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
     """
-    score = np.maximum(_smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in told)), 0.0)
+    score = np.maximum(
+        _smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in information)), 0.0
+    )
     score = score[np.ix_(at, at)] * share**4
     found = []
     edges = np.linspace(0, len(at), PER_SIDE + 1).astype(int)
@@ -233,20 +237,20 @@ def _places_of(
     planes, share = cloud.fit_planes(centres)
     flat = planes[:, 3] * np.hypot(*parallax) <= FLAT_PX
     share = np.where(flat, share, 0.0)
-    told = _saturated(source.read(col0, row0, SITE, SITE))
+    information = _shift_information(source.read(col0, row0, SITE, SITE))
     best, clear = [], []
-    for candidates in _candidates(told, share.reshape(len(at), len(at)), at):
+    for candidates in _candidates(information, share.reshape(len(at), len(at)), at):
         scored = []
         for k in candidates:
             pixels = cloud.clear_pixels(centres[k], planes[k], guard)
             i, j = centres[k] - MARGIN
-            own = [t[j - HALF : j + HALF + 1, i - HALF : i + HALF + 1] for t in told]
+            own = [t[j - HALF : j + HALF + 1, i - HALF : i + HALF + 1] for t in information]
             pixels &= np.isfinite(own[0])
             if pixels.sum() >= MIN_CLEAR:
                 scored.append((_smaller_eigenvalue(*(o[pixels].sum() for o in own)), k, pixels))
         if scored:
             score, k, pixels = max(scored, key=lambda entry: entry[0])
-            if score >= MIN_TOLD:
+            if score >= MIN_INFORMATION:
                 best.append(k)
                 clear.append(pixels)
     if not best:

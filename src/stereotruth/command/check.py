@@ -8,12 +8,21 @@ from pathlib import Path
 from ..configuration import Configuration
 from ..dataset.windows import cell_step
 from ..errors import InputError
-from ..project import check_fixed, configured, is_synthetic, read_scenes, sheet
+from ..project import (
+    check_fixed,
+    configured,
+    is_synthetic,
+    names_in_pair,
+    read_images,
+    read_scenes,
+    sheet,
+)
 from ..sheets import Scene
 from .check_scene import SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
 from .run_workflow import duration
+from .site import check_images
 
 MANY = 10  # scenes whose check takes more than a moment
 SCENE_SECONDS = 2.5  # of one core: images of 100 MB, control points, headers of the LiDAR
@@ -76,14 +85,18 @@ def check_project(
             f"looking at {len(scenes)} scenes, about {duration(SCENE_SECONDS * len(scenes))}; "
             "stereotruth check SCENE … looks at some"
         )
+    images = read_images(settings, cities)
     every, facts = [project], []
     for name, scene in scenes.items():
         found = Findings(name)
         if is_synthetic(scene):
             found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
         else:
-            facts.append(check_scene(scene, settings, found))
+            facts.append(check_scene(scene, settings, found, names_in_pair(scene, images)))
         every.append(found)
+    if settings.images:
+        towns = sorted({scene.city for scene in scenes.values()})
+        every.insert(1, check_images(settings, images, scenes.values(), towns))
     every.append(_run(facts, settings))
     return every
 

@@ -16,7 +16,7 @@ from ..alignment.aligned_pair import Alignment
 from ..alignment.control_points import ControlPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..configuration import Configuration
-from ..disparity.overlap_check import apart, refuse_apart
+from ..disparity.overlap_check import Box, apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import MAX_PIXELS, Source
 from ..epipolar.model import EpipolarModel
@@ -48,14 +48,19 @@ class SceneFacts:
     covered: float = 1.0  # share of the grid
 
 
-def check_scene(scene: Scene, settings: Configuration, found: Findings) -> SceneFacts:
-    """Add what is found of a scene to ``found``; what one part refuses keeps no other from it."""
+def check_scene(
+    scene: Scene, settings: Configuration, found: Findings, names: tuple[str, str] = ("", "")
+) -> SceneFacts:
+    """Add what is found of a scene to ``found``; what one part refuses keeps no other from it.
+
+    ``names`` of its images in the images sheet, where they stand in it.
+    """
     facts = SceneFacts(scene.scene)
     files: dict[str, Path] = {}
     with found.of("files"):
         files = lidar_of(scene, settings)
     images = _check_images(scene, found)
-    alignment, gcps = _check_alignment(scene, settings, images, found)
+    alignment, gcps = _check_alignment(scene, settings, images, names, found)
     model = None
     if alignment is not None:
         with found.of("images"):
@@ -146,13 +151,17 @@ def _is_sampled(dataset: rasterio.DatasetReader) -> bool:
 
 
 def _check_alignment(
-    scene: Scene, settings: Configuration, images: bool, found: Findings
+    scene: Scene,
+    settings: Configuration,
+    images: bool,
+    names: tuple[str, str],
+    found: Findings,
 ) -> tuple[Alignment | None, ControlPoints | None]:
     """The alignment as rule align makes it, and the control points, if they can be read."""
     alignment = gcps = None
     if scene.gcps and Path(scene.gcps).is_file():
         with found.of("GCPs"):
-            gcps = read_gcps(scene.gcps, scene.scene)
+            gcps = read_gcps(scene.gcps, scene.scene, names)
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"):
@@ -160,7 +169,13 @@ def _check_alignment(
             alignment = Alignment.load(settings.alignment.fixed[name])
         elif images and gcps is not None:
             alignment = align(
-                *pair, scene.gcps, model=model, scene=name, strict=settings.strict, provenance={}
+                *pair,
+                scene.gcps,
+                names=names,
+                model=model,
+                scene=name,
+                strict=settings.strict,
+                provenance={},
             )
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]
             sigma = max(fit.rms("after") for fit in alignment.fits)
@@ -234,6 +249,20 @@ def _hold_against_gcps(
         )
 
 
+def boxes_of(placed: Sequence[SurveyedFile], nodes: Nodes) -> tuple[Box, Box, tuple[float, float]]:
+    """Boxes (degrees) of LiDAR files, and of what the images see at their heights (m), and these.
+
+    All files have a box and heights.
+    """
+    boxes = np.array([file.box for file in placed])
+    heights = (min(f.heights[0] for f in placed), max(f.heights[1] for f in placed))
+    ends = [nodes.ground(height) for height in heights]
+    lon, lat = (np.concatenate([end[k].ravel() for end in ends]) for k in (0, 1))
+    images = tuple(map(float, (np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat))))
+    whole = tuple(map(float, (*boxes[:, :2].min(0), *boxes[:, 2:].max(0))))
+    return whole, images, heights
+
+
 def _hold_against_images(
     surveyed: Sequence[SurveyedFile],
     alignment: Alignment,
@@ -245,13 +274,8 @@ def _hold_against_images(
     placed = [file for file in surveyed if file.box and file.heights]
     if not placed:
         return 1.0
-    boxes = np.array([file.box for file in placed])
-    heights = (min(f.heights[0] for f in placed), max(f.heights[1] for f in placed))
     nodes = Nodes.of(model)
-    ends = [nodes.ground(height) for height in heights]
-    lon, lat = (np.concatenate([end[k].ravel() for end in ends]) for k in (0, 1))
-    images = tuple(map(float, (np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat))))
-    whole = tuple(map(float, (*boxes[:, :2].min(0), *boxes[:, 2:].max(0))))
+    whole, images, heights = boxes_of(placed, nodes)
     if apart(whole, images):
         refuse_apart(whole, images, heights, placed[0].path.parent)
     outside = [file.path.name for file in placed if apart(file.box, images)]

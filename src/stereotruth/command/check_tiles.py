@@ -10,18 +10,14 @@ from numpy.typing import NDArray
 
 from ..configuration import Configuration
 from ..epipolar.model import EpipolarModel
-from ..lidar.lattice import DEGREE_M
+from ..errors import in_number
 from ..lidar.survey import SurveyedFile
+from ..numerics.degrees import DEGREE_M
+from ..numerics.summed_area import window_sums
+from .estimates import estimates
 from .findings import Findings, Level
 
 NODES = 128  # along the longer side of the grid
-# Measured with bench/density.py: share of visible pixels with a label by points a pixel; with the
-# recipe paper those that have points, of which its filter drops a few.
-POINTS_PER_PX = (0.0, 0.105, 0.21, 0.42, 0.85, 1.7, 2.6)
-LABELLED = {
-    "paper": (0.0, 0.084, 0.172, 0.332, 0.586, 0.873, 0.965),
-    "surface": (0.0, 0.812, 0.869, 0.910, 0.936, 0.956, 0.965),
-}
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
 Bools = NDArray[np.bool_]
@@ -66,10 +62,7 @@ class Nodes:
     def windows(self, values: NDArray, size: int) -> NDArray[np.float64]:
         """Means of values over all squares of ``size`` px, [rows, cols] of their first nodes."""
         n = max(round(size / self.step), 1)
-        if min(values.shape) < n:
-            return np.empty((0, 0))
-        sums = np.pad(values.astype(float).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-        return (sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]) / n**2
+        return window_sums(values, n) / n**2
 
     def fits(self, size: float) -> bool:
         """Whether a square of that size lies in what both images show."""
@@ -100,7 +93,8 @@ def check_frame(nodes: Nodes, settings: Configuration, found: Findings) -> None:
 
 def expected_share(points_per_px: float, recipe: str) -> float:
     """Share of the pixels which both views see that will have a label."""
-    return float(np.interp(points_per_px, POINTS_PER_PX, LABELLED[recipe]))
+    of = estimates()["labelled"]
+    return float(np.interp(points_per_px, [0.0, *of["points_per_px"]], [0.0, *of[recipe]]))
 
 
 def pixel_m2(model: EpipolarModel) -> float:
@@ -137,10 +131,26 @@ def check_labels(
         Level.FACT,
         f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {share:.0%} of what both "
         f"images show: some {expected:.0%} of the visible pixels there will have a label "
-        f"(project.recipe: {recipe})",
+        f"(project.recipe: {recipe}), in {_tiles_in_words(nodes, covered, expected, settings)}",
     )
     _hold_against_tiles(nodes, covered, per_px, settings, found)
     return share
+
+
+def _tiles_in_words(nodes: Nodes, covered: Bools, expected: float, settings: Configuration) -> str:
+    """About how many tiles there will be, by the best position of their grid."""
+    size, needed = settings.tiles.size, settings.tiles.min_labelled
+    whole = nodes.windows(nodes.seen, size)
+    if not whole.size:
+        return "no tile"
+    enough = (whole > 1 - 1e-9) & (expected * nodes.windows(covered, size) >= needed)
+    every = max(round((settings.tiles.stride or size) / nodes.step), 1)
+    counts = [
+        int(enough[row::every, col::every].sum())
+        for row in range(min(every, enough.shape[0]))
+        for col in range(min(every, enough.shape[1]))
+    ]
+    return f"about {in_number(max(counts), 'tile')} of {size} px"
 
 
 def _hold_against_tiles(
@@ -156,15 +166,10 @@ def _hold_against_tiles(
     expected = best * expected_share(per_px, recipe)
     if expected >= needed:
         return
-    better = [
-        name
-        for name in LABELLED
-        if LABELLED[name] > LABELLED[recipe] and best * expected_share(per_px, name) >= needed
-    ]
     remedy = f"set tiles.min_labelled below {expected:.2g}, or give more LiDAR"
-    if better:
-        share = best * expected_share(per_px, better[0])
-        remedy = f"set project.recipe to {better[0]} ({share:.0%}), or {remedy}"
+    by_surface = best * expected_share(per_px, "surface")
+    if recipe != "surface" and by_surface >= needed:
+        remedy = f"set project.recipe to surface ({by_surface:.0%}), or {remedy}"
     dense = best * expected_share(BOX_SLACK * per_px, recipe)
     found.say(
         "labels",

@@ -17,10 +17,11 @@ from ..products.folders import files_below
 from ..products.ungeoreferenced import open_raster
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
-# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track.
+# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
+# plain words.
 VIEWS = (
-    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD)(?![A-Za-z])", re.IGNORECASE)),
-    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD)(?![A-Za-z])", re.IGNORECASE)),
+    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD|LEFT)(?![A-Za-z])", re.IGNORECASE)),
+    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD|RIGHT)(?![A-Za-z])", re.IGNORECASE)),
 )
 # What lies beside the images that are wanted: bands of colour, browse images.
 OTHERS = re.compile(

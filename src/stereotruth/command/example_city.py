@@ -1,14 +1,18 @@
-"""A small synthetic city whose files look like a user's own."""
+"""Small synthetic cities whose files look like a user's own: a pair, and a site of images."""
 
 from __future__ import annotations
 
 import csv
+from dataclasses import fields, replace
 from pathlib import Path
 
+from ..sheets import Image
 from ..simulate.cities import Character, CitySpec, SceneSpec, lidar_files
 from ..simulate.control_points import simulate_points
 from ..simulate.lidar import simulate_lidar_tile
 from ..simulate.render import simulate_image
+from ..simulate.site_images import simulate_site_image, simulate_site_points
+from ..simulate.sites import SiteSpec, images_drawn
 
 DEMO = CitySpec(
     name="Demo",
@@ -38,8 +42,16 @@ SEED = 1
 TILE_PX = 256
 
 
-def make_example(folder: Path) -> None:
-    """Images, LiDAR and control points of the city below ``folder``, and its rows and settings."""
+SITE_CITY = replace(
+    DEMO,
+    name="Stack",
+    scenes=(SceneSpec("Stack", (0.0, 0.0), 600, 600, 5, lidar_grid=(2, 1), ragged_m=(0.0, 0.0)),),
+)
+SITE = SiteSpec(SITE_CITY, images_drawn("Stack", SITE_CITY, 6, 560, seed=9))
+
+
+def make_example(folder: Path) -> str:
+    """The pair: images, LiDAR and control points below ``folder``, its rows and settings."""
     (scene,) = DEMO.scenes
     data, points = folder / "data" / scene.name, folder / "gcps" / f"{scene.name}.csv"
     simulate_points(
@@ -47,10 +59,7 @@ def make_example(folder: Path) -> None:
     )
     for view in ("left", "right"):
         simulate_image(DEMO, scene, view, data / f"{view}.tif", seed=SEED)
-    for file in lidar_files(DEMO, scene):
-        simulate_lidar_tile(
-            DEMO, scene, file, data / "lidar" / file, spacing_m=SPACING_M, seed=SEED
-        )
+    _make_lidar(DEMO, data / "lidar")
     inside = data.relative_to(folder)
     row = {
         "scene": scene.name,
@@ -60,11 +69,61 @@ def make_example(folder: Path) -> None:
         "lidar": f"{inside}/lidar",
         "gcps": f"gcps/{scene.name}.csv",
     }
-    city = {"city": DEMO.name, "prefix": "DM", "training": 6, "validation": 1, "testing": 3}
-    for name, values in (("scenes", row), ("cities", city)):
-        sheet = folder / f"{name}.tsv"
-        header = sheet.read_text(encoding="utf-8").split()
-        with sheet.open("a", newline="", encoding="utf-8") as stream:
-            csv.DictWriter(stream, header, delimiter="\t", lineterminator="\n").writerow(values)
+    _append(folder / "scenes.tsv", row)
+    _append(folder / "cities.tsv", _city_row(DEMO.name, "DM"))
+    _add_settings(folder, [])
+    return "stereotruth check"
+
+
+def make_site(folder: Path) -> str:
+    """The site: images with their sheet, LiDAR and control points; no pair is chosen yet."""
+    data, points = folder / "data", folder / "gcps" / f"{SITE.city.name}.csv"
+    simulate_site_points(SITE, points, data / "gcps_exact.csv", seed=SEED)
+    _make_lidar(SITE.city, data / "lidar")
+    sheet = folder / "images.tsv"
+    sheet.write_text("\t".join(field.name for field in fields(Image)) + "\n", encoding="utf-8")
+    for image in SITE.images:
+        file = data / f"{image.name}.tif"
+        simulate_site_image(SITE, image, file, seed=SEED)
+        acquired = image.acquired.strftime("%Y-%m-%dT%H:%M:%SZ")
+        row = {
+            "image": image.name,
+            "city": SITE.city.name,
+            "file": file.relative_to(folder),
+            "acquired": acquired,
+        }
+        _append(sheet, row)
+    _append(folder / "cities.tsv", _city_row(SITE.city.name, "ST"))
+    _add_settings(folder, ["images: images.tsv"])
+    return (
+        f"stereotruth pairs {SITE.city.name} --most 4 --lidar data/lidar "
+        f"--gcps gcps/{SITE.city.name}.csv"
+    )
+
+
+EXAMPLES = {"demo": make_example, "site": make_site}
+
+
+def _make_lidar(city: CitySpec, folder: Path) -> None:
+    """The LiDAR of the city's one scene."""
+    (scene,) = city.scenes
+    for file in lidar_files(city, scene):
+        simulate_lidar_tile(city, scene, file, folder / file, spacing_m=SPACING_M, seed=SEED)
+
+
+def _city_row(name: str, prefix: str) -> dict[str, object]:
+    return {"city": name, "prefix": prefix, "training": 6, "validation": 1, "testing": 3}
+
+
+def _append(sheet: Path, values: dict[str, object]) -> None:
+    """One more line of a sheet, in the order of its header."""
+    header = sheet.read_text(encoding="utf-8").splitlines()[0].split("\t")
+    with sheet.open("a", newline="", encoding="utf-8") as stream:
+        csv.DictWriter(stream, header, delimiter="\t", lineterminator="\n").writerow(values)
+
+
+def _add_settings(folder: Path, lines: list[str]) -> None:
+    """The settings of an example at the end of its configuration."""
+    lines = [*lines, "tiles: # the example's images are small", f"  size: {TILE_PX}"]
     with (folder / "config.yaml").open("a", encoding="utf-8") as stream:
-        stream.write(f"\ntiles: # the example's images are small\n  size: {TILE_PX}\n")
+        stream.write("\n" + "\n".join(lines) + "\n")

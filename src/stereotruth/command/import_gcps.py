@@ -21,6 +21,8 @@ from ..alignment.control_points import COLUMNS, read_gcps
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 from ..lidar.geoid import GeoidGrid
+from ..numerics.bilinear import bilinear
+from ..numerics.degrees import metres_per_degree
 from ..products.files import as_text
 from ..products.ungeoreferenced import open_raster
 
@@ -206,8 +208,8 @@ def _same_place(joined: dict, lon: float, lat: float) -> object:
     """The key of a point that lies there already, or a new one."""
     for key, entry in joined.items():
         _, there_lon, there_lat, _ = entry["ground"]
-        east = (lon - there_lon) * math.cos(math.radians(lat))
-        if math.hypot(east, lat - there_lat) * 111_320 <= SAME_PLACE_M:
+        east, north = metres_per_degree(lat) * (lon - there_lon, lat - there_lat)
+        if math.hypot(east, north) <= SAME_PLACE_M:
             return key
     return len(joined)
 
@@ -415,16 +417,6 @@ def _heights_of_raster(points: Sequence[Point], source: Path) -> list[Point]:
             col, row = to_pixel * (east, north)
             height = point.height
             if math.isnan(height):
-                height = _bilinear(band, col - 0.5, row - 0.5)
+                height = float(bilinear(band, col - 0.5, row - 0.5))
             found.append(replace(point, height=height))
     return found
-
-
-def _bilinear(band: np.ndarray, col: float, row: float) -> float:
-    """Value between the centres of four pixels; NaN outside, or where one of them has none."""
-    left, top = math.floor(col), math.floor(row)
-    if not (0 <= left < band.shape[1] - 1 and 0 <= top < band.shape[0] - 1):
-        return math.nan
-    right, down = col - left, row - top
-    across = band[top : top + 2, left] * (1 - right) + band[top : top + 2, left + 1] * right
-    return float(across[0] * (1 - down) + across[1] * down)

@@ -60,18 +60,31 @@ def _callback(
     del version
 
 
-@app.command(epilog=examples("stereotruth init my-project", "stereotruth init --example demo"))
+@app.command(
+    epilog=examples(
+        "stereotruth init my-project",
+        "stereotruth init --example demo",
+        "stereotruth init --example site",
+    )
+)
 def init(
-    folder: Annotated[Path, typer.Argument(help="Folder to be made, or an empty one.")],
+    folder: Annotated[
+        Path | None,
+        typer.Argument(help="Folder to be made, or an empty one; else the example's name."),
+    ] = None,
     example: Annotated[
-        bool, typer.Option("--example", help="With a small synthetic city to try, made here.")
-    ] = False,
+        str,
+        typer.Option(
+            help="With a small synthetic city to try, made here: demo (a pair) or site (a stack of "
+            "images)."
+        ),
+    ] = "",
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     from .new_project import begin, with_example
 
-    (with_example if example else begin)(folder)
-    next_step = "stereotruth check" if example else "stereotruth scene add DELIVERY --lidar FOLDER"
+    folder = folder or Path(example)
+    next_step = with_example(folder, example) if example else begin(folder)
     typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
 
 
@@ -109,6 +122,26 @@ def scene_add(
         configfiles=configfile,
     ):
         typer.echo(line)
+
+
+@scene_app.command("list", epilog=examples("stereotruth scene list"))
+def scene_list(configfile: Configured = None) -> None:
+    """The scenes of the project: city, images and LiDAR of each."""
+    from .add_scene import list_scenes
+
+    for line in list_scenes(configfile):
+        typer.echo(line)
+
+
+@scene_app.command("remove", epilog=examples("stereotruth scene remove Marseille-1"))
+def scene_remove(
+    scene: Annotated[str, typer.Argument(help="Name of the scene.")],
+    configfile: Configured = None,
+) -> None:
+    """Take a scene's row out of the scenes sheet; what was made of it stays."""
+    from .add_scene import remove_scene
+
+    typer.echo(remove_scene(scene, configfile))
 
 
 @gcps_app.command(
@@ -164,6 +197,52 @@ def check(
         raise typer.Exit(1)
 
 
+@app.command(
+    epilog=examples(
+        "stereotruth pairs Marseille",
+        "stereotruth pairs Marseille --most 20 --convergence 5 40 --lidar lidar",
+        "stereotruth pairs Marseille --diachronic --each 3",
+    )
+)
+def pairs(
+    city: Annotated[str, typer.Argument(help="City of the images sheet.")],
+    most: Annotated[int | None, typer.Option(min=1, help="Write so many pairs.")] = None,
+    convergence: Annotated[
+        tuple[float, float], typer.Option(help="Write pairs of so many degrees.")
+    ] = (5.0, 45.0),
+    days: Annotated[
+        tuple[float, float] | None, typer.Option(help="Write pairs so many days apart.")
+    ] = None,
+    diachronic: Annotated[
+        bool, typer.Option("--diachronic", help="Write pairs of more than 30 days.")
+    ] = False,
+    each: Annotated[
+        int | None, typer.Option(min=1, help="Each image in so many pairs at most.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Write all pairs.")] = False,
+    lidar: Annotated[str, typer.Option(help="Of the rows; else as in the city's first.")] = "",
+    gcps: Annotated[str, typer.Option(help="Likewise.")] = "",
+    lidar_crs: Annotated[str, typer.Option(help="Likewise.")] = "",
+    geoid: Annotated[str, typer.Option(help="Likewise.")] = "",
+    configfile: Configured = None,
+) -> None:
+    """List the pairs of a site, best first; with a choice, write it to the scenes sheet."""
+    from .pairs import CONVERGENCE_DEG, Choice, list_pairs
+    from .pairs_table import show_pairs
+
+    limits = (most, days, each, convergence if convergence != CONVERGENCE_DEG else None)
+    choice = None
+    if every:
+        choice = Choice(most, None, days, diachronic, each)
+    elif diachronic or any(limit is not None for limit in limits):
+        choice = Choice(most, convergence, days, diachronic, each)
+    given = {"lidar": lidar, "gcps": gcps, "lidar_crs": lidar_crs, "geoid": geoid}
+    rated, lines = list_pairs(city, choice, given, configfile)
+    show_pairs(rated)
+    for line in lines:
+        typer.echo(line)
+
+
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
@@ -171,8 +250,9 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
     context_settings=PASSED_ON,
     options_metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
     help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
-    "tiles of all cities. Any option goes to Snakemake as it is; where none says how many cores, "
-    "it takes all.",
+    "tiles of all cities. [cyan]stereotruth targets[/cyan] lists what can be made. Any option goes "
+    "to Snakemake as it is; where none says how many cores, it takes all. "
+    "[cyan]--example[/cyan] runs the built-in synthetic cities.",
     epilog=examples(
         "stereotruth run tiles/Marseille",
         "stereotruth run tiles/Marseille report --cores 8 --dry-run",
@@ -190,6 +270,15 @@ def run(
         typer.echo(context.get_help())
         raise typer.Exit
     raise typer.Exit(run_workflow(context.args))
+
+
+@app.command(epilog=examples("stereotruth targets", "stereotruth run report"))
+def targets(configfile: Configured = None) -> None:
+    """List what a run can make, one line each, and the names to put in."""
+    from .targets import list_targets
+
+    for line in list_targets(configfile):
+        typer.echo(line)
 
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))

@@ -12,6 +12,7 @@ from ..sheets import City, Scene
 
 # Keys that people change, of each section of the configuration; () where the section is one key.
 KEYS: dict[str, tuple[str, ...]] = {
+    "images": (),
     "strict": (),
     "seed": (),
     "ingest": ("drop_classes",),
@@ -42,9 +43,17 @@ def configuration_text() -> str:
     return "\n".join(lines) + "\n"
 
 
-def begin(folder: str | Path) -> None:
-    """Write the files of a new project. Raises InputError if the folder has anything in it."""
+def begin(folder: str | Path) -> str:
+    """Write the files of a new project; returns the next step.
+
+    Raises InputError if the folder has anything in it.
+    """
     folder = Path(folder)
+    if folder.name == "":
+        raise InputError(
+            "no folder is named",
+            remedy="stereotruth init FOLDER, or stereotruth init --example demo",
+        )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             "is there already, and not empty", file=folder, remedy="name a folder that is not there"
@@ -54,11 +63,19 @@ def begin(folder: str | Path) -> None:
     for name, columns in (("scenes", Scene), ("cities", City)):
         header = "\t".join(f.name for f in fields(columns) if f.default is MISSING)
         (folder / f"{name}.tsv").write_text(f"{header}\n", encoding="utf-8")
+    return "stereotruth scene add DELIVERY --lidar FOLDER"
 
 
-def with_example(folder: str | Path) -> None:
-    """A new project with a small synthetic city: images, LiDAR and control points, made here."""
-    from .example_city import make_example
+def with_example(folder: str | Path, name: str) -> str:
+    """A new project with a small synthetic city, ``demo`` or ``site``; returns the next step.
 
+    Images, LiDAR and control points are made here. Raises InputError for another name.
+    """
+    from .example_city import EXAMPLES
+
+    if name not in EXAMPLES:
+        raise InputError(
+            f"no example {name!r}", remedy=f"take one of {', '.join(EXAMPLES)} after --example"
+        )
     begin(folder)
-    make_example(Path(folder))
+    return EXAMPLES[name](Path(folder))

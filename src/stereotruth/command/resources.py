@@ -9,26 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..configuration import Configuration
+from .estimates import estimates
 from .findings import Findings, Level
 from .run_workflow import duration
 
 if TYPE_CHECKING:
     from .check_scene import SceneFacts
 
-# Seconds of one core (bench/README.md: throughput.py, scale.py, density.py).
-INGEST_POINT = 0.49e-6
-PROJECT_POINT = 0.47e-6
-RECTIFY_PX = 0.3e-6  # both images
-PROJECT_PX = 6e-6  # of covered ones
-EXPORT_PX = 0.9e-6
-TILE = 4.0  # a labelled tile of 1024 px: SIFT matches, warping
-SCENE = 60.0  # refinement
-JOB = 8.0  # start of a job, and what Snakemake does around it
-# Bytes on the disk.
-POINT_BYTES = 12.0
-PX_BYTES = 4.0 + 12.0 + 8.0  # rectified pair, disparity grid, tiles
-SPARE = 1.2
-MEMORY = 4.0e9  # of the largest job
+SPARE = 1.2  # of the disk: logs, records, blocks in the making
+MEMORY = 4.0e9  # that rules of the way to tiles ask for
 
 
 def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found: Findings) -> None:
@@ -38,16 +27,15 @@ def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     points, pixels = (sum(getattr(f, name) for f in facts) for name in ("points", "pixels"))
     covered = sum(fact.pixels * fact.covered for fact in facts)
+    rates, sizes = estimates()["seconds"], estimates()["bytes"]
     seconds = (
-        (INGEST_POINT + PROJECT_POINT) * points
-        + RECTIFY_PX * pixels
-        + PROJECT_PX * covered
-        + EXPORT_PX * pixels
-        + TILE * covered / 2**20
-        + SCENE * len(facts)
-        + JOB * sum(5 + fact.lidar_files for fact in facts)
+        (rates["ingest_point"] + rates["project_point"]) * points
+        + (rates["rectify_px"] + rates["scan_px"]) * pixels
+        + (rates["project_px"] + rates["tile_px"]) * covered
+        + rates["scene"] * len(facts)
+        + rates["job"] * sum(5 + fact.lidar_files for fact in facts)
     )
-    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
+    needed = SPARE * (sizes["point"] * points + sizes["px"] * pixels)
     free = shutil.disk_usage(Path.cwd()).free
     found.say(
         "time",

@@ -10,10 +10,14 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
-from ..project import CONFIG, FILES, read_mapping
+from ..errors import InputError
+from ..project import CONFIG, FILES, read_mapping, require_project
+from .targets import refuse_unknown
 
+EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
 CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
 # Seconds of the jobs of a scene of 1200 x 1200 px with 4 million points, one core: they say what
@@ -41,13 +45,43 @@ STEPS = re.compile(r"^(\d+) of (\d+) steps")
 
 def arguments_for(given: Sequence[str]) -> list[str]:
     """Arguments of Snakemake for what stands after ``stereotruth run``."""
-    given = [word for word in given if word != "--"]
+    given = [word for word in _with_profiles(given) if word != "--"]
+    configured = any(word.split("=")[0] in CONFIG_OPTIONS for word in given)
+    if EXAMPLE in given:
+        given.remove(EXAMPLE)
+    elif not configured:
+        require_project()
+        given += ["--configfile", CONFIG] if Path(CONFIG).is_file() else []
     arguments = ["--snakefile", str(FILES / "Snakefile"), *given]
-    if not any(word.split("=")[0] in CONFIG_OPTIONS for word in given) and Path(CONFIG).is_file():
-        arguments += ["--configfile", CONFIG]
     if not any(map(CORES.match, given)):
         arguments += ["--cores", "all"]
     return arguments
+
+
+def _with_profiles(given: Sequence[str]) -> list[str]:
+    """Arguments with the path of a profile that comes with the package in place of its name.
+
+    Raises InputError if the executor of that profile is not installed.
+    """
+    words = list(given)
+    for k, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if option not in ("--profile", "--workflow-profile"):
+            continue
+        at = k if equals else k + 1
+        name = value if equals else words[at] if at < len(words) else ""
+        shipped = FILES / "profiles" / name
+        if not name or "/" in name or Path(name).exists() or not shipped.is_dir():
+            continue
+        executor = read_mapping(next(shipped.glob("config*.yaml"))).get("executor", "local")
+        plugin = f"snakemake_executor_plugin_{executor.replace('-', '_')}"
+        if executor != "local" and find_spec(plugin) is None:
+            raise InputError(
+                f"profile {name!r} needs the package {plugin.replace('_', '-')}",
+                remedy=f"pip install {plugin.replace('_', '-')}",
+            )
+        words[at] = f"{option}={shipped}" if equals else str(shipped)
+    return words
 
 
 def config_files(arguments: Sequence[str]) -> list[Path]:
@@ -138,8 +172,11 @@ def run_workflow(given: Sequence[str]) -> int:
     becomes Snakemake's.
     """
     arguments = arguments_for(given)
-    for file in config_files(arguments):  # Snakemake names no file that it cannot read
+    files = config_files(arguments)
+    for file in files:  # Snakemake names no file that it cannot read
         read_mapping(file)
+    if EXAMPLE not in given:
+        refuse_unknown(given, files)
     command = [sys.executable, "-m", "snakemake", *arguments]
     if not sys.stderr.isatty() or {"--dry-run", "-n", "--dryrun"} & set(given):
         os.execv(sys.executable, command)
@@ -153,10 +190,14 @@ def run_workflow(given: Sequence[str]) -> int:
         errors="replace",
     )
     signal.signal(signal.SIGTERM, lambda number, _: process.send_signal(number))
-    progress = Progress()
+    progress, is_stopped = Progress(), False
     while True:
         try:
             watch(process.stdout, progress)
-            return process.wait()
+            status = process.wait()
+            break
         except KeyboardInterrupt:  # reached Snakemake too, which ends its jobs
-            continue
+            is_stopped = True
+    if is_stopped:
+        sys.stderr.write("Stopped. The same command carries on.\n")
+    return status

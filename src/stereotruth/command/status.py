@@ -134,9 +134,11 @@ def _made(city: str) -> str:
     if not (folder / "manifest.csv").is_file():
         return ""
     rows = read_manifest(folder)
-    splits = Counter(row.get("split", "") for row in rows)
-    named = ", ".join(f"{count} {split or 'none'}" for split, count in splits.items())
-    return f"{len(rows)} tiles ({named})"
+    splits = Counter(row.get("split", "") for row in rows if row.get("complete") == "yes")
+    incomplete = len(rows) - splits.total()
+    counts = [f"{count} {split or 'without a split'}" for split, count in splits.items()]
+    counts += [f"{incomplete} without complete labels"] * (incomplete > 0)
+    return f"{len(rows)} tiles ({', '.join(counts)})"
 
 
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:

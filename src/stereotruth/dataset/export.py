@@ -21,10 +21,10 @@ tile) is that which gives most labelled pairs, then most pairs, then most labell
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import asdict
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +33,12 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import progress
-from ..products.files import growing_table, replacing, whole_folder, write_table
+from ..products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..products.provenance import describe, file_sha256, own_digest, source_digest
 from .footprints import FOOTPRINTS, feature, write_footprints
 from .ground_looks import write_ground_looks
 from .label_doubts import doubts, surface_figures
+from .layer_kinds import column
 from .orientation import save
 from .quality_limits import flag, missed
 from .quick_looks import draw_contact_sheet, draw_coverage
@@ -49,7 +50,7 @@ from .splits import Place, scaled_counts, split_tiles
 from .summary import in_counts, summarise
 from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
-from .windows import cell_step, choose_windows, scan_scene
+from .windows import Window, cell_step, choose_windows, scan_scene
 
 log = logging.getLogger("stereotruth")
 
@@ -95,164 +96,258 @@ def _refuse_empty(
     )
 
 
+@dataclass(frozen=True)
+class City:
+    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
+
+    city: str
+    prefix: str
+    training: int
+    validation: int
+    testing: int
+
+    @property
+    def split_counts(self) -> dict[str, int]:
+        """Tiles by split, which are scaled to the tiles there are."""
+        return {"train": self.training, "val": self.validation, "test": self.testing}
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What is made together with the tiles: files and a folder to write, None for what is not.
+
+    ``coverage`` and ``contact_sheet``: PNG; ``matches``: CSV of all SIFT matches;
+    ``ground_looks``: folder of georeferenced quick looks.
+    """
+
+    coverage: str | Path | None = None
+    contact_sheet: str | Path | None = None
+    matches: str | Path | None = None
+    ground_looks: str | Path | None = None
+
+    @contextmanager
+    def being_written(self) -> Iterator[_ExtrasBeingWritten]:
+        """Places that become the files when the block ends well, all at the end.
+
+        A job that outlives its run cannot be found halfway.
+        """
+        with ExitStack() as stack:
+            table = None
+            if self.matches is not None:
+                table = stack.enter_context(growing_table(self.matches, MATCH_COLUMNS))
+            coverage, contact_sheet = (
+                None if path is None else stack.enter_context(atomic_file(path))
+                for path in (self.coverage, self.contact_sheet)
+            )
+            looks = None
+            if self.ground_looks is not None:
+                looks = stack.enter_context(atomic_folder(self.ground_looks))
+            yield _ExtrasBeingWritten(coverage, contact_sheet, table, looks)
+
+
+@dataclass(frozen=True)
+class _ExtrasBeingWritten:
+    """Where the extras are written until they are whole."""
+
+    coverage: Path | None
+    contact_sheet: Path | None
+    table: Any
+    looks: Path | None
+
+    def add_matches(self, row: Mapping[str, Any], checks: TileChecks) -> None:
+        """Add a tile's matches to the table."""
+        if self.table is not None:
+            head = {key: row[key] for key in ("city", "scene", "tile", "class")}
+            self.table.writerows(match_rows(head, checks.matches))
+
+    def draw(
+        self, city: str, rows: Sequence[dict[str, Any]], windows: _Windows, tiles: Path, nodata: Any
+    ) -> None:
+        """Draw both figures, one after the other: Matplotlib is not made for threads."""
+        if self.coverage is not None:
+            draw_coverage(self.coverage, city, rows, windows.pictures)
+        if self.contact_sheet is not None:
+            draw_contact_sheet(self.contact_sheet, city, rows, tiles, nodata)
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """The windows of all scenes of a city, in the order of their tiles' numbers.
+
+    ``phases``, ``outcomes``, ``pictures`` (small image, mask, scale): by scene.
+    """
+
+    sources: list[SceneStores]
+    chosen: list[tuple[SceneStores, Window]]
+    phases: dict[str, tuple[int, int]]
+    outcomes: dict[str, dict[str, int]]
+    pictures: dict[str, tuple[NDArray[np.uint16], NDArray[np.bool_], int]]
+
+    @classmethod
+    def of(cls, scenes: Iterable[SceneFiles | tuple], settings: Settings, workers: int) -> _Windows:
+        """Open the scenes and choose their windows; labelled ones come first."""
+        stride = settings.stride or settings.size
+        step = cell_step(settings.size, stride)
+        found = cls([], [], {}, {}, {})
+        for item in scenes:
+            source = open_stores(SceneFiles(*item), settings.max_uncertainty_px)
+            cells = scan_scene(source, step, workers)
+            windows, phase, outcome = choose_windows(
+                cells, settings.size, stride, settings.min_labelled, settings.right_offset
+            )
+            found.sources.append(source)
+            found.chosen.extend((source, window) for window in windows)
+            found.phases[source.scene], found.outcomes[source.scene] = phase, outcome
+            found.pictures[source.scene] = (cells.picture, cells.mask, cells.scale)
+        found.chosen.sort(key=lambda pair: not pair[1].labelled)  # stable
+        return found
+
+    def kinds(self, layers: Sequence[str]) -> set[str]:
+        """Folders of the files that tiles with these ``layers`` have."""
+        kinds = {"left", "right", "disp", "status", "orientation", *layers}
+        if any(source.of_right is not None for source in self.sources):
+            kinds |= set(RIGHT_FILES)
+        if not all(window.labelled for _, window in self.chosen):
+            kinds |= {"unlabelled/left", "unlabelled/right"}
+        return kinds
+
+
 def export_city(
-    city: str,
-    prefix: str,
+    city: City,
     scenes: Iterable[SceneFiles | tuple],
     out_dir: str | Path,
-    *,
     settings: Settings,
-    training: int,
-    validation: int,
-    testing: int,
+    *,
+    extras: Extras | None = None,
     code: str = "",
     workers: int = 1,
-    coverage: str | Path | None = None,
-    contact_sheet: str | Path | None = None,
-    matches: str | Path | None = None,
-    ground_looks: str | Path | None = None,
     work: str | Path | None = None,
 ) -> dict[str, Any]:
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
-    alignment.json (for the record) and the store of the right view's labels. ``training``,
-    ``validation``, ``testing`` are the counts of table 3, which are scaled to the tiles there are.
-    ``coverage`` and ``contact_sheet`` are PNG files to write, ``matches`` a CSV file of all SIFT
-    matches, ``ground_looks`` a folder of georeferenced quick looks. ``work``: folder in which
-    finished tiles wait for a later call that would make the same, by default a hidden one beside
-    ``out_dir``. Returns a summary, see :func:`.summary.summary_lines`.
+    alignment.json (for the record) and the store of the right view's labels. ``extras``: what is
+    made besides. ``work``: folder in which finished tiles wait for a later call that would make the
+    same, by default a hidden one beside ``out_dir``. Returns a summary, see
+    :func:`.summary.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
     """
-    out, size, stride = Path(out_dir), settings.size, settings.stride or settings.size
-    disparity_dtype, nodata = settings.disparity_dtype, settings.nodata
-    if float(np.dtype(disparity_dtype).type(nodata)) != float(nodata):
-        raise InputError(
-            f"nodata {nodata:g} cannot be stored in {disparity_dtype}",
-            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
-        )
-    step = cell_step(size, stride)
-    sources, chosen, phases, outcomes, scans = [], [], {}, {}, {}
-    for item in scenes:
-        source = open_stores(SceneFiles(*item), settings.max_uncertainty_px)
-        cells = scan_scene(source, step, workers)
-        windows, phase, outcome = choose_windows(
-            cells, size, stride, settings.min_labelled, settings.right_offset
-        )
-        sources.append(source)
-        chosen += [(source, window) for window in windows]
-        phases[source.scene], outcomes[source.scene] = phase, outcome
-        scans[source.scene] = (cells.picture, cells.mask, cells.scale)
-    if not any(window.labelled for _, window in chosen):
-        _refuse_empty(city, outcomes, size, settings.min_labelled, sources)
-    chosen.sort(key=lambda pair: not pair[1].labelled)  # stable: unlabelled pairs get last numbers
-    parameters = {
-        "size": size,
-        "stride": stride,
-        "min_labelled": settings.min_labelled,
-        "right_offset": settings.right_offset,
-        "disparity_dtype": disparity_dtype,
-        "nodata": nodata,
-        "max_uncertainty_px": settings.max_uncertainty_px,
-        "split_counts": {"train": training, "val": validation, "test": testing},
-        "seed": settings.seed,
-        "quality": asdict(settings.quality),
-        "building_share": settings.building_share,
-    }
-    inputs = {name: value for source in sources for name, value in source.inputs.items()}
-    provenance = describe(inputs, parameters, code)
-
+    out, extras = Path(out_dir), extras or Extras()
+    _refuse_nodata(settings)
+    windows = _Windows.of(scenes, settings, workers)
+    if not any(window.labelled for _, window in windows.chosen):
+        sources = windows.sources
+        _refuse_empty(city.city, windows.outcomes, settings.size, settings.min_labelled, sources)
+    parameters = _parameters(settings, city)
+    inputs = {name: value for source in windows.sources for name, value in source.inputs.items()}
+    flags = {name: flag for source in windows.sources for name, flag in source.flags.items()}
     cut = Cut(
-        city=city,
-        prefix=prefix,
-        size=size,
-        dtype=disparity_dtype,
-        nodata=nodata,
+        city=city.city,
+        prefix=city.prefix,
+        size=settings.size,
+        dtype=settings.disparity_dtype,
+        nodata=settings.nodata,
         building_share=settings.building_share,
         limits=settings.quality,
         code=code or source_digest("dataset.export"),
-        flags=dict(sorted({k: v for source in sources for k, v in source.flags.items()}.items())),
+        flags=dict(sorted(flags.items())),
+        layers=tuple(settings.layers),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
-        provenance=provenance,
+        provenance=describe(inputs, parameters, code),
     )
-    with ExitStack() as stack:
-        # all appear when the tiles do: a job that outlives its run cannot be found halfway
-        table = None
-        if matches is not None:
-            table = stack.enter_context(growing_table(matches, MATCH_COLUMNS))
-        coverage, contact_sheet = (
-            None if path is None else stack.enter_context(replacing(path))
-            for path in (coverage, contact_sheet)
-        )
-        looks = None
-        if ground_looks is not None:
-            looks = stack.enter_context(whole_folder(ground_looks))
-        scratch = stack.enter_context(whole_folder(out))
-        kinds = {"left", "right", "disp", "status", "orientation"}
-        if any(source.of_right is not None for source in sources):
-            kinds |= set(RIGHT_FILES)
-        if not all(window.labelled for _, window in chosen):
-            kinds |= {"unlabelled/left", "unlabelled/right"}
-        for kind in kinds:
+    with extras.being_written() as beside, atomic_folder(out) as scratch:
+        for kind in windows.kinds(cut.layers):
             (scratch / kind).mkdir(parents=True)
-
-        def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
-            return write_tile(scratch, *chosen[k], k, cut)
-
-        def draw(rows: Sequence[dict[str, Any]]) -> None:
-            # one figure at a time: Matplotlib is not made for threads
-            if coverage is not None:
-                draw_coverage(coverage, city, rows, scans)
-            if contact_sheet is not None:
-                draw_contact_sheet(contact_sheet, city, rows, scratch, nodata)
-
-        written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in sources}
-        with ThreadPoolExecutor(workers) as pool:
-            numbers = range(len(chosen))
-            tiles = pool.map(write, numbers)
-            drawn = []  # while the last tiles are written
-            if looks is not None:
-                drawn = [pool.submit(write_ground_looks, looks, source) for source in sources]
-            for row, ring, checks in progress(tiles, len(chosen), f"{city}: tiles"):
-                written.append((row, ring))
-                if checks is None:
-                    continue
-                scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
-                if table is not None:
-                    head = {key: row[key] for key in ("city", "scene", "tile", "class")}
-                    table.writerows(match_rows(head, checks.matches))
-            rows = [row for row, _ in written]
-            splits = _split(
-                written, parameters["split_counts"], settings.seed, settings.strict, city
-            )
-            drawn.append(pool.submit(draw, rows))
-            gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
-            for source in sources:
-                gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
-            half = disparity_dtype == "float16"
-            summary = summarise(city, rows, splits, phases, outcomes, parameters, half)
-            summary["quality"] = gates
-            write_table(scratch / "manifest.csv", rows)
-            write_footprints(scratch, [feature(row, ring) for row, ring in written])
-            for picture in drawn:
-                picture.result()
+        summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, settings, workers)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
             "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
-            "provenance": provenance,
+            "provenance": cut.provenance,
         }
         save(scratch / "export.json", record | {"digest": own_digest(record)})
         _forget_others(cut, rows)
     return summary
 
 
+def _refuse_nodata(settings: Settings) -> None:
+    dtype, nodata = settings.disparity_dtype, settings.nodata
+    if float(np.dtype(dtype).type(nodata)) != float(nodata):
+        raise InputError(
+            f"nodata {nodata:g} cannot be stored in {dtype}",
+            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
+        )
+
+
+def _parameters(settings: Settings, city: City) -> dict[str, Any]:
+    """What the tiles follow from besides the scenes, for their record."""
+    parameters = {
+        "size": settings.size,
+        "stride": settings.stride or settings.size,
+        "min_labelled": settings.min_labelled,
+        "right_offset": settings.right_offset,
+        "disparity_dtype": settings.disparity_dtype,
+        "nodata": settings.nodata,
+        "max_uncertainty_px": settings.max_uncertainty_px,
+        "split_counts": city.split_counts,
+        "seed": settings.seed,
+        "quality": asdict(settings.quality),
+        "building_share": settings.building_share,
+    }
+    return parameters | ({"layers": list(settings.layers)} if settings.layers else {})
+
+
+def _write_tiles(
+    scratch: Path,
+    windows: _Windows,
+    cut: Cut,
+    beside: _ExtrasBeingWritten,
+    parameters: Mapping[str, Any],
+    settings: Settings,
+    workers: int,
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Write tiles, manifest, footprints and extras; the summary, and the manifest's rows."""
+
+    def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
+        return write_tile(scratch, *windows.chosen[k], k, cut)
+
+    city, count = cut.city, len(windows.chosen)
+    written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in windows.sources}
+    with ThreadPoolExecutor(workers) as pool:
+        tiles = pool.map(write, range(count))
+        drawn = []  # while the last tiles are written
+        if beside.looks is not None:
+            drawn = [pool.submit(write_ground_looks, beside.looks, s) for s in windows.sources]
+        for row, ring, checks in progress(tiles, count, f"{city}: tiles"):
+            written.append((row, ring))
+            if checks is not None:
+                scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
+                beside.add_matches(row, checks)
+        rows = [row for row, _ in written]
+        splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
+        drawn.append(pool.submit(beside.draw, city, rows, windows, scratch, settings.nodata))
+        gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
+        for source in windows.sources:
+            gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
+        half = settings.disparity_dtype == "float16"
+        summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
+        summary["quality"] = gates
+        write_table(scratch / "manifest.csv", rows)
+        write_footprints(scratch, [feature(row, ring) for row, ring in written])
+        for picture in drawn:
+            picture.result()
+    return summary, rows
+
+
 def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
     """Remove what earlier calls have left for tiles that are no more."""
     cut.ledger.keep_only({row["tile"] for row in rows})
     kept = {
-        cut.work / row[kind] for row in rows for kind in (*FILES, *RIGHT_FILES) if row.get(kind)
+        cut.work / row[kind]
+        for row in rows
+        for kind in (*FILES, *RIGHT_FILES, *map(column, cut.layers))
+        if row.get(kind)
     }
     for file in cut.work.rglob("*.tiff"):
         if file not in kept:

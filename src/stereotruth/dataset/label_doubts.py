@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtr
 
-from ..error_statistics import TO_SIGMA
+from ..numerics.robust import TO_SIGMA, biweight
 from .label_surfaces import LabelSurface
 from .sift_matches import TileMatches
 
@@ -69,7 +69,7 @@ class Bias:
         """
         variance = self.sigma**2 + stated**2
         freedom = (self.cells - 1.0) * (variance / max(self.error**2, 1e-12)) ** 2
-        return float(2.0 * student.sf(abs(self.value) / math.sqrt(variance), freedom))
+        return float(2.0 * stdtr(freedom, -abs(self.value) / math.sqrt(variance)))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -119,7 +119,7 @@ def location(values: Floats) -> tuple[float, Floats, float]:
     width = float(np.ptp(shortest_half(np.sort(values))))
     reach = REACH * max(width * TO_SIGMA / 2.0, 1e-4)
     for _ in range(STEPS):
-        weight = np.maximum(1.0 - ((values - at) / reach) ** 2, 0.0) ** 2
+        weight = biweight((values - at) / reach)
         step = float((weight * (values - at)).sum() / weight.sum())
         at += step
         if abs(step) < 1e-6:

@@ -27,7 +27,7 @@ from ..epipolar.rpc import RPC
 from ..epipolar.rpc_files import rpc_text
 from ..errors import InputError
 from ..job import progress
-from ..products.files import whole_folder, write_table
+from ..products.files import atomic_folder, write_table
 from ..products.provenance import file_sha256
 from ..products.ungeoreferenced import open_raster
 from .manifest import read_manifest
@@ -61,7 +61,7 @@ def write_originals(
     """
     tiles = Path(tiles)
     rows = read_manifest(tiles)
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         for view in ("left", "right"):
             (scratch / view).mkdir()
 

@@ -9,7 +9,9 @@ disparity of its pair is 1 to 2 px; as many columns at its right end are nodata.
 ``us3d``: ``{Train,Validate,Test}-Track2-RGB/<tile>_{LEFT,RIGHT}_RGB.tif`` and
 ``{Train,Validate,Test}-Track2-Truth/<tile>_LEFT_DSP.tif``. Images are RGB of 8 bits, between
 ``black`` and ``white`` (digital numbers of both images of a pair), disparities those of the tiles.
-There are no heights above ground (AGL) and no classes (CLS).
+With the layers ``agl`` and ``class`` (``tiles.layers``) there are ``<tile>_LEFT_AGL.tif`` (m above
+the ground, NaN where it is not known) and ``<tile>_LEFT_CLS.tif`` (LAS classes, 65 where there is
+none) beside them.
 
 Each has a ``manifest.csv`` with what was done to each pair, and its checksums.
 """
@@ -29,15 +31,17 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..job import progress
 from ..products import pictures
-from ..products.files import whole_folder, write_table
+from ..products.files import atomic_folder, write_table
 from ..products.provenance import file_sha256
-from ..products.rasters import KITTI_STEPS, read_disparity, read_image, write_tiff
+from ..products.rasters import KITTI_STEPS, read_disparity, read_image, read_labels, write_tiff
+from .layer_kinds import KINDS, column
 from .manifest import read_manifest
 
 log = logging.getLogger("stereotruth")
 
 KITTI_SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 US3D_SPLITS = {"train": "Train-Track2", "val": "Validate-Track2", "test": "Test-Track2"}
+US3D_TRUTH = {"agl": ("AGL", np.nan), "class": ("CLS", 65)}  # ending and value where unknown
 KEPT = (
     *("tile", "number", "city", "scene", "row0", "col0", "size", "split", "class", "quality"),
     "doubt",
@@ -52,6 +56,7 @@ class _Pair:
     left: NDArray[Any]
     right: NDArray[Any]
     disparity: NDArray[np.float32]
+    layers: Mapping[str, NDArray[Any]]  # agl, class: of those that the dataset has
 
 
 def write_layout(dataset: str | Path, out: str | Path, layout: str) -> int:
@@ -61,12 +66,17 @@ def write_layout(dataset: str | Path, out: str | Path, layout: str) -> int:
     """
     dataset, write = Path(dataset), {"kitti": _kitti, "us3d": _us3d}[layout]
     rows = [row for row in read_manifest(dataset) if row["disp"]]
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         table = []
         for row in progress(rows, len(rows), f"dataset as {layout}: pairs"):
             images = (read_image(dataset / row[view]) for view in ("left", "right"))
             disparity = read_disparity(dataset / row["disp"], float(row["disparity_nodata"]))
-            pair = _Pair(row, *images, disparity)
+            layers = {
+                name: read_labels(dataset / row[column(name)])[0]
+                for name in US3D_TRUTH
+                if row.get(column(name))
+            }
+            pair = _Pair(row, *images, disparity, layers)
             files, said = write(scratch, pair)
             record = {name: row[name] for name in KEPT if name in row} | said
             for kind, name in files.items():
@@ -142,6 +152,12 @@ def _us3d(folder: Path, pair: _Pair) -> tuple[dict[str, str], dict[str, Any]]:
     known = np.isfinite(pair.disparity)
     labels = np.where(known, pair.disparity, np.float32(-999))
     write_tiff(folder / files["disp"], labels, nodata=-999)
+    for name, values in pair.layers.items():
+        ending, unknown = US3D_TRUTH[name]
+        files[name] = f"{split}-Truth/{tile}_LEFT_{ending}.tif"
+        nodata = KINDS[name].nodata
+        values = np.where(values == nodata, np.asarray(unknown, values.dtype), values)
+        write_tiff(folder / files[name], values, nodata=unknown)
     return files, {
         "right_offset_px": int(pair.row["right_offset_px"]),
         "black": f"{limits[0]:g}",

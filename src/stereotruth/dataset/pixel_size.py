@@ -10,9 +10,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from ..numerics.degrees import metres_per_degree
 from .polynomials import evaluate
-
-DEGREE_M = 111_320.0  # of latitude, near enough for two digits
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,8 @@ class PixelSize:
         d = (low + high) / 2
         below, above = (evaluate(ground, middle, middle, d + k)["height"] for k in (-0.5, 0.5))
         a, b = (evaluate(ground, middle + k, middle, d) for k in (-0.5, 0.5))
-        east = (b["lon"] - a["lon"]) * DEGREE_M * math.cos(math.radians(a["lat"]))
-        north = (b["lat"] - a["lat"]) * DEGREE_M
-        return cls(math.hypot(east, north), float(above - below))
+        degrees = b["lon"] - a["lon"], b["lat"] - a["lat"]
+        return cls(math.hypot(*(degrees * metres_per_degree(a["lat"]))), float(above - below))
 
     @classmethod
     def mean(cls, orientations: Iterable[Path]) -> PixelSize | None:

@@ -15,9 +15,10 @@ from typing import Any
 
 from ..errors import InputError
 from ..job import progress
-from ..products.files import whole_folder, write_table
+from ..products.files import atomic_folder, write_table
 from ..products.provenance import file_sha256
 from .footprints import read_footprints, write_footprints
+from .layer_kinds import KINDS, column
 from .manifest import read_manifest
 from .split_names import NO_TRUTH, NONE, SPLITS, TRUTH
 from .splits import shared_ground
@@ -25,6 +26,7 @@ from .splits import shared_ground
 log = logging.getLogger("stereotruth")
 
 
+PAIR = ("left", "right", "disp")
 README = """Stereo pairs with ground-truth disparity, in the folder layout of WHU-Stereo
 
   with ground truth/{{train,val,test}}/{{left,right,disp}}
@@ -40,6 +42,8 @@ Conventions
   {rounding}
 - The right image of each pair is shifted by a whole number of px (right_offset_px in
   manifest.csv), which is already inside d: the disparity of the scene is d + right_offset_px.
+- height, class, agl, uncertainty, where there are such folders: layers on the grid of disp
+  (tiles.layers); nodata is tagged.
 - Why a pixel has no label (status), and the way back to heights and to the original images
   (orientation), are in tiles/<City>/ under the same number; manifest.csv has their checksums there.
 - No ground lies in two splits: tiles of which two overlap are in one split, or in none and then
@@ -90,13 +94,14 @@ def assemble_dataset(
                 nodata.add(row["disparity_nodata"])
                 if row["split"] == NONE:
                     continue
-                place, kinds = f"{TRUTH}/{row['split']}", ("left", "right", "disp")
+                kinds = *PAIR, *(name for name in KINDS if row.get(column(name)))
+                place = f"{TRUTH}/{row['split']}"
             else:
-                place, kinds = NO_TRUTH, ("left", "right")
+                place, kinds = NO_TRUTH, PAIR[:2]
             todo.append((folder, row, place, kinds))
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         for split in SPLITS:
-            for kind in ("left", "right", "disp"):
+            for kind in {*PAIR, *(kind for *_, kinds in todo for kind in kinds)}:
                 (scratch / TRUTH / split / kind).mkdir(parents=True)
         for kind in ("left", "right"):
             (scratch / NO_TRUTH / kind).mkdir(parents=True)
@@ -157,17 +162,18 @@ def _copy(
 ) -> dict[str, Any]:
     """Copy one pair and return its row of the dataset's manifest."""
     row = {k: v for k, v in row.items() if k.partition("_")[0] not in ("status", "orientation")}
-    for kind in ("left", "right", "disp"):
+    for kind in (*PAIR, *(name for name in KINDS if column(name) in row)):
+        cell = kind if kind in PAIR else column(kind)
         if kind not in kinds:
-            row[kind] = row[f"{kind}_sha256"] = ""
+            row[cell] = row[f"{cell}_sha256"] = ""
             continue
-        source, target = folder / row[kind], f"{place}/{kind}/{Path(row[kind]).name}"
+        source, target = folder / row[cell], f"{place}/{kind}/{Path(row[cell]).name}"
         if not source.is_file():
             raise InputError("file is missing", file=source, remedy=f"make {folder} again")
         shutil.copyfile(source, scratch / target)
-        if file_sha256(scratch / target) != row[f"{kind}_sha256"]:
+        if file_sha256(scratch / target) != row[f"{cell}_sha256"]:
             raise InputError(
                 "file is not as in its manifest", file=source, remedy=f"make {folder} again"
             )
-        row[kind] = target
+        row[cell] = target
     return row

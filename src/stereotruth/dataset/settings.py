@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from ..settings import Flag, Number, Share, Text, Unit, Whole, settings
+from ..settings import Flag, Number, Share, Text, Unit, Whole, each_once, settings
 
 NotNegative = Annotated[Number, Field(ge=0)]
 
@@ -40,6 +40,15 @@ class Tiles:
     """of the labels of rough surfaces (`labelled_crown`, 12), those with a greater `uncertainty`
     are in the disparity store alone: in the tiles they have no disparity and the status
     `too_uncertain` (13). 0: none of them is in the tiles. All other labels are"""
+
+    layers: Annotated[
+        tuple[Literal["height", "class", "agl", "uncertainty"], ...], AfterValidator(each_once)
+    ] = ()
+    """more files of each labelled tile, on the grid of `disp`: `height` (of what the label shows, m
+    above the ellipsoid), `class` (LAS class), `agl` (m above the ground, by the LiDAR's class 2, or
+    a morphological filter where it has none), `uncertainty` (of the disparity, px); float32 with
+    nodata -9999, `class` uint8 with 0. They go into `dataset/` too, and `agl` and `class` into the
+    truth of `dataset_us3d/`"""
 
 
 @settings

@@ -38,6 +38,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..numerics.bilinear import bilinear
 from ..products.pictures import stretch
 
 Floats = NDArray[np.float64]
@@ -154,14 +155,6 @@ def constant_labels(disparity: Floats) -> Bools:
     )
     dense = share >= np.median(share[known]) - 1e-4
     return known & dense & (high - low <= CONSTANT_PX)
-
-
-def _bilinear(grid: Floats, x: Floats, y: Floats) -> Floats:
-    i = np.clip(np.floor(x).astype(np.intp), 0, grid.shape[1] - 2)
-    j = np.clip(np.floor(y).astype(np.intp), 0, grid.shape[0] - 2)
-    u, v = x - i, y - j
-    upper = (1 - u) * grid[j, i] + u * grid[j, i + 1]
-    return (1 - v) * upper + v * (u * grid[j + 1, i + 1] + (1 - u) * grid[j + 1, i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +294,7 @@ def match_tile(
             found |= {first: _match_band(*images, where, reach, first) for first in missing}
     x, y, x_right, y_right = (np.concatenate(c) for c in zip(*(found[k] for k in sorted(found))))
     at = np.floor(y + 0.5).astype(np.intp), np.floor(x + 0.5).astype(np.intp)
-    between = _bilinear(disparity, x, y)
+    between = bilinear(disparity, x, y)
     if surface_class is None:
         surface_class = np.zeros(disparity.shape, np.uint8)
     return TileMatches(

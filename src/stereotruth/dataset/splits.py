@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from ..numerics.degrees import metres_per_degree
 from .manifest import Tile, manifest_rows
 from .split_names import NONE, SPLITS
 
 # Footprints follow the heights on the tile's border; what leans across it by less than this many
 # pixels (a roof 30 m high in a view 5° off nadir at 0.65 m) does not count as shared.
 TOLERANCE_PX = 4.0
-EARTH_M_PER_DEGREE = 111_320.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def scaled_counts(total: int, weights: Mapping[str, int]) -> dict[str, int]:
 def _metric(places: Sequence[Place]) -> list[NDArray[np.float64]]:
     """Rings in metres east and north of the first tile (equirectangular; one city is small)."""
     origin = places[0].ring[0]
-    scale = EARTH_M_PER_DEGREE * np.array([np.cos(np.radians(origin[1])), 1.0])
+    scale = metres_per_degree(origin[1])
     rings = []
     for place in places:
         ring = place.ring - origin

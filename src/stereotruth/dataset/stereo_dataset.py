@@ -30,10 +30,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..products.files import read_sealed
 from ..products.folders import files_below
 from ..products.names import plain_name
-from ..products.rasters import read_disparity
-from .manifest import manifest_rows
+from ..products.provenance import file_sha256
+from ..products.rasters import read_disparity, read_labels
+from .layer_kinds import column as column_of
+from .manifest import PATHS, SUM, manifest_rows
 from .split_names import NO_TRUTH, NONE, SPLITS
 from .stereo_dataset_settings import Settings
 
@@ -71,6 +74,19 @@ class Pair:
     right: Path
     disparity: Path | None
     row: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+
+    def refuse_changed(self) -> None:
+        """Raise InputError if a file is not the one that the manifest has the checksum of."""
+        files = zip(PATHS, (self.left, self.right, self.disparity))
+        for column, file in files:
+            known = self.row.get(f"{column}{SUM}")
+            if file is not None and known and file_sha256(file) != known:
+                raise InputError(
+                    "is not what its manifest has the checksum of",
+                    file=file,
+                    remedy="get or make the dataset again; or delete the manifest, if the edit "
+                    "was yours",
+                )
 
 
 @dataclass(frozen=True)
@@ -128,6 +144,23 @@ class StereoDataset:
         assert pair.disparity is not None
         return read_disparity(pair.disparity, self.nodata)
 
+    def layer(self, pair: Pair, name: str) -> NDArray[Any]:
+        """A layer of ``tiles.layers`` of a pair of layout ``stereotruth`` [h, w].
+
+        float32 with NaN, or of ``class`` uint8 with 0, where nothing is known. Raises InputError if
+        the dataset has no such layer.
+        """
+        if not pair.row.get(column_of(name)):
+            raise InputError(
+                f"pair {pair.name} has no layer {name}",
+                file=self.root,
+                remedy=f"make the tiles with tiles.layers: [{name}]",
+            )
+        values, nodata = read_labels(Path(self.root) / pair.row[column_of(name)])
+        if values.dtype == np.uint8:
+            return values
+        return np.where(values == np.float32(nodata), np.float32(np.nan), values)
+
 
 def find_pairs(root: str | Path, layout: str) -> list[Pair]:
     """All pairs below a folder, sorted by split and name.
@@ -173,6 +206,14 @@ def match_inside(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _of_manifest(root: Path) -> Iterator[Pair]:
+    known = root / "export.json"  # of a folder of tiles
+    sums = read_sealed(known) if known.is_file() else {}
+    if sums.get("manifest_sha256") not in (None, file_sha256(root / "manifest.csv")):
+        raise InputError(
+            f"is not what {known} has the checksum of",
+            file=root / "manifest.csv",
+            remedy=f"make the folder again, or delete {known}, if the edit was yours",
+        )
     for row in manifest_rows(root / "manifest.csv"):
         try:
             split = row["split"] if row["disp"] else NONE

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..errors import in_number
 from .manifest import carries_label
 
 
@@ -65,10 +66,10 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
     labelled = sum(share for name, share in shares.items() if carries_label(name))
     low, high = summary["disparity_px"]["min"], summary["disparity_px"]["max"]
     lines = [
-        f"{summary['city']}: {summary['labelled_pairs']} labelled pairs of "
+        f"{summary['city']}: {in_number(summary['labelled_pairs'], 'labelled pair')} of "
         f"{summary['size_px']} × {summary['size_px']} px "
         f"({in_counts(summary['splits']['realised'])}), "
-        f"{summary['unlabelled_pairs']} pairs without complete labels",
+        f"{in_number(summary['unlabelled_pairs'], 'pair')} without complete labels",
         f"{100 * labelled:.1f} % of their pixels labelled, disparities {low:.1f} … {high:.1f} px, "
         f"rounded by at most {summary['disparity_rounding']['largest_px']:.4f} px",
         *(_quality_line(scene, found) for scene, found in summary["quality"]["scenes"].items()),

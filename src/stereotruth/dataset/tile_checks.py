@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.warping import CorrelationSum
-from ..error_statistics import ErrorSum
+from ..numerics.error_sums import ErrorSum
 from .label_doubts import SceneMatches, agreement
 from .quality_limits import flag, missed
 from .settings import Limits

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
 from ..products.rasters import write_tiff
 from .label_surfaces import label_surfaces
+from .layer_kinds import column
 from .orientation import orientation, save
 from .scene_stores import SceneStores
 from .settings import Limits
@@ -25,6 +26,7 @@ from .sift_matches import match_tile
 from .split_names import NONE
 from .tile_checks import TileChecks, check_cells
 from .tile_classes import Buildings
+from .tile_layers import tile_layers, write_layer
 from .windows import Window
 
 FILES = ("left", "right", "disp", "status", "orientation")
@@ -54,6 +56,7 @@ class Cut:
     limits: Limits
     code: str
     flags: Mapping[int, str]  # meaning of the status values of all scenes
+    layers: tuple[str, ...]  # see tile_layers
     work: Path  # where the files of finished tiles wait, with the ledger
     provenance: Mapping[str, Any]
 
@@ -111,7 +114,9 @@ class _Crop:
         return [np.ascontiguousarray(array) for array in found if array is not None]
 
 
-def tile_names(source: SceneStores, window: Window, number: int, prefix: str) -> dict[str, str]:
+def tile_names(
+    source: SceneStores, window: Window, number: int, prefix: str, layers: Sequence[str] = ()
+) -> dict[str, str]:
     """Paths of a tile's files in the city's folder, by kind."""
     group = "" if window.labelled else "unlabelled/"
     names = {
@@ -125,6 +130,7 @@ def tile_names(source: SceneStores, window: Window, number: int, prefix: str) ->
         if source.of_right is not None:
             names["disp_right"] = f"disp_right/{prefix}_disparity_right_{number}.tiff"
             names["status_right"] = f"status_right/{prefix}_status_right_{number}.tiff"
+        names |= {column(layer): f"{layer}/{prefix}_{layer}_{number}.tiff" for layer in layers}
     return names
 
 
@@ -204,8 +210,9 @@ def _finished(
     known = None
     if window.labelled:
         known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
+    layers = tile_layers(source, here, cut.layers) if window.labelled else {}
     pixels = hashlib.sha256()
-    for array in (*crop.arrays(), *(known.arrays() if known else ())):
+    for array in (*crop.arrays(), *(known.arrays() if known else ()), *layers.values()):
         pixels.update(array)
     files = {name: path for name, path in names.items() if name != "orientation"}
     paths = {name: cut.work / path for name, path in files.items()}
@@ -220,6 +227,8 @@ def _finished(
     piece = cut.ledger.find(tile, key, paths)
     if piece is None:
         _write_images(paths, source, window, crop, cut)
+        for name, values in layers.items():
+            write_layer(paths[column(name)], name, values)
         checks = None if known is None else _check(crop, known)
         piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
     found = piece.result
@@ -238,7 +247,7 @@ def write_tile(
             f"tile {name} has a true disparity of {cut.nodata:g} px, the value for nodata",
             remedy="set tiles.nodata to a value that no disparity takes",
         )
-    files = tile_names(source, window, number, cut.prefix)
+    files = tile_names(source, window, number, cut.prefix, cut.layers)
     sums, checks = _finished(source, window, files, crop, cut)
     for kind in sums:
         link(cut.work / files[kind], folder / files[kind])
@@ -290,7 +299,11 @@ def write_tile(
     }
     for value, meaning in cut.flags.items():
         row[f"count_{meaning}"] = int((crop.status == value).sum())
-    for kind in (*FILES, *(RIGHT_FILES if source.of_right is not None else ())):
+    for kind in (
+        *FILES,
+        *(RIGHT_FILES if source.of_right is not None else ()),
+        *map(column, cut.layers),
+    ):
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = sums.get(kind, "")
     return row, ring, checks

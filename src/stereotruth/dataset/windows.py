@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import progress
+from ..numerics.summed_area import window_sums
 from .scene_stores import SceneStores
 
 MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image border
@@ -121,13 +121,6 @@ def scan_scene(source: SceneStores, step: int, workers: int) -> CellSums:
     return CellSums(step, labelled, left_nodata, disparity, right_nodata, scale, picture, mask)
 
 
-def _window_sums(cells: NDArray[Any], n: int) -> NDArray[Any]:
-    """Sums over n × n cells from every origin."""
-    total = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), cells.dtype)
-    total[1:, 1:] = cells.cumsum(axis=0).cumsum(axis=1)
-    return total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]
-
-
 def choose_windows(
     cells: CellSums, size: int, stride: int, min_labelled: float, right_offset: str
 ) -> tuple[list[Window], tuple[int, int], dict[str, int]]:
@@ -135,11 +128,11 @@ def choose_windows(
     n, step = size // cells.step, cells.step
     if min(cells.labelled.shape) < n:
         return [], (0, 0), {"grid smaller than a tile": 1}
-    labelled = _window_sums(cells.labelled, n)
+    labelled = window_sums(cells.labelled, n)
     mean = cells.mean_disparity
     offset = np.full(labelled.shape, mean)
     if right_offset == "tile":
-        sums = _window_sums(cells.disparity, n)
+        sums = window_sums(cells.disparity, n)
         np.divide(sums, labelled, out=offset, where=labelled > 0)
     offset = np.rint(offset).astype(np.int64)
     row = np.arange(labelled.shape[0])[:, None]
@@ -150,7 +143,7 @@ def choose_windows(
     total = cells.right_nodata
     missing = total[row + n, a + size] - total[row, a + size] - total[row + n, a] + total[row, a]
     refused = [
-        _window_sums(cells.left_nodata, n) > 0,
+        window_sums(cells.left_nodata, n) > 0,
         ~inside,
         missing > MAX_RIGHT_NODATA * size * size,
         labelled < max(min_labelled * size * size, 1),

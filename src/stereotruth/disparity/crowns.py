@@ -1,189 +1,68 @@
 """Labels of rough surfaces, as crowns are, with an uncertainty of their own.
 
-On a rough surface no triangle of points goes on the plane of its neighbours, so that
-:mod:`.smooth_triangles` calls all of them steps. Between points that lie close together such a
-surface is still known to some tenths of a pixel. So
+Between points that lie close together a rough surface is known to some tenths of a pixel. So
 
-1. points far below others all around them went through the surface (:func:`_passed`): they are left
-   out, and the others, its tops, are triangulated anew (:class:`RoughSurface`);
+1. its points are tops, and those that went through it (:mod:`stereotruth.surface.rough_tops`);
 2. a pixel's value is linear in the triangle of tops that is nearest to the left camera;
-3. a pixel is labelled if no other triangle, smooth or steep, nor a step between known surfaces may
-   be nearer to either camera, if nothing near it is much higher, and if the pixels beside it keep
-   their order in the right image (:func:`_narrowest`);
-4. the uncertainty follows from what is between the points: how far tops are off the planes of the
-   triangles beside them, how much the triangle rises, and how much higher the pixels beside it are.
+3. a pixel is labelled if no other triangle, facet or steep, nor a strip between known surfaces may
+   be nearer to either camera, if nothing near it is much higher, and if nothing higher comes close
+   to it in the right image (:func:`_clearance`);
+4. the uncertainty follows from what is between the points: the residuals of tops to the planes of
+   the triangles beside them, how much the triangle rises, and how much higher the pixels beside it
+   are (eq. 12 of docs/explanation/surface.md).
 
-No image has a say in which surface a pixel shows. All follows from the points around a pixel alone,
-in an order that no window changes.
+No image decides which surface a pixel shows. All follows from the points around a pixel alone, in
+an order that no window changes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
-from .local_projection import LocalProjection
-from .point_triangles import triangulate
-from .smooth_triangles import ROUGH_REACH, STEP_PX, GroundSurface, Scale
-from .status import WATER_CLASS
-from .surface_between import (
-    STEP_IN_LEFT,
-    STEP_IN_RIGHT,
-    TOLERANCE_PX,
-    Between,
-    Places,
-    at_pixels,
-    by_right_column,
-    nearest_faces,
-    steps_in_left,
-    steps_in_right,
+from ..surface.rough_tops import RoughTops, rough_tops
+from .facet_raster import (
+    OCCLUSION_TOLERANCE_PX,
+    FacetValues,
+    PixelValues,
+    interpolate,
+    raster_facets,
+    right_pixels,
 )
-from .vertices import Vertices
+from .image_agreement import Comparison, window_agreement
+from .pair_window import PairWindow, WindowLabels
+from .pixel_labels import Labels
+from .pixel_scale import FACET_RESIDUAL_PX, PixelScale
+from .seen_surface import box_max
+from .status import WATER_CLASS, Status, is_labelled
+from .visibility import FACET_IN_RIGHT, PRISM_IN_LEFT, PRISM_IN_RIGHT, VisibleSurface, hidden_by
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
-# A point went through the surface if points higher than it by PASSED_PX (disparity) lie in all
-# directions around it, no farther than ROUGH_REACH mean distances of points, and are no fewer than
-# the others there: a gap between crowns keeps its ground.
-PASSED_PX = 1.0
-SECTORS = 12
-_ROOT_3 = np.sqrt(3.0)
-WIDEST_GAP = 4  # empty sectors in a row, which leave no half of the directions without a point
-STEEP_PX = 6.0  # a triangle that rises by more is the side of something
-# A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: an outline that
-# points tell to a pixel alone may cover it in either view.
-HIGHER_PX, HIGHER_REACH = 1.5, 3
-# Nor if one of the next BESIDE_PX of its row lies less far to its right in the right image: there
-# the surface turns away. More labels and more hidden ones go together. Of crowns with lobes, at 4
-# points/m², 52, 57 and 60 % of the visible and 0.66, 0.72 and 0.86 % of the hidden pixels had
-# labels with 0.8, 0.65 and 0.5.
-LEAST_WIDTH = 0.65
-BESIDE_PX = 12
-# Standard uncertainty, px, where points are a pixel apart: of its own, and per px of misfit, of the
-# triangle's rise, and of what is higher beside the pixel. It grows with the distance of points to
-# the power of GROWTH.
-OWN, MISFIT, RISE, HIGHER = 0.078, 0.134, 0.18, 0.26
-GROWTH = 0.75
-
-
-@inner
-def _bucket(value: int, side: int) -> int:
-    return value // side
-
-
-@kernel
-def _by_bucket(x: Ints, y: Ints, side: int, cols: int, rows: int) -> tuple[Steps, Steps]:
-    """Vertices by square: ``list[start[k] : start[k + 1]]``, in their order."""
-    start = np.zeros(rows * cols + 1, np.int32)
-    for k in range(x.size):
-        start[_bucket(y[k], side) * cols + _bucket(x[k], side) + 1] += 1
-    for k in range(rows * cols):
-        start[k + 1] += start[k]
-    place = start[:-1].copy()
-    out = np.empty(x.size, np.int32)
-    for k in range(x.size):
-        b = _bucket(y[k], side) * cols + _bucket(x[k], side)
-        out[place[b]] = k
-        place[b] += 1
-    return start, out
-
-
-@inner
-def _sector(dx: int, dy: int) -> int:
-    """One of SECTORS directions of 30 degrees, counter-clockwise from east."""
-    across, along = float(abs(dx)), float(abs(dy))
-    part = 0 if along * _ROOT_3 < across else 1 if along < across * _ROOT_3 else 2
-    if dy >= 0:
-        return part if dx > 0 else 5 - part
-    return 6 + part if dx < 0 else 11 - part
-
-
-@kernel
-def _passed(
-    x: Ints, y: Ints, h: Ints, radius: float, step: float, side: int, cols: int,
-    start: Steps, members: Steps,
-) -> Bools:  # fmt: skip
-    """Which vertices lie below a surface around them: see PASSED_PX.
-
-    ``step``: height steps; ``side``, ``cols``, ``start``, ``members``: of :func:`_by_bucket`.
-    """
-    out = np.zeros(x.size, np.bool_)
-    rows = (start.size - 1) // cols
-    filled = np.empty(SECTORS, np.bool_)
-    for k in range(x.size):
-        filled[:] = False
-        higher = others = 0
-        j, i = _bucket(y[k], side), _bucket(x[k], side)
-        for b in range(max(j - 1, 0), min(j + 2, rows)):
-            for a in range(max(i - 1, 0), min(i + 2, cols)):
-                for m in range(start[b * cols + a], start[b * cols + a + 1]):
-                    v = members[m]
-                    dx, dy = x[v] - x[k], y[v] - y[k]
-                    if v == k or float(dx * dx + dy * dy) > radius * radius:
-                        continue
-                    if h[v] - h[k] > step:
-                        higher += 1
-                        filled[_sector(dx, dy)] = True
-                    else:
-                        others += 1
-        if higher < 3 or higher < others:
-            continue
-        empty = widest = 0
-        for s in range(2 * SECTORS):
-            empty = 0 if filled[s % SECTORS] else empty + 1
-            widest = max(widest, empty)
-        out[k] = widest <= WIDEST_GAP
-    return out
-
-
-@kernel
-def _misfits(x: Ints, y: Ints, h: Ints, corner: Steps, neighbour: Steps, kept: Bools) -> Floats:
-    """Root mean square by which the far vertices of the triangles beside each one are off its
-    plane, as the noise of one point, height steps; NaN where there is none beside."""
-    size = len(corner)
-    total, number = np.zeros(size), np.zeros(size)
-    for t in range(size):
-        if not kept[t]:
-            continue
-        a, b, c = corner[t]
-        u, v, s, w = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
-        area = float(u * w - v * s)
-        for i in range(3):
-            other = neighbour[t, i]
-            if other < 0 or not kept[other]:
-                continue
-            shared = a + b + c - corner[t, i]
-            far = corner[other, 0] + corner[other, 1] + corner[other, 2] - shared
-            p, q = float(x[far] - x[a]), float(y[far] - y[a])
-            wb, wc = (p * w - q * s) / area, (q * u - p * v) / area
-            wa = 1.0 - wb - wc
-            off = h[far] - wa * h[a] - wb * h[b] - wc * h[c]
-            total[t] += off * off / (1.0 + wa * wa + wb * wb + wc * wc)
-            number[t] += 1.0
-    out = np.full(size, np.nan)
-    for t in range(size):
-        squares, n = total[t], number[t]
-        for i in range(3):
-            other = neighbour[t, i]
-            if other >= 0:
-                squares += total[other]
-                n += number[other]
-        if n > 0.0:
-            out[t] = np.sqrt(squares / n)
-    return out
+# A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: a contour that
+# points determine to a pixel alone may cover it in either view.
+HIGHER_PX, HIGHER_REACH = 4.0, 3
+# Nor if a surface that is higher by ABOVE_PX comes nearer to it than CLEARANCE_PX in the right
+# image. The next BESIDE_PX of a row can do so. Contours of crowns lie beyond their last points, by
+# about a spacing of points. Six drawn scenes: bench/README.md, refinement.py.
+CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
+# Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
+# the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
+# to the power of GROWTH.
+OWN, RESIDUAL, RISE, HIGHER = 0.057, 0.074, 0.155, 0.455
+GROWTH = 0.66
 
 
 @kernel
 def _higher(disparity: Floats, reach: int) -> Floats:
-    """By how much the highest disparity up to ``reach`` px around is above each pixel's own, px;
-    NaN where a pixel has none."""
+    """By how much the highest disparity up to ``reach`` px around is above each pixel's own, px
+    (κ of eq. 12 of docs/explanation/surface.md); NaN where a pixel has none."""
     rows, cols = disparity.shape
     along, out = np.empty_like(disparity), np.empty_like(disparity)
     for j in range(rows):
@@ -202,143 +81,167 @@ def _higher(disparity: Floats, reach: int) -> Floats:
 
 
 @kernel
-def _narrowest(disparity: Floats) -> Floats:
-    """How far to the right of each pixel's column in the right image the next BESIDE_PX of its row
-    lie there at least, px: 1 on a level surface, below 0 if one of them hides the pixel."""
+def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
+    """Distance px in the right image from each pixel to the nearest surface that is higher.
+
+    ``disparity`` [h, w] of the pixels, ``above`` [h, w] of what may be higher, NaN for nothing. The
+    next BESIDE_PX to the right in the left image count, in ``reach_rows`` rows above and below the
+    pixel's, too. Infinite without a higher surface, below 0 where one covers the pixel (eq. 14 of
+    docs/explanation/surface.md).
+    """
     rows, cols = disparity.shape
+    highest = np.full(above.shape, -np.inf)
+    for j in range(rows):
+        for b in range(max(j - reach_rows, 0), min(j + reach_rows + 1, rows)):
+            for i in range(cols):
+                if above[b, i] > highest[j, i]:  # false for NaN
+                    highest[j, i] = above[b, i]
     out = np.full(disparity.shape, np.inf)
     for j in range(rows):
         for i in range(cols):
             for a in range(i + 1, min(i + BESIDE_PX + 1, cols)):
-                apart = (a - i) - (disparity[j, a] - disparity[j, i])
-                if apart < out[j, i]:  # false for NaN
-                    out[j, i] = apart
+                rise = highest[j, a] - disparity[j, i]
+                if rise > ABOVE_PX and a - i - rise < out[j, i]:
+                    out[j, i] = a - i - rise
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class RoughSurface:
-    """Triangles of the tops of rough surfaces.
-
-    ``corner`` [m, 3]: of ``vertices``, the tops; ``misfit`` [m]: by how much these are off the
-    planes of the triangles beside, px of disparity; ``rise`` [m]: height of a triangle, px;
-    ``gentle`` [m]: neither steep nor alone.
-    """
-
-    vertices: Vertices
-    corner: Steps
-    misfit: Floats
-    rise: Floats
-    gentle: Bools
-
-    @classmethod
-    def of(cls, surface: GroundSurface, scale: Scale, px_per_m: float) -> RoughSurface:
-        """Of the points around the steps of a surface; ``px_per_m``: disparity of a m of height."""
-        step = px_per_m * LATTICE_M
-        points = _taken(surface.vertices, np.flatnonzero(surface.uneven))
-        radius = ROUGH_REACH * scale.distance
-        side = int(np.ceil(radius))
-        cols, rows = (int(v.max(initial=0)) // side + 1 for v in (points.x, points.y))
-        buckets = _by_bucket(points.x, points.y, side, cols, rows)
-        place = points.x, points.y, points.h_q
-        passed = _passed(*place, radius, PASSED_PX / step, side, cols, *buckets)
-        tops = _taken(points, np.flatnonzero(~passed))
-        found = triangulate(tops.x, tops.y, scale.smooth)
-        rise = np.ptp(tops.h_q[found.corner], axis=1) * step
-        flat = rise <= STEEP_PX
-        place = tops.x, tops.y, tops.h_q
-        misfit = _misfits(*place, found.corner, found.neighbour, flat) * step
-        return cls(tops, found.corner, misfit, rise, flat & np.isfinite(misfit))
-
-
-def _taken(vertices: Vertices, index: Ints) -> Vertices:
-    return Vertices(*(getattr(vertices, f.name)[index] for f in fields(Vertices)))
 
 
 @dataclass(frozen=True, eq=False)
 class Crowns:
     """What rough surfaces show at the centres of pixels; arrays [h, w].
 
-    ``shown``: both cameras see it. ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px²
-    (of the points and of what is between them), ``height`` m, ``surface_class`` (ASPRS, of the
-    nearest point): NaN (0) where there is none.
+    ``visible``: from both cameras. ``labels``: disparity px, slope, variance px² (of the points and
+    of what is between them); ``height`` m, ``surface_class`` (ASPRS, of the nearest point): NaN (0)
+    where there is none. ``tops`` px: disparity of the nearest triangle of tops, steep ones too.
     """
 
-    shown: Bools
-    disparity: Floats
-    slope: Floats
-    variance: Floats
+    visible: Bools
+    labels: Labels
     height: Floats
     surface_class: NDArray[np.uint8]
+    tops: Floats
 
 
-def crowns(
-    surface: GroundSurface,
-    between: Between,
-    local: LocalProjection,
-    first: tuple[int, int],
-    scale: Scale,
-    px_per_m: float,
-) -> Crowns:
-    """The rough surfaces of a window whose first pixel is (row, col) ``first``.
-
-    Shown at pixels of which the points leave open what they show (``between``). ``local`` projects
-    all that lies in the box of the vertices; ``px_per_m``: disparity of a m of height.
-    """
-    shape = between.outcome.shape
-    rough = RoughSurface.of(surface, scale, px_per_m)
-    tops, corner = rough.vertices, rough.corner[rough.gentle]
-    xy = local.at_points(tops.lon_q, tops.lat_q, tops.h_q)
-    nearest, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    nearest_faces(xy, corner, first, nearest, index)
-    disparity = np.where(index >= 0, nearest, np.nan)
-    before = np.where(np.isnan(between.disparity), -np.inf, between.disparity)
-    nearest_faces(xy, rough.corner[~rough.gentle], first, before, np.empty(shape, np.int32))
-    steps_in_left(surface, local, _known(surface), first, before)
+def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
+    """The rough surfaces of a window, at pixels of which the facets leave open what they show."""
+    surface, first = visible.projected.surface, visible.projected.first
+    shape = visible.visibility.shape
+    rough = rough_tops(surface, scale.surface)
+    tops, corner = rough.vertices, rough.corner[rough.is_gentle]
+    xy = visible.projected.projection.at_points(tops.lon_q, tops.lat_q, tops.h_q)
+    z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
+    raster_facets(xy, corner, first, z_buffer, index)
+    disparity = np.where(index >= 0, z_buffer, np.nan)
+    before = np.where(np.isnan(visible.disparity), -np.inf, visible.disparity)
+    steep, unused = rough.corner[~rough.is_gentle], np.empty(shape, np.int32)
+    raster_facets(xy, steep, first, before, unused)
+    tops_buffer = z_buffer.copy()
+    raster_facets(xy, steep, first, tops_buffer, unused)
+    visible.projected.raster_prisms(surface.strips, before)
     all_around = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
-    is_open = (between.outcome == STEP_IN_LEFT) | (between.outcome == STEP_IN_RIGHT)
-    # what smooth triangles show has labels already, as far as it is certain
+    is_open = np.isin(visible.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
+    # what facets show has labels already, as far as it is certain
     with np.errstate(invalid="ignore"):
-        shown = is_open & (disparity > before - TOLERANCE_PX)
-        shown &= ~(np.abs(disparity - between.disparity) <= STEP_PX)
-        shown &= _higher(all_around, HIGHER_REACH) <= HIGHER_PX
-    shown &= _narrowest(all_around) >= LEAST_WIDTH
-    row, col = np.nonzero(shown)
-    hidden = _hidden_in_right(surface, between.places, rough.corner, xy, local, row, col, disparity)
-    shown[row, col] = ~hidden
-    slope, height = np.zeros((2, *shape)), np.full(shape, np.nan)
-    spare, rise, classes = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.uint8)
-    flat = np.zeros(len(corner))
-    at_pixels(
-        xy, tops.h_q, tops.surface_class, tops.count, corner, flat, flat, index, first, slope,
-        spare, height, rise, classes,
-    )  # fmt: skip
-    parts = (
-        np.full(shape, OWN),
-        MISFIT * np.append(rough.misfit[rough.gentle], np.nan)[index],
-        RISE * np.append(rough.rise[rough.gentle], np.nan)[index],
-        HIGHER * _higher(all_around, 1),
-    )
-    variance = sum(part**2 for part in parts) * scale.distance_px ** (2.0 * GROWTH)
-    shown &= classes != WATER_CLASS
-    return Crowns(shown, disparity, slope, variance, height * LATTICE_M, classes)
+        labelled = is_open & (disparity > before - OCCLUSION_TOLERANCE_PX)
+        labelled &= ~(np.abs(disparity - visible.disparity) <= FACET_RESIDUAL_PX)
+        labelled &= _higher(all_around, HIGHER_REACH) <= HIGHER_PX
+    spacing_rows = int(np.ceil(scale.spacing_px))
+    labelled &= _clearance(disparity, all_around, spacing_rows) >= CLEARANCE_PX
+    labelled &= ~_hidden_in_right(visible, rough, xy, labelled, disparity)
+
+    values = PixelValues.none(shape)
+    none = np.zeros(len(corner))
+    facets = FacetValues(xy, corner, tops.h_q, tops.surface_class, tops.count, none, none)
+    interpolate(facets, index, first, values)
+    variance = _variance(rough, index, all_around, scale)
+    labelled &= values.surface_class != WATER_CLASS
+    labels = Labels(disparity, values.slope, variance)
+    return Crowns(labelled, labels, values.height * LATTICE_M, values.surface_class, tops_buffer)
 
 
-def _known(surface: GroundSurface) -> slice:
-    """The steps between two known surfaces."""
-    return slice(surface.rough, len(surface.steps))
+def without_contours(
+    labels: WindowLabels, crowns: Crowns, visible: VisibleSurface, scale: PixelScale
+) -> WindowLabels:
+    """Labels of facets, without those that the contour of a crown may hide from the right camera.
+
+    A contour lies beyond the crown's last points, by about a spacing. So a pixel beside one that is
+    hidden, or may be, is uncertain itself where a crown comes nearer than the diagonal of a
+    spacing in the right image.
+    """
+    hidden = np.isin(visible.visibility, (PRISM_IN_RIGHT, FACET_IN_RIGHT))
+    beside = np.zeros_like(hidden)
+    beside[:, :-1] = hidden[:, 1:]
+    reach = int(scale.spacing_px)
+    if reach:
+        beside |= box_max(hidden, reach)
+    uncertain = _clearance(labels.labels.disparity, crowns.tops, 1) < np.sqrt(2) * scale.spacing_px
+    status = labels.status.copy()
+    status[is_labelled(status) & beside & uncertain] = Status.EDGE_IN_PIXEL
+    return replace(labels, status=status)
 
 
 def _hidden_in_right(
-    surface: GroundSurface, smooth: Places, corner: Steps, xy: Floats, local: LocalProjection,
-    row: Ints, col: Ints, disparity: Floats,
-) -> Bools:  # fmt: skip
-    """Which pixels [n] a smooth triangle, one of the tops ``corner`` at ``xy``, or a step between
-    known surfaces hides from the right camera."""
-    out = np.zeros(row.size, np.bool_)
+    visible: VisibleSurface, rough: RoughTops, xy: Floats, labelled: Bools, disparity: Floats
+) -> Bools:
+    """Which pixels ``labelled`` [h, w] a facet, a triangle of the tops at ``xy``, or a strip
+    between known surfaces hides from the right camera."""
+    out = np.zeros(labelled.shape, np.bool_)
+    row, col = np.nonzero(labelled)
     if row.size == 0:
         return out
-    order, where = by_right_column(row, col, disparity[row, col], smooth.first)
-    hidden = smooth.hidden(where) | steps_in_right(surface, local, _known(surface), where)
-    out[order] = hidden | Places(xy, corner, smooth.first).hidden(where)
+    projected = visible.projected
+    order, pixels = right_pixels(row, col, disparity[row, col], projected.first)
+    hidden = projected.hidden_by_facets(pixels)
+    hidden |= projected.hidden_by_prisms(projected.surface.strips, pixels)
+    hidden |= hidden_by(xy, rough.corner, pixels)
+    out[row[order], col[order]] = hidden
     return out
+
+
+def _variance(
+    rough: RoughTops, index: NDArray[np.int32], all_around: Floats, scale: PixelScale
+) -> Floats:
+    """Variance px² [h, w] of what the triangle ``index`` of tops shows (eq. 12 of
+    docs/explanation/surface.md)."""
+    step_px = scale.px_per_m * LATTICE_M
+    parts = (
+        np.full(index.shape, OWN),
+        RESIDUAL * np.append((rough.residual * step_px)[rough.is_gentle], np.nan)[index],
+        RISE * np.append((rough.rise * step_px)[rough.is_gentle], np.nan)[index],
+        HIGHER * _higher(all_around, 1),
+    )
+    return sum(part**2 for part in parts) * scale.spacing_px ** (2.0 * GROWTH)
+
+
+def with_crowns(
+    labels: WindowLabels, crowns: Crowns, window: PairWindow, comparison: Comparison
+) -> WindowLabels:
+    """Labels with those of rough surfaces, as far as both images agree with these.
+
+    Labels of other statuses stay as they are.
+    """
+    row, col = np.nonzero(crowns.visible & (labels.status == Status.EDGE_IN_PIXEL))
+    inside, _ = window.usable(row, col, crowns.labels.disparity[row, col])
+    new = np.zeros(labels.status.shape, np.bool_)
+    new[row[inside], col[inside]] = True
+    status, correlation = labels.status.copy(), labels.correlation
+    merged = Labels(
+        np.where(new, crowns.labels.disparity, labels.labels.disparity),
+        np.where(new, crowns.labels.slope, labels.labels.slope),
+        np.where(new, crowns.labels.variance, labels.labels.variance),
+    )
+    if inside.any():
+        agreement = window_agreement(merged, window, comparison)
+        correlation = np.where(new, agreement.correlation, correlation)
+        changed = new & agreement.outvoted()
+        status[changed] = Status.CHANGED
+        new &= ~changed
+    status[new] = Status.LABELLED_CROWN
+    return replace(
+        labels,
+        status=status,
+        labels=merged,
+        height=np.where(new, crowns.height, labels.height),
+        surface_class=np.where(new, crowns.surface_class, labels.surface_class),
+        correlation=correlation,
+    )

@@ -1,4 +1,4 @@
-"""Do the images agree with the labels? What a pixel's own surface says, not a square window.
+"""Do the images agree with the labels? Correlation over a pixel's own surface, not a square window.
 
 The paper's filter (:mod:`stereotruth.disparity.paper_correlation`) compares square windows around
 each point. Where heights step, such a window mixes surfaces and fails although the label is right.
@@ -22,22 +22,34 @@ depend on blocks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
-from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
+from ..epipolar.surface_correlation import (
+    BLOCK,
+    columns_inside,
+    surface_correlation,
+    surface_of_row,
+    tolerance_px,
+)
 from ..epipolar.warping import warp_rows
 from ..kernels import kernel
+from ..numerics.summed_area import window_sums
 from .image_patches import Patch
+from .pair_window import PairWindow, WindowLabels
+from .pixel_labels import Labels
+from .status import WATER_CLASS, Status, is_labelled
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 
+DENSE = 2.0  # points in a pixel, that miss nothing of a pixel's size
 VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
 NEARBY_PX = 8  # for what is small, pixels up to here vote,
@@ -116,7 +128,7 @@ def surface_mean(
 ) -> Singles:
     """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
 
-    ``disparity`` (px) and its ``slope`` [2, h, w] tell what belongs to a surface. Pixels up to
+    ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
     ``reach`` px off count, one of so many (``every``) along each axis, if they have a value.
     """
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
@@ -139,15 +151,15 @@ class Agreement:
     """How well left and right image agree over each pixel's surface; arrays of a window.
 
     ``correlation`` [h, w]: their coefficient around each pixel, NaN for none; ``disparity`` (px)
-    [h, w] and its ``slope`` [2, h, w] tell what belongs to a surface. With less than ``threshold``
-    a pixel fails. ``trust`` (0 to 1): how far the points miss nothing.
+    [h, w] and its ``slope`` [2, h, w] decide what belongs to a surface. With less than
+    ``threshold`` a pixel fails. ``weight`` in [0, 1] that no object fits between the points.
     """
 
     correlation: NDArray[np.floating]
     disparity: NDArray[np.floating]
     slope: NDArray[np.floating]
     threshold: float
-    trust: float = 1.0
+    weight: float = 1.0
 
     def outvoted(self) -> Bools:
         """Pixels [h, w] around which most of their surface fails."""
@@ -160,9 +172,9 @@ class Agreement:
         them, by the ``correlation`` [h, w] there.
 
         That is the threshold, or more: the share USUAL of the mean up to VOTE_PX off, since noise
-        lowers both. With less trust more is asked for.
+        lowers both. With less weight the limit is higher.
         """
-        usual = 1.0 - (1.0 - USUAL) * self.trust
+        usual = 1.0 - (1.0 - USUAL) * self.weight
         mean = surface_mean(correlation, self.disparity, self.slope)
         return np.fmax(usual * mean, self.threshold)
 
@@ -170,11 +182,11 @@ class Agreement:
         """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
 
         Small things are found that :meth:`outvoted` lets their surroundings outvote. With less
-        trust fewer failures are enough.
+        weight fewer failures are enough.
         """
         least = self._usual(self.correlation)
         against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
-        share = NEARBY_SHARE * float(np.sqrt(self.trust))
+        share = NEARBY_SHARE * float(np.sqrt(self.weight))
         return surface_mean(against, self.disparity, self.slope, NEARBY_PX, 1) > share
 
     def beside(self, changed: Bools) -> Bools:
@@ -186,9 +198,47 @@ class Agreement:
         """
         if not changed.any():
             return changed.copy()
-        size = 2 * NEARBY_PX + 1
-        sums = np.pad(changed.astype(np.int32), ((NEARBY_PX + 1, NEARBY_PX),) * 2)
-        sums = sums.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-        near = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
+        near = window_sums(np.pad(changed, NEARBY_PX), 2 * NEARBY_PX + 1)
         unchanged = np.where(changed, np.nan, self.correlation)
         return (near > 0) & (self.correlation < self._usual(unchanged))
+
+
+class Comparison(NamedTuple):
+    """How both images are compared: side of the ``window_px``, ``threshold`` of the correlation,
+    mean number of ``points_per_px``, ``weight`` in [0, 1] that no object fits between the
+    points."""
+
+    window_px: int
+    threshold: float
+    points_per_px: float
+    weight: float
+
+
+def window_agreement(labels: Labels, window: PairWindow, comparison: Comparison) -> Agreement:
+    """Of both images of a window, over the surfaces of its ``labels``."""
+    rows, cols = labels.disparity.shape
+    warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
+    top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
+    left = window.left.pixels[top : top + rows, side : side + cols]
+    surface = labels.disparity, labels.slope
+    clear = apart_from_steps(labels.disparity)
+    correlation = surface_correlation(left, warped, *surface, comparison.window_px, clear)
+    return Agreement(correlation, *surface, comparison.threshold, comparison.weight)
+
+
+def without_changes(
+    labels: WindowLabels, window: PairWindow, comparison: Comparison
+) -> WindowLabels:
+    """Labels without those that the images contradict, and without water; with the correlation of
+    the images over each pixel's surface."""
+    agreement = window_agreement(labels.labels, window, comparison)
+    status = labels.status.copy()
+    changed = agreement.outvoted()
+    rim = agreement.beside(changed)
+    if comparison.points_per_px < DENSE:
+        # Points far apart miss what is small: the pixels of one window vote once more.
+        changed |= is_labelled(status) & agreement.outvoted_nearby()
+    changed |= is_labelled(status) & rim
+    changed |= is_labelled(status) & (labels.surface_class == WATER_CLASS)
+    status[changed] = Status.CHANGED
+    return replace(labels, status=status, correlation=agreement.correlation)

@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..numerics.summed_area import window_sums
+
 USABLE, MASKED = 1, 2  # bits
 
 
@@ -78,10 +80,6 @@ def read_patch(image: Array2D, rows: slice, cols: slice, window: int) -> Patch:
     return Patch(pixels, usable, row, col)
 
 
-def _touched(chosen: NDArray[np.bool_], half: int) -> NDArray[np.int32]:
+def _touched(chosen: NDArray[np.bool_], half: int) -> NDArray[np.int64]:
     """How many pixels are ``chosen`` in [-half, half + 1]² around every pixel that has them."""
-    sums = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), dtype=np.int32)
-    np.cumsum(chosen, axis=0, dtype=np.int32, out=sums[1:, 1:])
-    np.cumsum(sums, axis=1, out=sums)
-    n = 2 * half + 2
-    return sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]
+    return window_sums(chosen, 2 * half + 2)

@@ -1,12 +1,43 @@
-"""The arrays of a disparity store and what their attributes say."""
+"""The arrays of a disparity store: what their attributes say, and their values."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..products.grids import Layer
+from .pair_window import PairWindow, WindowLabels
+from .right_view import Pair
 from .settings import Settings
-from .status import Status
+from .status import Status, is_labelled
+
+GREATEST_COUNT = 65535  # of points of a pixel that is stored
+
+
+def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str, NDArray]:
+    """The layers of a window, without its margin, from its ``labels`` there.
+
+    The variance of the alignment joins that of the labels (eq. 13 of docs/explanation/surface.md).
+    """
+    y, x = (
+        np.arange(grid.start + window.margin, grid.stop - window.margin, dtype=np.float64)
+        for grid in (window.rows, window.cols)
+    )
+    variance = labels.labels.variance + pair.alignment_variance(x, y, labels.labels.slope)
+    values = {
+        "disparity": labels.labels.disparity,
+        "height": labels.height,
+        "correlation": labels.correlation,
+        "uncertainty": np.sqrt(variance),
+    }
+    known = is_labelled(labels.status)
+    layers = {name: np.where(known, v, np.nan).astype(np.float32) for name, v in values.items()}
+    kept = known | (labels.status == Status.BELOW_MINIMUM_COUNT)
+    count = np.where(kept, np.minimum(labels.point_count, GREATEST_COUNT), 0)
+    layers["point_count"] = count.astype(np.uint16)
+    layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
+    layers["status"] = labels.status
+    return layers
 
 
 def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Layer]:
@@ -14,126 +45,118 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
 
     ``masked``: whether a mask hides something of an image.
     """
-    statuses = [*settings.statuses, *([Status.MASKED] if masked else [])]
-    other = {"left": "right", "right": "left"}[view]
-    match = {"left": "x - disparity", "right": "x + disparity"}[view]
-    condensed = "disparity of the point at mean longitude and latitude, greatest height"
+    on_surface = settings.on_surface
     used = "points whose image windows correlate"
-    compared = "mean correlation coefficient of the image windows at the points used"
-    between, lonely, rough = {}, {}, {}
-    if settings.on_surface:
-        condensed = (
+    if on_surface:
+        used = "points on the surface that the pixel's centre sees"
+    height = {
+        "units": "m",
+        "long_name": "greatest height above the WGS 84 ellipsoid of the points used",
+        "nodata": "NaN",
+    }
+    count = {
+        "units": "1",
+        "long_name": f"number of points used: {used}",
+        "comment": f"counts above {GREATEST_COUNT} are stored as {GREATEST_COUNT}",
+    }
+    surface_class = {
+        "units": "1",
+        "long_name": "LAS class (ASPRS) of the highest point used",
+        "comment": "0: never classified, or no label",
+    }
+    return {
+        "disparity": Layer("float32", np.nan, _disparity(on_surface, view)),
+        "status": Layer("uint8", 0, _status(settings, view, masked)),
+        "height": Layer("float32", np.nan, height),
+        "point_count": Layer("uint16", 0, count),
+        "correlation": Layer("float32", np.nan, _correlation(settings, view)),
+        "uncertainty": Layer("float32", np.nan, _uncertainty(on_surface)),
+        "surface_class": Layer("uint8", 0, surface_class),
+    }
+
+
+def _other(view: str) -> str:
+    return {"left": "right", "right": "left"}[view]
+
+
+def _disparity(on_surface: bool, view: str) -> dict[str, str]:
+    """Attributes of the layer disparity."""
+    match = {"left": "x - disparity", "right": "x + disparity"}[view]
+    attributes = {
+        "units": "px",
+        "long_name": f"ground-truth disparity x_left - x_right of the {view} view",
+        "nodata": "NaN",
+        "match": f"what the {view} image shows at (x, y), the {_other(view)} one shows at "
+        f"({match}, y)",
+        "representative": "disparity of the point at mean longitude and latitude, greatest height",
+    }
+    if on_surface:
+        attributes["representative"] = (
             "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
             "of its neighbours on the same surface"
         )
-        used = "points on the surface that the pixel's centre sees"
-        compared = (
-            f"correlation coefficient of {view} and warped {other} image over the pixels of "
-            f"the same surface in {settings.window} x {settings.window} px"
-        )
-        between = {
-            "between": "where the status is labelled_between, or a point is less sure than those "
-            "around it: linear in the triangle of points that the pixel's centre sees; where it is "
+        attributes["between"] = (
+            "where the status is labelled_between, or a point is less sure than those around it: "
+            "linear in the facet of points that the pixel's centre sees; where it is "
             "labelled_crown: linear in the triangle of the tops of a rough surface"
-        }
-        lonely = {
+        )
+    return attributes
+
+
+def _status(settings: Settings, view: str, masked: bool) -> dict[str, object]:
+    """Attributes of the layer status."""
+    other = _other(view)
+    statuses = [*settings.statuses, *([Status.MASKED] if masked else [])]
+    attributes = {
+        "units": "1",
+        "long_name": "why a pixel has a label or none",
+        "flag_values": [int(status) for status in statuses],
+        "flag_meanings": " ".join(status.name.lower() for status in statuses),
+        f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre sees",
+        "changed": "LiDAR and images show different surfaces there, or water",
+        "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other surfaces",
+        "precedence": f"frame, {view} view, correlation of points; {other} view, edge, change, "
+        "number of points of pixels",
+    }
+    if settings.on_surface:
+        attributes |= {
             "labelled_crown": "a rough surface that both views must show; its uncertainty follows "
             "from the roughness of its points",
-            "edge_in_pixel": "no smooth triangle of points, or a step between points may be "
-            "nearer to one of the cameras",
+            "edge_in_pixel": "no facet of points, or a height step between points may be nearer to "
+            "one of the cameras",
         }
-        rough = {
-            "labelled_crown": "v / n + p is what the roughness of the tops of the surface leaves "
-            "between them"
-        }
-    hidden = {}
     if masked:
-        hidden = {
-            "masked": f"a mask hides the pixel, or what the {other} image shows of it; or a mask "
-            "reaches into the windows that are compared around it"
-        }
-    return {
-        "disparity": Layer(
-            "float32",
-            np.nan,
-            {
-                "units": "px",
-                "long_name": f"ground-truth disparity x_left - x_right of the {view} view",
-                "nodata": "NaN",
-                "match": f"what the {view} image shows at (x, y), the {other} one shows at "
-                f"({match}, y)",
-                "representative": condensed,
-            }
-            | between,
-        ),
-        "status": Layer(
-            "uint8",
-            0,
-            {
-                "units": "1",
-                "long_name": "why a pixel has a label or none",
-                "flag_values": [int(status) for status in statuses],
-                "flag_meanings": " ".join(status.name.lower() for status in statuses),
-                f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre "
-                "sees",
-                "changed": "LiDAR and images show different surfaces there, or water",
-                "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other "
-                "surfaces",
-                "precedence": f"frame, {view} view, correlation of points; {other} view, edge, "
-                "change, number of points of pixels",
-            }
-            | lonely
-            | hidden,
-        ),
-        "height": Layer(
-            "float32",
-            np.nan,
-            {
-                "units": "m",
-                "long_name": "greatest height above the WGS 84 ellipsoid of the points used",
-                "nodata": "NaN",
-            },
-        ),
-        "point_count": Layer(
-            "uint16",
-            0,
-            {
-                "units": "1",
-                "long_name": f"number of points used: {used}",
-                "comment": "counts above 65535 are stored as 65535",
-            },
-        ),
-        "correlation": Layer(
-            "float32",
-            np.nan,
-            {
-                "units": "1",
-                "long_name": compared,
-                "nodata": "NaN",
-            },
-        ),
-        "uncertainty": Layer(
-            "float32",
-            np.nan,
-            {
-                "units": "px",
-                "long_name": "standard uncertainty of the disparity",
-                "nodata": "NaN",
-                "formula": "sqrt(v / n + p + var(ed - gx ex - gy ey)): v variance of the points' "
-                "disparities about their surface, pooled over 3 x 3 pixels; n point_count; p "
-                "variance of the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey)"
-                " errors of a ground point's disparity and place by the alignment, whose "
-                "covariance is that of alignment.json",
-            }
-            | rough,
-        ),
-        "surface_class": Layer(
-            "uint8",
-            0,
-            {
-                "units": "1",
-                "long_name": "LAS class (ASPRS) of the highest point used",
-                "comment": "0: never classified, or no label",
-            },
-        ),
+        attributes["masked"] = (
+            f"a mask hides the pixel, or what the {other} image shows of it; or a mask reaches "
+            "into the windows that are compared around it"
+        )
+    return attributes
+
+
+def _correlation(settings: Settings, view: str) -> dict[str, str]:
+    """Attributes of the layer correlation."""
+    compared = "mean correlation coefficient of the image windows at the points used"
+    if settings.on_surface:
+        compared = (
+            f"correlation coefficient of {view} and warped {_other(view)} image over the pixels of "
+            f"the same surface in {settings.window} x {settings.window} px"
+        )
+    return {"units": "1", "long_name": compared, "nodata": "NaN"}
+
+
+def _uncertainty(on_surface: bool) -> dict[str, str]:
+    """Attributes of the layer uncertainty."""
+    attributes = {
+        "units": "px",
+        "long_name": "standard uncertainty of the disparity",
+        "nodata": "NaN",
+        "formula": "sqrt(v / n + p + var(ed - gx ex - gy ey)): v variance of the points' "
+        "disparities about their surface, pooled over 3 x 3 pixels; n point_count; p variance of "
+        "the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey) errors of a ground "
+        "point's disparity and place by the alignment, whose covariance is that of alignment.json",
     }
+    if on_surface:
+        attributes["labelled_crown"] = (
+            "v / n + p is what the roughness of the tops of the surface leaves between them"
+        )
+    return attributes

@@ -3,8 +3,8 @@
 RPCs and epipolar splines are smooth: over 105 m (117 m along a meridian) a cubic polynomial of
 longitude, latitude and height is off by 1e-6 px at most (on six scenes), and
 takes a tenth of the time. Cubes are those of the global lattice and a polynomial depends on nothing
-but the model, so that a point has the same place in whatever window it is worked on. Where a
-polynomial is off by more than TOLERANCE_PX, the model itself is taken.
+but the model, so that a point has the same position in whatever window it is worked on. Where a
+polynomial is off by more than POLYNOMIAL_ERROR_PX, the model itself is taken.
 
 The polynomial is the least-squares fit to the model on 4 x 4 x 4 nodes (at 1/8, 3/8, 5/8 and 7/8 of
 each side), by the Gram polynomials of four equidistant nodes (Abramowitz & Stegun 22.17), which are
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-TOLERANCE_PX = 1e-5  # at the corners and the middle of a cube
+POLYNOMIAL_ERROR_PX = 1e-5  # at the corners and the middle of a cube
 _PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
 _SCALE = 8.0 / (1 << CELL_BITS)  # nodes lie at -3, -1, 1 and 3
 # Gram polynomials: their values at the nodes, the sums of their squares, their coefficients.
@@ -42,7 +42,7 @@ _NODES = np.stack(np.meshgrid(*[[-3.0, -1.0, 1.0, 3.0]] * 3, indexing="ij"), -1)
 _CHECKS = np.vstack(
     [np.stack(np.meshgrid(*[[-4.0, 4.0]] * 3, indexing="ij"), -1).reshape(-1, 3), np.zeros((1, 3))]
 )
-_BLOCK = 512  # points that are worked on at once; see _at_points
+_RUN = 512  # points that are worked on at once; see _at_points
 
 
 @inner
@@ -67,7 +67,7 @@ def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
 def _fit(
     values: Floats,
     checks: Floats,
-    places: Floats,
+    positions: Floats,
     gram: Floats,
     norm: Floats,
     powers: Floats,
@@ -76,8 +76,8 @@ def _fit(
     out: Floats,
     good: NDArray[np.bool_],
 ) -> None:
-    """``values`` [4, cubes, 64] at nodes, ``checks`` [4, cubes, 9] at ``places``; ``out`` [cubes,
-    80]."""
+    """``values`` [4, cubes, 64] at nodes, ``checks`` [4, cubes, 9] at ``positions``; ``out``
+    [cubes, 80]."""
     row = np.empty((4, 4, 4))
     for cube in range(out.shape[0]):
         good[cube] = True
@@ -101,9 +101,11 @@ def _fit(
             for t in range(len(terms)):
                 p, q, r = terms[t]
                 out[cube, 20 * axis + t] = row[p, q, r]
-            for k in range(len(places)):
-                found = _cubic(out[cube], 20 * axis, places[k, 0], places[k, 1], places[k, 2])
-                if not abs(found - checks[axis, cube, k]) <= tolerance:  # also for NaN
+            for k in range(len(positions)):
+                value = _cubic(
+                    out[cube], 20 * axis, positions[k, 0], positions[k, 1], positions[k, 2]
+                )
+                if not abs(value - checks[axis, cube, k]) <= tolerance:  # also for NaN
                     good[cube] = False
 
 
@@ -124,15 +126,15 @@ def _at_points(
     """
     bad = 0
     mask = (1 << CELL_BITS) - 1
-    place = np.empty(3 * _BLOCK)
-    found = np.empty(4 * _BLOCK)
+    position = np.empty(3 * _RUN)
+    values = np.empty(4 * _RUN)
     c = np.empty(80)
     n = lon_q.size
     start = 0
     while start < n:
         i, j, k = lon_q[start] >> CELL_BITS, lat_q[start] >> CELL_BITS, h_q[start] >> CELL_BITS
         end = start + 1
-        last = min(n, start + _BLOCK)
+        last = min(n, start + _RUN)
         while (
             end < last
             and lon_q[end] >> CELL_BITS == i
@@ -147,17 +149,17 @@ def _at_points(
             c[m] = coefficients[cube, m]
         size = end - start
         for m in range(size):
-            place[m] = (lon_q[start + m] & mask) * _SCALE - 4.0
-            place[_BLOCK + m] = (lat_q[start + m] & mask) * _SCALE - 4.0
-            place[2 * _BLOCK + m] = (h_q[start + m] & mask) * _SCALE - 4.0
+            position[m] = (lon_q[start + m] & mask) * _SCALE - 4.0
+            position[_RUN + m] = (lat_q[start + m] & mask) * _SCALE - 4.0
+            position[2 * _RUN + m] = (h_q[start + m] & mask) * _SCALE - 4.0
         for m in range(size):
-            x, y, z = place[m], place[_BLOCK + m], place[2 * _BLOCK + m]
-            found[m] = _cubic(c, 0, x, y, z)
-            found[_BLOCK + m] = _cubic(c, 20, x, y, z)
-            found[2 * _BLOCK + m] = _cubic(c, 40, x, y, z)
-            found[3 * _BLOCK + m] = _cubic(c, 60, x, y, z)
+            x, y, z = position[m], position[_RUN + m], position[2 * _RUN + m]
+            values[m] = _cubic(c, 0, x, y, z)
+            values[_RUN + m] = _cubic(c, 20, x, y, z)
+            values[2 * _RUN + m] = _cubic(c, 40, x, y, z)
+            values[3 * _RUN + m] = _cubic(c, 60, x, y, z)
         for axis in range(4):
-            out[axis, start:end] = found[axis * _BLOCK : axis * _BLOCK + size]
+            out[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
         start = end
     return bad
 
@@ -179,11 +181,11 @@ def _at_means(
             out[:, p] = np.nan
             continue
         cube = 0
-        place = (0.0, 0.0, 0.0)
+        position = (0.0, 0.0, 0.0)
         side = n << CELL_BITS
         i, j, k = sums[p, 1] // side, sums[p, 2] // side, sums[p, 3] // side
         # Integers as far as they go: what is divided is the same wherever windows begin.
-        place = (
+        position = (
             (sums[p, 1] - i * side) / n * _SCALE - 4.0,
             (sums[p, 2] - j * side) / n * _SCALE - 4.0,
             (sums[p, 3] - k * side) / n * _SCALE - 4.0,
@@ -192,7 +194,9 @@ def _at_means(
         if not good[cube]:
             bad += 1
         for axis in range(4):
-            out[axis, p] = _cubic(coefficients[cube], 20 * axis, place[0], place[1], place[2])
+            out[axis, p] = _cubic(
+                coefficients[cube], 20 * axis, position[0], position[1], position[2]
+            )
     return bad
 
 
@@ -218,10 +222,10 @@ class LocalProjection:
         corner = np.indices(shape).reshape(3, -1, 1) + first[:, None, None]
         steps = np.array([LATTICE_DEG, LATTICE_DEG, LATTICE_M])[:, None, None] * (1 << CELL_BITS)
 
-        def at(places: Floats) -> Floats:
-            ground = (corner + (places.T[:, None] + 4.0) / 8.0) * steps
+        def at(positions: Floats) -> Floats:
+            ground = (corner + (positions.T[:, None] + 4.0) / 8.0) * steps
             values = model.ground_to_epipolar(*(g.reshape(-1) for g in ground))
-            return values.reshape(4, corner.shape[1], len(places))
+            return values.reshape(4, corner.shape[1], len(positions))
 
         coefficients = np.empty((corner.shape[1], 80))
         good = np.empty(corner.shape[1], dtype=np.bool_)
@@ -233,7 +237,7 @@ class LocalProjection:
             _NORM,
             _POWERS,
             _TERMS,
-            TOLERANCE_PX,
+            POLYNOMIAL_ERROR_PX,
             coefficients,
             good,
         )

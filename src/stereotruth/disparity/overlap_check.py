@@ -22,7 +22,7 @@ FAR = 0.5  # degrees; no survey lies that far from the images that it was ordere
 
 
 def refuse_apart(lidar: Box, images: Box, heights: tuple[float, float], file: Path) -> None:
-    """InputError that tells points elsewhere from points in a wrong coordinate system."""
+    """InputError: points lie elsewhere, or are in a wrong coordinate system."""
     facts = (
         f"the LiDAR covers {_in_words(lidar)} (heights {heights[0]:.1f} to {heights[1]:.1f} m), "
         f"the images {_in_words(images)}"

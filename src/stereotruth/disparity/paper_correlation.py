@@ -18,6 +18,8 @@ in float64, whatever the order. No shortcut is taken: the coefficient is that of
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +39,47 @@ _BLOCK = 256  # windows that are summed at once,
 _WIDE = 1032  # the pixels under them; limits the window to 777 px
 # A variance below this share of the mean square is what rounding leaves of a constant window.
 CONSTANT = 1e-13
+
+
+class _Task(NamedTuple):
+    """Points of a window by pixel (see :class:`.pixel_points.PixelPoints`), those to ``use``, and
+    both images' patches with the pixel at the origin of each; side of the ``window``, px."""
+
+    points: Records
+    start: Ints
+    use: NDArray[np.bool_]
+    shape: tuple[int, int]
+    first: tuple[int, int]
+    left: Singles
+    right: Singles
+    left_origin: tuple[int, int]
+    right_origin: tuple[int, int]
+    window: int
+
+
+class _Tables(NamedTuple):
+    """Sums over the windows along a part of a row.
+
+    ``slot_of`` [shifts, 3]: number of the ``products`` of both images that have a shift of columns
+    and rows, -1 for none; ``products`` [slots, 4, _TILE + 1]; ``own`` [3, 4, _TILE + 2] of the left
+    image: products, products beside, sums; ``other`` [3, 3, 4, columns]: the same of the right one,
+    for three rows; ``work`` [4 * _WIDE].
+    """
+
+    slot_of: Ints
+    products: Floats
+    own: Floats
+    other: Floats
+    work: Floats
+
+
+class _Part(NamedTuple):
+    """A part of a row of windows: that of pixel row ``r`` from column ``x0`` on, ``width``
+    windows."""
+
+    r: int
+    x0: int
+    width: int
 
 
 @inner
@@ -146,149 +189,182 @@ def _moments(
     return total, gy * gy * one + fy * fy * two + 2.0 * gy * fy * mixed
 
 
-@kernel
-def _correlate(
-    points: Records,
-    start: Ints,
-    shape: tuple[int, int],
-    first: tuple[int, int],
-    use: NDArray[np.bool_],
-    left: Singles,
-    right: Singles,
-    left_origin: tuple[int, int],
-    right_origin: tuple[int, int],
-    right_width: int,
-    window: int,
-    out: NDArray[np.float32],
+@inner
+def _steps(point: Records, x: int) -> tuple[int, int, int, int]:
+    """Position of a point of pixel column ``x`` in steps: column and row from the one above in the
+    left image, then in the right one."""
+    u = (x << BITS) + point.u
+    v = np.int64(point.v) & _MASK
+    return u, v, u - point.disparity, v + point.parallax
+
+
+@inner
+def _origin(task: _Task, part: _Part) -> tuple[int, int, int]:
+    """Of the first window of a part: row and column in the left patch, row in the right one."""
+    half = task.window // 2
+    row = part.r + task.first[0] - task.left_origin[0] - half
+    col = part.x0 + task.first[1] - task.left_origin[1] - half
+    return row, col, part.r + task.first[0] - task.right_origin[0] - half
+
+
+@inner
+def _mark_demand(
+    task: _Task, part: _Part, zero: int, slot_of: Ints
+) -> tuple[int, int, int, int, int, int]:
+    """Marks the shifts of the points of a part in ``slot_of``; least and greatest shift of columns,
+    column in the right image, and shift of rows. ``zero``: shift of columns that counts as 0."""
+    points, start, use, first = task.points, task.start, task.use, task.first
+    rows, cols = task.shape
+    r, x0, width = part
+    _, col, _ = _origin(task, part)
+    half = task.window // 2
+    low, high = len(slot_of), -1
+    west, east = task.right.shape[1], -1
+    up, down = 1, -1
+    for j in range(max(r, 0), min(r + 2, rows)):
+        for i in range(max(x0, 0), min(x0 + width + 1, cols)):
+            for k in range(start[j * cols + i], start[j * cols + i + 1]):
+                if not use[k] or (points[k].v < 0) != (j > r):
+                    continue
+                c = i - x0 - (1 if points[k].u < 0 else 0)
+                if c < 0 or c >= width:
+                    continue
+                _, _, u_right, v_right = _steps(points[k], first[1] + i)
+                d = (u_right >> BITS) - task.right_origin[1] - half
+                e = v_right >> BITS
+                s = d - col - c + zero
+                slot_of[s - 1, e + 1] = slot_of[s, e + 1] = slot_of[s + 1, e + 1] = 0
+                low, high = min(low, s), max(high, s)
+                west, east = min(west, d), max(east, d)
+                up, down = min(up, e), max(down, e)
+    return low, high, west, east, up, down
+
+
+@inner
+def _fill_tables(task: _Task, part: _Part, zero: int, demand: tuple, tables: _Tables) -> None:
+    """The sums that the marked shifts need; ``demand``: of :func:`_mark_demand`."""
+    left, right, window, work = task.left, task.right, task.window, tables.work
+    slot_of, products, own, other = tables.slot_of, tables.products, tables.own, tables.other
+    low, high, west, east, up, down = demand
+    width = part.width
+    row, col, row_right = _origin(task, part)
+    n = 0
+    for s in range(low - 1, high + 2):
+        for e in range(up, down + 1):
+            if slot_of[s, e + 1] < 0:
+                continue
+            slot_of[s, e + 1] = n
+            begin = col + s - zero
+            cut = max(0, -begin)
+            count = min(width + 1, right.shape[1] - window + 1 - begin) - cut
+            if count > 0:
+                q, a, b = row_right + e, col + cut, begin + cut
+                _products(left, right, row, q, a, b, count, window, work, products[n, :, cut:])
+            n += 1
+    _products(left, left, row, row, col, col, width + 1, window, work, own[0])
+    _products(left, left, row, row, col, col + 1, width, window, work, own[1])
+    _sums(left, row, col, width + 1, window, work, own[2])
+    for e in range(up, down + 1):
+        q, count = row_right + e, east - west + 2
+        mine = other[e + 1]
+        _products(right, right, q, q, west, west, count, window, work, mine[0])
+        _products(right, right, q, q, west, west + 1, count - 1, window, work, mine[1])
+        _sums(right, q, west, count, window, work, mine[2])
+
+
+@inner
+def _fill_coefficients(
+    task: _Task, part: _Part, zero: int, west: int, tables: _Tables, out: Singles
 ) -> None:
-    """``right_width``: columns of ``right`` in which windows may lie."""
-    rows, cols = shape
-    half = window // 2
-    number = float(window * window)
-    work = np.empty(4 * _WIDE)
-    zero = cols + 3  # shift of columns in the patches that counts as 0
-    shifts = zero + right_width + 3
-    slot_of = np.full((shifts, 3), -1, np.int64)
-    boxes = np.empty((shifts * 3, 4, _TILE + 1))  # only what is needed is written
-    own = np.empty((3, 4, _TILE + 2))  # of the left image: products, products beside, sums
-    other = np.empty((3, 3, 4, right_width + 2))  # the same of the right one, for three rows
+    """Correlation coefficients of the points of a part; ``west``: first column of the right image
+    in the tables."""
+    points, start, use, first = task.points, task.start, task.use, task.first
+    slot_of, products, own, other = tables.slot_of, tables.products, tables.own, tables.other
+    rows, cols = task.shape
+    r, x0, width = part
+    _, col, _ = _origin(task, part)
+    half, number = task.window // 2, float(task.window * task.window)
+    for j in range(max(r, 0), min(r + 2, rows)):
+        for i in range(max(x0, 0), min(x0 + width + 1, cols)):
+            for k in range(start[j * cols + i], start[j * cols + i + 1]):
+                if not use[k] or (points[k].v < 0) != (j > r):
+                    continue
+                c = i - x0 - (1 if points[k].u < 0 else 0)
+                if c < 0 or c >= width:
+                    continue
+                u, v, u_right, v_right = _steps(points[k], first[1] + i)
+                d = (u_right >> BITS) - task.right_origin[1] - half
+                e = v_right >> BITS
+                s = d - col - c + zero
+                fx, fy = (u & _MASK) / PX, v / PX
+                ex, ey = (u_right & _MASK) / PX, (v_right & _MASK) / PX
+                gx, gy, hx, hy = 1.0 - fx, 1.0 - fy, 1.0 - ex, 1.0 - ey
+                before = products[slot_of[s - 1, e + 1]]
+                here = products[slot_of[s, e + 1]]
+                after = products[slot_of[s + 1, e + 1]]
+                together = 0.0
+                for m in range(4):
+                    weight = (gy if m < 2 else fy) * (hy if m % 2 == 0 else ey)
+                    along = gx * hx * here[m, c] + fx * ex * here[m, c + 1]
+                    along += gx * ex * after[m, c] + fx * hx * before[m, c + 1]
+                    together += weight * along
+                a, aa = _moments(own[0], own[1], own[2], c, fx, fy)
+                mine = other[e + 1]
+                b, bb = _moments(mine[0], mine[1], mine[2], d - west, ex, ey)
+                aa, bb = number * aa, number * bb
+                vary_a, vary_b = aa - a * a, bb - b * b
+                out[k] = 0.0
+                if vary_a > CONSTANT * aa and vary_b > CONSTANT * bb:
+                    r_ab = (number * together - a * b) / np.sqrt(vary_a * vary_b)
+                    out[k] = min(max(r_ab, -1.0), 1.0)
+
+
+@kernel
+def _correlate(task: _Task, out: Singles) -> None:
+    """Correlation coefficients of all points to ``out``."""
+    rows, cols = task.shape
+    columns = task.right.shape[1]
+    zero = cols + 3
+    shifts = zero + columns + 3
+    tables = _Tables(
+        np.full((shifts, 3), -1, np.int64),
+        np.empty((shifts * 3, 4, _TILE + 1)),  # only what is needed is written
+        np.empty((3, 4, _TILE + 2)),
+        np.empty((3, 3, 4, columns + 2)),
+        np.empty(4 * _WIDE),
+    )
     for r in range(-1, rows):
-        row = r + first[0] - left_origin[0] - half
-        row_right = r + first[0] - right_origin[0] - half
         for x0 in range(-1, cols, _TILE):
-            width = min(_TILE, cols - x0)
-            col = x0 + first[1] - left_origin[1] - half
-            low, high = shifts, -1  # shifts
-            west, east = right_width, -1  # places in the right image
-            far_up, far_down = 1, -1  # rows
-            for turn in range(2):
-                # Below, what is wanted of each pair of surfaces; then, at ``turn`` 1, the points.
-                if turn == 1:
-                    if high < 0:
-                        break
-                    n = 0
-                    for s in range(low - 1, high + 2):
-                        for e in range(far_up, far_down + 1):
-                            if slot_of[s, e + 1] < 0:
-                                continue
-                            slot_of[s, e + 1] = n
-                            begin = col + s - zero
-                            cut = max(0, -begin)
-                            count = min(width + 1, right_width - window + 1 - begin) - cut
-                            if count > 0:
-                                _products(
-                                    left,
-                                    right,
-                                    row,
-                                    row_right + e,
-                                    col + cut,
-                                    begin + cut,
-                                    count,
-                                    window,
-                                    work,
-                                    boxes[n, :, cut:],
-                                )
-                            n += 1
-                    _products(left, left, row, row, col, col, width + 1, window, work, own[0])
-                    _products(left, left, row, row, col, col + 1, width, window, work, own[1])
-                    _sums(left, row, col, width + 1, window, work, own[2])
-                    for e in range(far_up, far_down + 1):
-                        q, count = row_right + e, east - west + 2
-                        mine = other[e + 1]
-                        _products(right, right, q, q, west, west, count, window, work, mine[0])
-                        _products(
-                            right, right, q, q, west, west + 1, count - 1, window, work, mine[1]
-                        )
-                        _sums(right, q, west, count, window, work, mine[2])
-                for j in range(max(r, 0), min(r + 2, rows)):
-                    for i in range(max(x0, 0), min(x0 + width + 1, cols)):
-                        for k in range(start[j * cols + i], start[j * cols + i + 1]):
-                            if not use[k] or (points[k].v < 0) != (j > r):
-                                continue
-                            c = i - x0 - (1 if points[k].u < 0 else 0)
-                            if c < 0 or c >= width:
-                                continue
-                            u = ((first[1] + i) << BITS) + points[k].u
-                            v = np.int64(points[k].v) & _MASK
-                            u_right = u - points[k].disparity
-                            v_right = v + points[k].parallax
-                            d = (u_right >> BITS) - right_origin[1] - half
-                            e = v_right >> BITS
-                            s = d - col - c + zero
-                            if turn == 0:
-                                slot_of[s - 1, e + 1] = 0
-                                slot_of[s, e + 1] = 0
-                                slot_of[s + 1, e + 1] = 0
-                                low, high = min(low, s), max(high, s)
-                                west, east = min(west, d), max(east, d)
-                                far_up, far_down = min(far_up, e), max(far_down, e)
-                                continue
-                            fx, fy = (u & _MASK) / PX, v / PX
-                            ex, ey = (u_right & _MASK) / PX, (v_right & _MASK) / PX
-                            gx, gy, hx, hy = 1.0 - fx, 1.0 - fy, 1.0 - ex, 1.0 - ey
-                            before = boxes[slot_of[s - 1, e + 1]]
-                            here = boxes[slot_of[s, e + 1]]
-                            after = boxes[slot_of[s + 1, e + 1]]
-                            together = 0.0
-                            for m in range(4):
-                                weight = (gy if m < 2 else fy) * (hy if m % 2 == 0 else ey)
-                                along = gx * hx * here[m, c] + fx * ex * here[m, c + 1]
-                                along += gx * ex * after[m, c] + fx * hx * before[m, c + 1]
-                                together += weight * along
-                            a, aa = _moments(own[0], own[1], own[2], c, fx, fy)
-                            mine = other[e + 1]
-                            b, bb = _moments(mine[0], mine[1], mine[2], d - west, ex, ey)
-                            aa, bb = number * aa, number * bb
-                            vary_a, vary_b = aa - a * a, bb - b * b
-                            out[k] = 0.0
-                            if vary_a > CONSTANT * aa and vary_b > CONSTANT * bb:
-                                r_ab = (number * together - a * b) / np.sqrt(vary_a * vary_b)
-                                out[k] = min(max(r_ab, -1.0), 1.0)
-            for s in range(low - 1, high + 2):
-                slot_of[s] = -1
+            part = _Part(r, x0, min(_TILE, cols - x0))
+            demand = _mark_demand(task, part, zero, tables.slot_of)
+            if demand[1] < 0:
+                continue
+            _fill_tables(task, part, zero, demand, tables)
+            _fill_coefficients(task, part, zero, demand[2], tables, out)
+            for s in range(demand[0] - 1, demand[1] + 2):
+                tables.slot_of[s] = -1
 
 
 def correlate(
-    window_points: PixelPoints, use: NDArray[np.bool_], left: Patch, right: Patch, window: int
+    points: PixelPoints, use: NDArray[np.bool_], left: Patch, right: Patch, window: int
 ) -> NDArray[np.float32]:
     """Correlation coefficient of the two windows of each point [n] in ``use``, else NaN.
 
-    The patches must be those by which the points were found to be in both frames, read for this
-    ``window`` (odd, px). A point's value does not depend on the others or on the patches.
+    The patches must be those by which the points are in both frames, read for this ``window`` (odd,
+    px). A point's value does not depend on the others or on the patches.
     """
     out = np.full(use.size, np.nan, dtype=np.float32)
-    _correlate(
-        window_points.points,
-        window_points.start,
-        window_points.shape,
-        window_points.first,
+    task = _Task(
+        points.points,
+        points.start,
         use,
+        points.shape,
+        points.first,
         left.pixels,
         right.pixels,
         (left.row, left.col),
         (right.row, right.col),
-        right.pixels.shape[1],
         window,
-        out,
     )
+    _correlate(task, out)
     return out

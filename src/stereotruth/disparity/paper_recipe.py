@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lidar.lattice import PER_DEG
-from .image_patches import Patch
+from .pair_window import PairWindow, WindowLabels
 from .paper_correlation import correlate
-from .pixel_labels import Labels, Pixels, condense, noise_variance
+from .pixel_labels import Labels, condense, noise_variance
 from .pixel_points import PixelPoints
 from .settings import Settings
 from .status import Status
@@ -32,26 +32,25 @@ def paper_labels(
     settings: Settings,
     model: ViewGeometry,
     points: PixelPoints,
-    left: Patch,
-    right: Patch,
+    window: PairWindow,
     px_per_m: float,
-) -> tuple[Pixels, Labels, NDArray[np.uint8]]:
-    """Pixels, labels and status [h, w] of a window from its points in both frames.
+) -> WindowLabels:
+    """Labels of a window from its points in both frames.
 
-    ``left``, ``right``: patches read for the settings' window. ``px_per_m``: disparity of a metre
-    of height.
+    ``window``: its patches are read for the settings' window. ``px_per_m``: disparity of a metre of
+    height.
     """
 
     def at_highest(sums: Ints, highest: Floats) -> Floats:
-        """Places [4, pixels] (px) of mean longitude and latitude at the greatest height."""
-        place = np.full((4, highest.size), np.nan)
+        """Positions [4, pixels] (px) of mean longitude and latitude at the greatest height."""
+        xy = np.full((4, highest.size), np.nan)
         known = np.flatnonzero(sums[:, 0])
         lon, lat = (sums[known, axis] / sums[known, 0] / PER_DEG for axis in (1, 2))
-        place[:, known] = model.ground_to_epipolar(lon, lat, highest[known])
-        return place
+        xy[:, known] = model.ground_to_epipolar(lon, lat, highest[known])
+        return xy
 
     every = np.ones(points.points.size, dtype=np.bool_)
-    correlation = correlate(points, every, left, right, settings.window)
+    correlation = correlate(points, every, window.left, window.right, settings.window)
     correlated = correlation >= settings.correlation_threshold
     pixels = condense(points, correlated, at_highest, correlation)
     labelled = pixels.count > 0
@@ -68,4 +67,11 @@ def paper_labels(
     status[points.count > 0] = Status.LOW_CORRELATION
     status[labelled] = Status.LABELLED
     status[labelled & (pixels.count < settings.min_points)] = Status.BELOW_MINIMUM_COUNT
-    return pixels, labels, status
+    return WindowLabels(
+        status=status,
+        labels=labels,
+        height=pixels.highest,
+        surface_class=pixels.surface_class,
+        point_count=pixels.count,
+        correlation=pixels.correlation,
+    )

@@ -1,12 +1,12 @@
-"""What the points of each pixel come to, and labels at the pixels' centres from it.
+"""The points of each pixel condensed to one, and labels at the pixels' centres from it.
 
-A pixel's points are condensed to one (:func:`condense`): where it lies, a recipe says. With the
+A pixel's points are condensed to one (:func:`condense`), whose position a recipe decides. With the
 recipe surface it is the mean of the points on the surface that the pixel's centre sees. The mean
 lies beside the centre; a plane through the means of the pixel and those of its neighbours on the
 same surface takes the disparity there (:func:`at_centres`). No bias by the largest of several noisy
 heights, by slopes, or by mixture where a roof's edge and the ground share a pixel.
 
-Sums are of integers, so that the order of the points leaves no trace; what is computed from
+Sums are of integers, so that the order of the points does not count; what is computed from
 neighbours takes them in a fixed order.
 """
 
@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 from ..epipolar.one_surface import SURFACE_PX
 from ..kernels import kernel
 from ..lidar.lattice import PER_M
+from ..surface.scale import HEIGHT_NOISE_M, PRIOR_NOISE_M
+from .local_projection import LocalProjection
 from .pixel_points import PX, PixelPoints
+from .seen_surface import seen_surface
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -29,21 +32,18 @@ Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 
 
-# What airborne LiDAR has at least (m): floor of the points' noise, however few and alike they are.
-HEIGHT_NOISE_M = 0.02
-FEW = 3  # degrees of freedom below which the points' own spread says nothing:
-FEW_NOISE_M = 0.05  # then this is taken
-RIDGE = 0.1  # px², keeps planes through places in a line level across it
+FEW = 3  # degrees of freedom below which the points' own spread says nothing
+RIDGE = 0.1  # px², keeps planes through positions in a line level across it
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """What the points of each pixel come to; arrays [h, w], NaN (0) where a pixel has none.
+    """The point that stands for each pixel; arrays [h, w], NaN (0) where a pixel has none.
 
     ``count`` of the points used; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the point
     that stands for the pixel; ``highest`` (m); ``correlation`` mean of the points';
     ``surface_class`` ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points,
-    about their mean, of uu, uv, vv, uz, vz, zz, with (u, v) the place in the left grid and z the
+    about their mean, of uu, uv, vv, uz, vz, zz, with (u, v) the position in the left grid and z the
     disparity, px².
     """
 
@@ -70,7 +70,8 @@ def _collect(
     mean_correlation: Floats,
     moments: Floats,
 ) -> None:
-    """Per pixel from its points in ``use``; sums of products are of steps about known places."""
+    """Per pixel from its points in ``use``; sums of products are of steps about the pixel's
+    centre."""
     square = float(PX) * PX
     for p in range(start.size - 1):
         n = lon = lat = height = 0
@@ -127,13 +128,13 @@ def _collect(
 def condense(
     window: PixelPoints,
     use: Bools,
-    place_of: Callable[[Ints, Floats], Floats],
+    position_at: Callable[[Ints, Floats], Floats],
     correlation: NDArray[np.float32] | None = None,
 ) -> Pixels:
     """The pixels of a window from its points in ``use`` [n].
 
-    ``place_of`` (sums, highest) gives the places [4, pixels] (px, of the left image, then of the
-    right one) of the point that stands for each pixel, NaN where it has none: from ``sums``
+    ``position_at`` (sums, highest) gives the positions [4, pixels] (px, of the left image, then of
+    the right one) of the point that stands for each pixel, NaN where it has none: from ``sums``
     int64[pixels, 4], number of points and sums of their longitudes, latitudes and heights (lattice
     steps), and ``highest`` (m). ``correlation`` [n] of the points or None.
     """
@@ -153,12 +154,12 @@ def condense(
         mean,
         moments,
     )
-    place = place_of(sums, highest)
+    xy = position_at(sums, highest)
     return Pixels(
         count=sums[:, 0].reshape(shape),
-        x=place[0].reshape(shape),
-        y=place[1].reshape(shape),
-        disparity=(place[0] - place[2]).reshape(shape),
+        x=xy[0].reshape(shape),
+        y=xy[1].reshape(shape),
+        disparity=(xy[0] - xy[2]).reshape(shape),
         highest=highest.reshape(shape),
         correlation=mean.reshape(shape),
         surface_class=surface_class.reshape(shape),
@@ -249,7 +250,7 @@ def at_centres(pixels: Pixels, valid: Bools, first: tuple[int, int], px_per_m: f
 
 
 @kernel
-def _rests(
+def _residual_squares(
     moments: Floats, count: Ints, valid: Bools, slope: Floats, squares: Floats, freedom: Floats
 ) -> None:
     """Sums of squares about the surface's slope, and degrees of freedom; 0 where not ``valid``."""
@@ -289,7 +290,39 @@ def _pooled(
 def noise_variance(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float) -> Floats:
     """Variance (px²) of a point's disparity about its surface, pooled over 3 x 3 pixels."""
     squares, freedom, out = (np.empty(valid.shape) for _ in range(3))
-    _rests(pixels.moments, pixels.count, valid, slope, squares, freedom)
-    floors = (FEW_NOISE_M * px_per_m) ** 2, (HEIGHT_NOISE_M * px_per_m) ** 2
+    _residual_squares(pixels.moments, pixels.count, valid, slope, squares, freedom)
+    floors = (PRIOR_NOISE_M * px_per_m) ** 2, (HEIGHT_NOISE_M * px_per_m) ** 2
     _pooled(squares, freedom, valid, *floors, out)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class OwnLabels:
+    """What each pixel's own points say, arrays [h, w]: ``labels`` at the centres, and ``pixels``
+    that they follow from; ``on_edge``: an edge passes within the margin of the centre;
+    ``in_frames``: number of points in both frames."""
+
+    labels: Labels
+    pixels: Pixels
+    on_edge: Bools
+    in_frames: NDArray[np.int32]
+
+
+def own_labels(
+    points: PixelPoints,
+    projection: LocalProjection,
+    px_per_m: float,
+    *,
+    edge_margin_px: float,
+    min_points: int,
+) -> OwnLabels:
+    """Labels by each pixel's points on the surface that its centre sees (recipe surface).
+
+    A pixel of fewer than ``min_points`` has none. ``px_per_m``: disparity of a metre of height.
+    """
+    use, on_edge = seen_surface(points, edge_margin_px)
+    pixels = condense(points, use, lambda sums, _: projection.at_means(sums))
+    labels = at_centres(pixels, pixels.count >= min_points, points.first, px_per_m)
+    if edge_margin_px == 0.0:
+        on_edge = np.zeros(points.shape, np.bool_)
+    return OwnLabels(labels, pixels, on_edge, points.count)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from .image_patches import MASKED, USABLE, Patch
 Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+Counts = NDArray[np.int32]
 
 
 BITS = 16
@@ -33,7 +36,7 @@ POINT = np.dtype(
         ("height", np.int32),  # lattice steps
         ("u", np.int16),  # steps from the pixel's centre, in the left image
         ("v", np.int16),
-        ("parallax", np.int16),  # y_right - y_left, steps; at most half a pixel is told
+        ("parallax", np.int16),  # y_right - y_left, steps; half a pixel at most
         ("surface_class", np.uint8),
     ],
     align=True,  # 24 bytes
@@ -64,27 +67,48 @@ class PixelPoints:
         return np.diff(self.start).astype(np.int32).reshape(self.shape)
 
 
+class _Block(NamedTuple):
+    """Points [n]: lattice coordinates, ASPRS class, ``xy`` [4, n] (px) in both images."""
+
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+    surface_class: Bytes
+    xy: Floats
+
+
+class _Frames(NamedTuple):
+    """A window of ``shape`` (rows, cols) whose first pixel is (row, col) ``first``; lattice (lon,
+    lat) ``origin`` from which points count; pixels of both patches that are ``usable``, and the
+    pixel at the ``origin`` of each patch."""
+
+    shape: tuple[int, int]
+    first: tuple[int, int]
+    origin: tuple[int, int]
+    left: Bytes
+    right: Bytes
+    left_origin: tuple[int, int]
+    right_origin: tuple[int, int]
+
+
+class _Pixels(NamedTuple):
+    """Per pixel: ``count`` [pixels + 1] of the points in both frames, from the second element on;
+    number of those ``outside``, whether a mask hides one."""
+
+    count: Counts
+    outside: Counts
+    masked: NDArray[np.bool_]
+
+
 @kernel
-def _take(
-    lon_q: Ints,
-    lat_q: Ints,
-    h_q: Ints,
-    surface_class: NDArray[np.uint8],
-    xy: Floats,
-    origin: tuple[int, int],
-    first: tuple[int, int],
-    shape: tuple[int, int],
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    left_origin: tuple[int, int],
-    right_origin: tuple[int, int],
-    points: Records,
-    pixel: NDArray[np.int32],
-    count: NDArray[np.int32],
-    outside: NDArray[np.int32],
-    masked: NDArray[np.bool_],
-) -> int:
+def _take(block: _Block, frames: _Frames, points: Records, pixel: Counts, pixels: _Pixels) -> int:
     """Fills ``points`` and ``pixel`` with those in both frames; returns how many these are."""
+    lon_q, lat_q, h_q, xy = block.lon_q, block.lat_q, block.h_q, block.xy
+    surface_class = block.surface_class
+    shape, first, origin = frames.shape, frames.first, frames.origin
+    left, right = frames.left, frames.right
+    left_origin, right_origin = frames.left_origin, frames.right_origin
+    count, outside, masked = pixels.count, pixels.outside, pixels.masked
     n = 0
     half = PX // 2
     low_x, low_y = first[1] - 1.0, first[0] - 1.0
@@ -130,10 +154,11 @@ def _take(
 
 
 @kernel
-def _scatter(points: Records, pixel: NDArray[np.int32], place: Ints, out: Records) -> None:
+def _scatter(points: Records, pixel: Counts, cursor: Ints, out: Records) -> None:
+    """Points [n] to the next free element of their ``pixel``, which ``cursor`` counts."""
     for k in range(pixel.size):
-        out[place[pixel[k]]] = points[k]
-        place[pixel[k]] += 1
+        out[cursor[pixel[k]]] = points[k]
+        cursor[pixel[k]] += 1
 
 
 @dataclass(eq=False)
@@ -150,9 +175,17 @@ class Collection:
 
     def __post_init__(self) -> None:
         size = self.shape[0] * self.shape[1]
-        self.count = np.zeros(size + 1, dtype=np.int32)
-        self.outside = np.zeros(size, dtype=np.int32)
-        self.masked = np.zeros(size, dtype=np.bool_)
+        count, outside = (np.zeros(n, dtype=np.int32) for n in (size + 1, size))
+        self.pixels = _Pixels(count, outside, np.zeros(size, dtype=np.bool_))
+        self.frames = _Frames(
+            self.shape,
+            self.first,
+            self.origin,
+            self.left.usable,
+            self.right.usable,
+            (self.left.row, self.left.col),
+            (self.right.row, self.right.col),
+        )
 
     def add(
         self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8], xy: Floats
@@ -163,25 +196,8 @@ class Collection:
             size = max(_PART, lon_q.size)
             self.parts.append((np.empty(size, dtype=POINT), np.empty(size, dtype=np.int32)))
         points, pixel = (array[self.taken :] for array in self.parts[-1])
-        self.taken += _take(
-            lon_q,
-            lat_q,
-            h_q,
-            surface_class,
-            xy,
-            self.origin,
-            self.first,
-            self.shape,
-            self.left.usable,
-            self.right.usable,
-            (self.left.row, self.left.col),
-            (self.right.row, self.right.col),
-            points,
-            pixel,
-            self.count,
-            self.outside,
-            self.masked,
-        )
+        block = _Block(lon_q, lat_q, h_q, surface_class, xy)
+        self.taken += _take(block, self.frames, points, pixel, self.pixels)
 
     def _close(self) -> None:
         if self.parts:
@@ -191,13 +207,12 @@ class Collection:
     def sorted(self) -> PixelPoints:
         """All that was taken; empties the collection."""
         self._close()
-        start = np.cumsum(self.count, dtype=np.int64)
+        start = np.cumsum(self.pixels.count, dtype=np.int64)
         points = np.empty(int(start[-1]), dtype=POINT)
-        place = start[:-1].copy()
+        cursor = start[:-1].copy()
         for part in range(len(self.parts)):
-            _scatter(*self.parts[part], place, points)
+            _scatter(*self.parts[part], cursor, points)
             self.parts[part] = None
         self.parts = []
-        return PixelPoints(
-            points, start, self.outside, self.masked, self.shape, self.first, self.origin
-        )
+        outside, masked = self.pixels.outside, self.pixels.masked
+        return PixelPoints(points, start, outside, masked, self.shape, self.first, self.origin)

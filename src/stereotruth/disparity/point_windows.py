@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 READ_POINTS = 1 << 20  # about as many are read at once
 
 
-class Reach(NamedTuple):
+class Footprint(NamedTuple):
     """Where the points of a window are: box of those that it can show, with their heights (m);
     box of those that can hide these, with the greatest height there."""
 
@@ -44,18 +44,18 @@ def corners_of_hull(x: Floats, y: Floats) -> list[int]:
     """
     order = np.lexsort((y, x)).tolist()
     xs, ys = x.tolist(), y.tolist()
-    found: list[int] = []
-    for way in (order, order[::-1]):  # the lower side, then the upper
+    corners: list[int] = []
+    for points in (order, order[::-1]):  # the lower side, then the upper
         side: list[int] = []
-        for k in way:
+        for k in points:
             while len(side) > 1:
                 i, j = side[-2:]
                 if (xs[j] - xs[i]) * (ys[k] - ys[i]) > (ys[j] - ys[i]) * (xs[k] - xs[i]):
                     break
                 side.pop()
             side.append(k)
-        found += side[:-1]
-    return found
+        corners += side[:-1]
+    return corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class PointWindows:
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
-        ground = self.outline(rows, cols, low, high)
+        ground = self.ground_outline(rows, cols, low, high)
         if ground.size == 0:
             return None
         (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
@@ -81,7 +81,7 @@ class PointWindows:
         spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
         return west - spare[0], south - spare[1], east + spare[0], north + spare[1]
 
-    def outline(self, rows: slice, cols: slice, low: float, high: float) -> Floats:
+    def ground_outline(self, rows: slice, cols: slice, low: float, high: float) -> Floats:
         """lon, lat [2, n] (degrees) along the edges of a window and its margin at two heights."""
         margin = self.settings.margin
         x = np.linspace(cols.start - margin - 1.0, cols.stop + margin, 5)
@@ -95,21 +95,21 @@ class PointWindows:
 
     def heights(self, box: Box) -> tuple[float, float] | None:
         """Lowest and highest point (m) of the stores' cells that a box touches."""
-        found = [r for r in (store.height_range(*box) for store in self.stores) if r is not None]
-        return (min(r[0] for r in found), max(r[1] for r in found)) if found else None
+        each = [r for r in (store.height_range(*box) for store in self.stores) if r is not None]
+        return (min(r[0] for r in each), max(r[1] for r in each)) if each else None
 
-    def reach(self, rows: slice, cols: slice) -> Reach | None:
+    def footprint(self, rows: slice, cols: slice) -> Footprint | None:
         """Of a window; None if there are no points."""
         low = min(store.bounds[4] for store in self.stores)
         top = high = max(store.bounds[5] for store in self.stores)
         box = None
         for _ in range(3):  # heights narrow the box, the box narrows the heights
             box = self.ground_box(rows, cols, low, high)
-            found = None if box is None else self.heights(box)
-            if found is None:
+            heights = None if box is None else self.heights(box)
+            if heights is None:
                 return None
-            low, high = found
-        moves = self.rays.reach(cols, rows)
+            low, high = heights
+        moves = self.rays.moves(cols, rows)
         spare = self.spare
         around = box
         for _ in range(3):
@@ -121,28 +121,28 @@ class PointWindows:
                 box[3] + moves[1, 1] * rise + spare[1],
             )
             top = self.heights(around)[1]
-        return Reach(box, low, high, around, top)
+        return Footprint(box, low, high, around, top)
 
     @property
     def spare(self) -> Floats:
         """Degrees (lon, lat) around the ground that a window needs: its ``halo`` of cells."""
         return (self.halo + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
 
-    def strips(self, rows: slice, cols: slice, reach: Reach) -> list[Box]:
+    def strips(self, rows: slice, cols: slice, footprint: Footprint) -> list[Box]:
         """Boxes, one for some rows of cells of the stores each, of the points a window needs.
 
         They cover the hull of what it can show and of the tracks of the rays from there. A box
         around the hull of a turned image would hold up to twice as many points.
         """
-        ground = self.outline(rows, cols, reach.low, reach.high)
-        box = reach.box
+        ground = self.ground_outline(rows, cols, footprint.low, footprint.high)
+        box = footprint.box
         if self.settings.on_surface:
-            box = reach.around
+            box = footprint.around
             corners = np.array(
                 [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]
             )
             moves = np.hstack([*(self.rays.track @ corners.T), np.zeros((2, 1))])
-            moves *= reach.top - reach.low
+            moves *= footprint.top - footprint.low
             ground = (ground[:, :, None] + moves[:, None]).reshape(2, -1)
         hull = ground[:, corners_of_hull(*ground)]
         after = np.roll(hull, -1, axis=1)
@@ -152,7 +152,7 @@ class PointWindows:
         side = LATTICE_DEG * (1 << CELL_BITS)
         first, last = (int(np.floor(edge / side)) for edge in (box[1], box[3]))
         step = max(round(READ_POINTS / max(self.expected([box]), 1.0) * (last + 1 - first)), 1)
-        found = []
+        strips = []
         for row in range(first, last + 1, step):
             # Half a step below the border, so that no point lies on it.
             south, north = (
@@ -165,8 +165,8 @@ class PointWindows:
             touched = np.ptp(ends, axis=0) > 0.0
             if touched.any():
                 west, east = lon[:, touched].min(), lon[:, touched].max()
-                found.append((west - spare[0], south, east + spare[0], north))
-        return found
+                strips.append((west - spare[0], south, east + spare[0], north))
+        return strips
 
     def expected(self, boxes: Sequence[Box]) -> float:
         """About how many points lie in boxes, if the stores are evenly filled."""
@@ -185,8 +185,8 @@ class PointWindows:
 
     def touched(self, rows: slice, cols: slice) -> list[PointStore]:
         """The stores that have points of a window, or in the same cells."""
-        reach = self.reach(rows, cols)
-        strips = [] if reach is None else self.strips(rows, cols, reach)
+        footprint = self.footprint(rows, cols)
+        strips = [] if footprint is None else self.strips(rows, cols, footprint)
         return [
             store
             for store in self.stores
@@ -195,11 +195,11 @@ class PointWindows:
 
     def parts(self, rows: slice, cols: slice, max_points: int) -> list[tuple[slice, slice]]:
         """The window cut along its longer side until no part expects more points."""
-        reach = self.reach(rows, cols)
-        if reach is None:
+        footprint = self.footprint(rows, cols)
+        if footprint is None:
             return []
         tall, broad = rows.stop - rows.start, cols.stop - cols.start
-        many = self.expected(self.strips(rows, cols, reach)) > max_points
+        many = self.expected(self.strips(rows, cols, footprint)) > max_points
         if not many or max(tall, broad) <= 128:
             return [(rows, cols)]
         if tall > broad:

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lidar.lattice import DEGREE_M, LATTICE_DEG
+from ..lidar.lattice import LATTICE_DEG
+from ..numerics.degrees import DEGREE_M
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 
 # Cells are finer than pixels, so that walls stand where they are.
-CELL_PX = 0.5
+GROUND_CELL_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class Rays:
         area = abs(
             (lon3[1] - lon3[0]) * (lat3[2] - lat3[0]) - (lon3[2] - lon3[0]) * (lat3[1] - lat3[0])
         )  # degrees²
-        side = CELL_PX * np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
+        side = GROUND_CELL_PX * np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
         cell = (max(round(side / shrink), 1), max(round(side), 1))
         return cls(track, cell, float(np.round(np.nanmedian(disparity) / rise, 9)))
 
@@ -87,7 +88,7 @@ class Rays:
         """Side of a cell on the ground, m."""
         return self.cell[1] * LATTICE_DEG * DEGREE_M
 
-    def reach(self, cols: slice, rows: slice) -> Floats:
+    def moves(self, cols: slice, rows: slice) -> Floats:
         """[2, 2] (lon, lat; lowest, highest) degrees per metre that any ray from a window moves."""
         corners = np.array(
             [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]

@@ -129,10 +129,10 @@ class MirroredPair(Pair):
 
     def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
         """See :class:`Pair`; what the mirrored pair calls left is right in the view's grid."""
-        found = {name: array[:, ::-1] for name, array in arrays.items()}
-        if "status" in found:
-            found["status"] = _exchanged(found["status"])
-        return found
+        out = {name: array[:, ::-1] for name, array in arrays.items()}
+        if "status" in out:
+            out["status"] = _exchanged(out["status"])
+        return out
 
 
 def _exchanged(status: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,17 +15,17 @@ from ..lidar.density import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
 from .image_patches import MaskedImage
+from .pixel_scale import PixelScale
 from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
 from .settings import Settings
-from .smooth_triangles import Scale
 from .status import Status
 
 
 @dataclass(frozen=True, eq=False)
 class SceneInputs:
-    """The rectified images and point stores of a scene, and how to judge and condense the points.
+    """The rectified images and point stores of a scene, and the settings of its labels.
 
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
@@ -37,6 +38,23 @@ class SceneInputs:
     settings: Settings
     view: str = "left"
     alignment: Path | None = None
+
+    @classmethod
+    def of(
+        cls,
+        left_store: str | Path,
+        right_store: str | Path,
+        point_stores: Sequence[str | Path],
+        settings: Settings,
+        view: str = "left",
+        alignment: str | Path | None = None,
+    ) -> SceneInputs:
+        """With absolute paths, since workers of a Dask cluster live in other folders, and the point
+        stores in their order by name."""
+        left, right = Path(left_store).absolute(), Path(right_store).absolute()
+        points = tuple(sorted(Path(path).absolute() for path in point_stores))
+        aligned = None if alignment is None else Path(alignment).absolute()
+        return cls(left, right, points, settings, view, aligned)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
@@ -84,9 +102,9 @@ class SceneInputs:
         return open_stores(self.point_stores)
 
     @cached_property
-    def scale(self) -> Scale:
-        """Of the triangles between the points."""
-        return Scale.of(self.points_per_m2, self.rays.cell_m)
+    def scale(self) -> PixelScale:
+        """What a pixel is on the ground and in height."""
+        return PixelScale.of(self.points_per_m2, self.rays)
 
     @cached_property
     def points_per_m2(self) -> float:
@@ -95,8 +113,8 @@ class SceneInputs:
 
     @property
     def halo(self) -> int:
-        """Cells around all that a window shows and what hides it, whose points have a say."""
-        return self.scale.halo if self.settings.on_surface else 0
+        """Cells around all that a window shows and what hides it, whose points determine labels."""
+        return self.scale.surface.halo_cells if self.settings.on_surface else 0
 
     @cached_property
     def windows(self) -> PointWindows:

@@ -1,24 +1,27 @@
 """Which surface a pixel's centre sees.
 
 Points that others, nearer to the left camera (of larger disparity), surround in the left image are
-covered; the uncovered point nearest to the centre tells the surface.
+covered; the surface is that of the uncovered point nearest to the centre.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
-from ..kernels import inner, kernel
+from ..kernels import inlined, inner, kernel
 from .pixel_points import PX, PixelPoints
 
 Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 Steps = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
 
 
-EDGE = 5  # px; see seen_surface
+OUTER_RINGS = 5  # rings of pixels that lack neighbours, see seen_surface
 # A point is covered if the higher ones around it leave no gap of more than EMPTY_OCTANTS; looked
 # for within COVER_PX, or further where points are sparse. Outside a straight edge the gap is 180°.
 COVER_PX = 1.0
@@ -29,7 +32,7 @@ _FINE = 4  # parts of a pixel along each axis
 
 _NOTHING = np.int32(-(1 << 30))  # disparity (steps) below all that occur
 _SURFACE = round(SURFACE_PX * PX)
-_PART = PX // _FINE
+_FINE_STEPS = PX // _FINE
 _UNCOVERED, _ON_SURFACE = np.uint8(1), np.uint8(2)
 
 
@@ -45,6 +48,24 @@ def _surrounded(limit: int) -> NDArray[np.bool_]:
 _SURROUNDED = _surrounded(EMPTY_OCTANTS)
 
 
+class _Window(NamedTuple):
+    """Points of a window by pixel, see :class:`.pixel_points.PixelPoints`, and ``flags`` of each:
+    _UNCOVERED, _ON_SURFACE."""
+
+    points: Records
+    start: Ints
+    shape: tuple[int, int]
+    flags: Bytes
+
+
+class _Ranges(NamedTuple):
+    """Of each pixel's uncovered points: least and greatest disparity (steps), number."""
+
+    low: Steps
+    high: Steps
+    count: Steps
+
+
 @inner
 def _octant(du: float, dv: float) -> int:
     """0 … 7 in the order of the angle: quadrant, then its first or second half."""
@@ -54,31 +75,23 @@ def _octant(du: float, dv: float) -> int:
 
 
 @inner
-def _range(
-    points: Records, start: Ints, p: int, flags: NDArray[np.uint8], low: Steps, high: Steps
-) -> int:
-    """Least and greatest disparity of a pixel's uncovered points, and how many there are."""
+def _update_range(window: _Window, p: int, ranges: _Ranges) -> None:
+    """Least and greatest disparity of a pixel's uncovered points, and their number."""
+    points, start, flags = window.points, window.start, window.flags
     least, greatest, n = -_NOTHING, _NOTHING, 0
     for k in range(start[p], start[p + 1]):
         if flags[k] & _UNCOVERED:
             least = min(least, points[k].disparity)
             greatest = max(greatest, points[k].disparity)
             n += 1
-    low[p], high[p] = least, greatest
-    return n
+    ranges.low[p], ranges.high[p], ranges.count[p] = least, greatest, n
 
 
 @kernel
-def _ranges(
-    points: Records,
-    start: Ints,
-    flags: NDArray[np.uint8],
-    low: Steps,
-    high: Steps,
-    count: NDArray[np.int32],
-) -> None:
-    for p in range(count.size):
-        count[p] = _range(points, start, p, flags, low, high)
+def _update_ranges(window: _Window, ranges: _Ranges) -> None:
+    """As :func:`_update_range`, of all pixels."""
+    for p in range(ranges.count.size):
+        _update_range(window, p, ranges)
 
 
 @inner
@@ -87,7 +100,7 @@ def _fine_tops(points: Records, start: Ints, p: int, tops: Steps) -> None:
     first = p * _FINE * _FINE
     tops[first : first + _FINE * _FINE] = _NOTHING
     for k in range(start[p], start[p + 1]):
-        i, j = (points[k].u + PX // 2) // _PART, (points[k].v + PX // 2) // _PART
+        i, j = (points[k].u + PX // 2) // _FINE_STEPS, (points[k].v + PX // 2) // _FINE_STEPS
         at = first + j * _FINE + i
         tops[at] = max(tops[at], points[k].disparity)
 
@@ -104,24 +117,16 @@ def _possible(across: int, down: int) -> int:
 
 
 @kernel
-def _uncovered(
-    points: Records,
-    start: Ints,
-    shape: tuple[int, int],
-    near: NDArray[np.int32],
-    top: Steps,
-    ceilings: Steps,
-    surrounded: NDArray[np.bool_],
-    flags: NDArray[np.uint8],
-    low: Steps,
-    high: Steps,
-    count: NDArray[np.int32],
+def _mark_covered(
+    window: _Window, near: Steps, ceilings: Steps, surrounded: NDArray[np.bool_], ranges: _Ranges
 ) -> None:
     """Takes _UNCOVERED from the points that parts of higher disparity surround.
 
-    ``near``: points in 3 x 3 pixels; ``top`` of each pixel; ``ceilings`` [k]: the greatest ``top``
-    no more than k + 1 px off. ``low``, ``high``, ``count`` (see _range) are brought up to date.
+    ``near``: points in 3 x 3 pixels; ``ceilings`` [k]: the greatest disparity no more than k px
+    off. ``ranges`` are brought up to date.
     """
+    points, start, shape, flags = window.points, window.start, window.shape, window.flags
+    low, top, ceilings = ranges.low, ceilings[0], ceilings[1:]
     tops = np.empty(top.size * _FINE * _FINE, np.int32)  # only what is needed is written
     known = np.zeros(top.size, np.bool_)
     rows, cols = shape
@@ -157,12 +162,12 @@ def _uncovered(
                     if not known[q]:
                         known[q] = True
                         _fine_tops(points, start, q, tops)
-                    du = (a - col) * PX - PX // 2 + _PART // 2 - points[k].u
-                    dv = (b - row) * PX - PX // 2 + _PART // 2 - points[k].v
+                    du = (a - col) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].u
+                    dv = (b - row) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].v
                     for part in range(_FINE * _FINE):
                         if tops[q * _FINE * _FINE + part] > limit:
-                            s = du + part % _FINE * _PART
-                            t = dv + part // _FINE * _PART
+                            s = du + part % _FINE * _FINE_STEPS
+                            t = dv + part // _FINE * _FINE_STEPS
                             if s * s + t * t <= far:
                                 octants |= 1 << _octant(s, t)
                 if surrounded[octants]:
@@ -170,17 +175,16 @@ def _uncovered(
                     covered = True
                     break
         if covered:
-            count[p] = _range(points, start, p, flags, low, high)
+            _update_range(window, p, ranges)
 
 
-@inner
-def _nearest(
-    points: Records, start: Ints, q: int, across: int, down: int, flags: NDArray[np.uint8], best
-) -> tuple[int, int]:
+@inlined
+def _nearest(window: _Window, q: int, across: int, down: int, best: tuple) -> tuple[int, int]:
     """(Squared distance to the centre, disparity) of the nearest: ``best``, or a point of pixel q.
 
     q lies ``across``, ``down`` px from the centre; of equals, the greater disparity.
     """
+    points, start, flags = window.points, window.start, window.flags
     distance, disparity = best
     for k in range(start[q], start[q + 1]):
         if flags[k] & _UNCOVERED:
@@ -193,19 +197,18 @@ def _nearest(
 
 @inner
 def _on_edge(
-    points: Records,
-    start: Ints,
-    shape: tuple[int, int],
+    window: _Window,
     p: int,
-    flags: NDArray[np.uint8],
-    distance: int,
-    disparity: int,
+    nearest: tuple[int, int],
     many: bool,
     margin: float,
     surrounded: NDArray[np.bool_],
 ) -> bool:
-    """See :func:`seen_surface`; ``distance`` (squared) and ``disparity`` by _nearest."""
-    rows, cols = shape
+    """Whether an edge passes near pixel ``p``, see :func:`seen_surface`; ``nearest``: (squared
+    distance, disparity) by :func:`_nearest`."""
+    points, start, flags = window.points, window.start, window.flags
+    rows, cols = window.shape
+    distance, disparity = nearest
     row, col = p // cols, p % cols
     other = np.inf
     octants = 0
@@ -226,25 +229,39 @@ def _on_edge(
     return np.sqrt(other) < np.sqrt(float(distance)) + 2.0 * margin * PX
 
 
+@inner
+def _enclosed(ranges: _Ranges, shape: tuple[int, int], p: int, least: int, greatest: int) -> bool:
+    """Whether four sides or corners of a pixel have nothing but disparities from ``least`` to
+    ``greatest``: they leave no gap of three octants."""
+    low, high, count = ranges.low, ranges.high, ranges.count
+    rows, cols = shape
+    row, col = p // cols, p % cols
+    sides = corners = 0
+    if 0 < row < rows - 1 and 0 < col < cols - 1:
+        for b in range(-1, 2):
+            for a in range(-1, 2):
+                q = p + b * cols + a
+                if count[q] > 0 and low[q] >= least and high[q] <= greatest:
+                    sides += (a == 0) != (b == 0)
+                    corners += a != 0 and b != 0
+    return sides >= 4 or corners >= 4
+
+
 @kernel
-def _seen(
-    points: Records,
-    start: Ints,
-    shape: tuple[int, int],
-    low: Steps,
-    high: Steps,
-    count: NDArray[np.int32],
-    around: NDArray[np.int32],
-    lowest: Steps,
-    highest: Steps,
+def _mark_seen(
+    window: _Window,
+    ranges: _Ranges,
+    around: _Ranges,
     margin: float,
     surrounded: NDArray[np.bool_],
-    flags: NDArray[np.uint8],
-    seen: NDArray[np.int32],
+    seen: Steps,
     edge: NDArray[np.bool_],
 ) -> None:
-    """``around``, ``lowest``, ``highest``: of ``count``, ``low``, ``high`` in 3 x 3 pixels."""
-    rows, cols = shape
+    """Gives _ON_SURFACE to the points on the surface that their pixel's centre sees; number of
+    these to ``seen`` [pixels], pixels on an edge to ``edge``. ``around``: of 3 x 3 pixels."""
+    points, start, flags = window.points, window.start, window.flags
+    low, high, count = ranges.low, ranges.high, ranges.count
+    rows, cols = window.shape
     quarter = PX * PX // 4  # squared; points of other pixels are no nearer
     none = (np.int64(1 << 62), np.int64(_NOTHING))
     for p in range(count.size):
@@ -253,46 +270,21 @@ def _seen(
         if count[p] == 0:
             continue
         row, col = p // cols, p % cols
-        distance, disparity = _nearest(points, start, p, 0, 0, flags, none)
-        if distance >= quarter:
+        nearest = _nearest(window, p, 0, 0, none)
+        if nearest[0] >= quarter:
             for b in range(max(row - 1, 0), min(row + 2, rows)):
                 for a in range(max(col - 1, 0), min(col + 2, cols)):
                     if a != col or b != row:
-                        distance, disparity = _nearest(
-                            points,
-                            start,
-                            b * cols + a,
-                            a - col,
-                            b - row,
-                            flags,
-                            (distance, disparity),
-                        )
+                        nearest = _nearest(window, b * cols + a, a - col, b - row, nearest)
+        disparity = nearest[1]
         least, greatest = disparity - _SURFACE, disparity + _SURFACE
-        flat = lowest[p] >= least and highest[p] <= greatest
-        many = around[p] >= MANY
+        flat = around.low[p] >= least and around.high[p] <= greatest
+        many = around.count[p] >= MANY
         if (many or not flat) and (many or margin > 0.0):
-            # Four sides or corners with nothing but this surface leave no gap of three octants.
-            sides = corners = 0
-            if (flat or margin == 0.0) and 0 < row < rows - 1 and 0 < col < cols - 1:
-                for b in range(-1, 2):
-                    for a in range(-1, 2):
-                        q = p + b * cols + a
-                        if count[q] > 0 and low[q] >= least and high[q] <= greatest:
-                            sides += (a == 0) != (b == 0)
-                            corners += a != 0 and b != 0
-            if sides < 4 and corners < 4:
-                edge[p] = _on_edge(
-                    points,
-                    start,
-                    shape,
-                    p,
-                    flags,
-                    distance,
-                    disparity,
-                    many,
-                    margin,
-                    surrounded,
-                )
+            enclosed = flat or margin == 0.0
+            enclosed = enclosed and _enclosed(ranges, window.shape, p, least, greatest)
+            if not enclosed:
+                edge[p] = _on_edge(window, p, nearest, many, margin, surrounded)
         one = low[p] >= least and high[p] <= greatest
         for k in range(start[p], start[p + 1]):
             on_surface = one or abs(points[k].disparity - disparity) <= _SURFACE
@@ -308,7 +300,7 @@ def box_sum(values: NDArray) -> NDArray:
     return sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
 
 
-def _box_max(values: Steps, reach: int) -> Steps:
+def box_max(values: NDArray, reach: int) -> NDArray:
     """Maximum over squares of 2 * reach + 1 px, cut off at the edges."""
     for axis in (0, 1):
         out = values.copy()
@@ -327,45 +319,32 @@ def seen_surface(
 
     A point is covered if points of another surface, nearer to the left camera by more than
     SURFACE_PX, lie on all sides of it in the left image (within COVER_PX, or 1.7 times the mean
-    distance of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
-    beside it, tells the surface that is seen there; to it belong the uncovered points of the pixel
-    within SURFACE_PX. There are none if the pixel only holds points of another surface.
+    spacing of points). The uncovered point nearest to a pixel's centre, in the pixel or in one
+    beside it, lies on the surface that is seen there; to it belong the uncovered points of the
+    pixel within SURFACE_PX. There are none if the pixel only holds points of another surface.
 
     On an edge: either the points of its surface do not surround the centre: they leave a gap of
-    more than EMPTY_OCTANTS, as beside a wall that no point tells of (not where points are so sparse
+    more than EMPTY_OCTANTS, as beside a wall without points (not where points are so sparse
     that gaps come by chance). Or, half-way between the nearest points of its surface and of another
     one, the edge passes within ``edge_margin_px`` of the centre, so that it may as well see the
     other one.
 
-    The outermost EDGE rings of pixels lack neighbours.
+    The outermost OUTER_RINGS rings of pixels lack neighbours.
     """
-    points, start, shape = window.points, window.start, window.shape
-    size = start.size - 1
-    low, high = np.empty(size, np.int32), np.empty(size, np.int32)
-    count, seen = np.empty(size, np.int32), np.empty(size, np.int32)
-    flags = np.full(points.size, _UNCOVERED)
-    _ranges(points, start, flags, low, high, count)
-    top = high.copy()
-    reach = range(1, int(np.ceil(MAX_COVER_PX)) + 1)
-    ceilings = np.stack([_box_max(top.reshape(shape), px).reshape(-1) for px in reach])
-    near = box_sum(count.reshape(shape)).reshape(-1)
-    _uncovered(points, start, shape, near, top, ceilings, _SURROUNDED, flags, low, high, count)
-    edge = np.empty(size, dtype=np.bool_)
-    _seen(
-        points,
-        start,
-        shape,
-        low,
-        high,
-        count,
-        box_sum(count.reshape(shape)).reshape(-1),
-        -_box_max(-low.reshape(shape), 1).reshape(-1),
-        _box_max(high.reshape(shape), 1).reshape(-1),
-        edge_margin_px,
-        _SURROUNDED,
-        flags,
-        seen,
-        edge,
-    )
+    shape, size = window.shape, window.start.size - 1
+    flags = np.full(window.points.size, _UNCOVERED)
+    points = _Window(window.points, window.start, shape, flags)
+    ranges = _Ranges(*(np.empty(size, np.int32) for _ in range(3)))
+    _update_ranges(points, ranges)
+    top = ranges.high.reshape(shape)
+    reach = range(int(np.ceil(MAX_COVER_PX)) + 1)
+    ceilings = np.stack([box_max(top, px).reshape(-1) for px in reach])
+    near = box_sum(ranges.count.reshape(shape)).reshape(-1)
+    _mark_covered(points, near, ceilings, _SURROUNDED, ranges)
+    low, high, count = (values.reshape(shape) for values in ranges)
+    around = -box_max(-low, 1), box_max(high, 1), box_sum(count)
+    seen, edge = np.empty(size, np.int32), np.empty(size, np.bool_)
+    around = _Ranges(*(values.reshape(-1) for values in around))
+    _mark_seen(points, ranges, around, edge_margin_px, _SURROUNDED, seen, edge)
     edge &= seen > 0
     return (flags & _ON_SURFACE) != 0, edge.reshape(shape)

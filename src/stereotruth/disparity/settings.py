@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -18,16 +17,16 @@ class Settings:
     recipe: Literal["surface", "paper"] = "surface"
     """how points become labels. `surface`: the points are triangles over the ground. Those that go
     on the plane of their neighbours, or bulge as crowns do, give labels. Those between two surfaces
-    are cut at the outline that the points on both sides of it tell. All others are swept vertically
-    as what may hide a pixel in either view. All pixels on the surface have a label: those with
-    points on it the status `labelled` (1), those between points `labelled_between` (9) and an
-    `uncertainty` of their own. Rough surfaces, as crowns are, have labels where both views must see
-    them, `labelled_crown` (12), with the `uncertainty` that the roughness of their points leaves;
-    which of these are in the tiles, `tiles.max_uncertainty_px` says. Where a step lies between
-    points, other pixels are `edge_in_pixel`. Where the images contradict the LiDAR over most of a
-    surface (25 px around a pixel), pixels are `changed`. A value is always the LiDAR's. `paper`: as
-    in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and max Z of its points, and
-    points around which the images do not correlate are dropped"""
+    are cut at the breakline that the points on both sides of it determine. All others are swept
+    vertically as what may hide a pixel in either view. All pixels on the surface have a label:
+    those with points on it the status `labelled` (1), those between points `labelled_between` (9)
+    and an `uncertainty` of their own. Rough surfaces, as crowns are, have labels where both views
+    must see them, `labelled_crown` (12), with the `uncertainty` that the roughness of their points
+    leaves; which of these are in the tiles, `tiles.max_uncertainty_px` says. Where a step lies
+    between points, other pixels are `edge_in_pixel`. Where the images contradict the LiDAR over
+    most of a surface (25 px around a pixel), pixels are `changed`. A value is always the LiDAR's.
+    `paper`: as in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and max Z of its
+    points, and points around which the images do not correlate are dropped"""
 
     window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
     """side of the correlation window; with `surface`, of the pixels in it only those of the same
@@ -44,12 +43,6 @@ class Settings:
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
     """a pixel with fewer stays unlabelled with `paper`, and is one between points with `surface`"""
 
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Settings:
-        """From the configuration."""
-        project = config.get("project", {})
-        return cls(**{key: value for key, value in project.items() if key != "right_view"})
-
     @property
     def on_surface(self) -> bool:
         """Whether labels follow from the surface of the points."""
@@ -58,10 +51,10 @@ class Settings:
     @property
     def statuses(self) -> list[Status]:
         """Those that the recipe's grids name; MASKED comes with masks alone."""
-        found = [status for status in Status if status <= Status.EDGE_IN_PIXEL]
+        statuses = [status for status in Status if status <= Status.EDGE_IN_PIXEL]
         if self.on_surface:
-            found += [Status.LABELLED_BETWEEN, Status.LABELLED_CROWN]
-        return found
+            statuses += [Status.LABELLED_BETWEEN, Status.LABELLED_CROWN]
+        return statuses
 
     @property
     def images_window(self) -> int:
@@ -75,11 +68,11 @@ class Settings:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # here, since these load compiled code and a workflow plans with the settings
         from .image_agreement import NEARBY_PX, VOTE_PX
-        from .seen_surface import EDGE
+        from .seen_surface import OUTER_RINGS
 
         # one for each ring of neighbours: planes, their pooled noise, support
-        reach = EDGE + 3
-        # steps beside pixels, windows, votes about them, and what is asked of the votes nearby; in
+        reach = OUTER_RINGS + 3
+        # steps beside pixels, windows, votes about them, and the votes nearby; in
         # the rim of a change, by the mean of what is not voted against
         return reach + VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
 

@@ -33,7 +33,7 @@ class Status(IntEnum):
 
 
 def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where a status says that there is a label: measured, between points, told by images, or of a
+    """Where a status says that there is a label: measured, between points, by images, or of a
     rough surface."""
     between = (status >= Status.LABELLED_BETWEEN) & (status <= Status.LABELLED_BY_IMAGES)
     return (status == Status.LABELLED) | between | (status == Status.LABELLED_CROWN)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inner, kernel
+from ..numerics.degrees import DEGREE_M
 from .model import EpipolarModel
 from .rpc import project_point
 from .spline_kernels import inverse_point
@@ -15,7 +16,7 @@ Floats = NDArray[np.float64]
 
 TOLERANCE_M = 1e-5
 FRESH = 64  # px along a row after which the derivatives are taken anew
-DEG = 1.0 / 111_000.0  # per metre, about
+DEG = 1.0 / DEGREE_M  # per metre, about
 
 
 @inner

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
-from ..products.files import replacing
+from ..products.files import atomic_file, read_record, sealed
 from .rpc import SensorModel
 from .spline_kernels import POWERS, ground_points_to_epipolar, map_points
 
@@ -232,19 +230,10 @@ class EpipolarModel:
     def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model and its provenance as JSON; the file appears when it is whole."""
         record = self.to_dict() | {"provenance": dict(provenance or {})}
-        with replacing(path) as scratch:
-            scratch.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        with atomic_file(path) as scratch:
+            scratch.write_text(sealed(record), encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> EpipolarModel:
         """Read what :meth:`save` wrote. Raises InputError if it cannot be used."""
-        try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except FileNotFoundError as error:
-            raise InputError(
-                "no such epipolar model", file=path, remedy="run the rectify stage"
-            ) from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"not an epipolar model ({error})", file=path, remedy="run the rectify stage again"
-            ) from error
+        return read_record(path, cls.from_dict, what="epipolar model", stage="rectify")

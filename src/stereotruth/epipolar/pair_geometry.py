@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..numerics.degrees import exact_metres_per_degree
 from .rpc import SensorModel
 from .virtual_points import frame, inside, steps
 
@@ -48,21 +49,11 @@ def find_overlap(
     )
 
 
-def _direction(sensor: SensorModel, col: float, row: float, height: float) -> Floats:
+def ray_upwards(sensor: SensorModel, col: float, row: float, height: float) -> Floats:
     """Unit vector (east, north, up) of a pixel's ray, upwards, near an ellipsoidal height in m."""
     lon, lat = sensor.localize([col, col], [row, row], [height, height + 200.0])
-    phi = np.radians(lat[0])
-    squared = 6.69437999014e-3  # first eccentricity squared of WGS 84
-    w = 1.0 - squared * np.sin(phi) ** 2
-    prime_vertical = 6378137.0 / np.sqrt(w) + height
-    meridian = 6378137.0 * (1.0 - squared) / w**1.5 + height
-    ray = np.array(
-        [
-            np.radians(lon[1] - lon[0]) * np.cos(phi) * prime_vertical,
-            np.radians(lat[1] - lat[0]) * meridian,
-            200.0,
-        ]
-    )
+    east, north = exact_metres_per_degree(lat[0], height)
+    ray = np.array([(lon[1] - lon[0]) * east, (lat[1] - lat[0]) * north, 200.0])
     return ray / np.linalg.norm(ray)
 
 
@@ -72,7 +63,7 @@ def convergence_angle(
     """Angle in degrees between both rays in the middle of the overlap."""
     col, row = overlap.mean(axis=1)
     there = right.project(*left.localize(col, row, height), height)
-    rays = _direction(left, col, row, height), _direction(right, *map(float, there), height)
+    rays = ray_upwards(left, col, row, height), ray_upwards(right, *map(float, there), height)
     angle = float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0))))
     if not angle >= MIN_CONVERGENCE:
         raise InputError(
@@ -107,7 +98,9 @@ def view_order(left: SensorModel, right: SensorModel, overlap: Floats, height: f
     """Which image looks backward, if image rows run in flight direction."""
     col, row = overlap.mean(axis=1)
     there = right.project(*left.localize(col, row, height), height)
-    base = (_direction(left, col, row, height) - _direction(right, *map(float, there), height))[:2]
+    base = (ray_upwards(left, col, row, height) - ray_upwards(right, *map(float, there), height))[
+        :2
+    ]
     lon, lat = left.localize([col, col], [row - 50.0, row + 50.0], height)
     flight = np.array([(lon[1] - lon[0]) * np.cos(np.radians(lat[0])), lat[1] - lat[0]])
     along = float(base @ flight / np.linalg.norm(base) / np.linalg.norm(flight))

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import block_progress
+from ..numerics.cubic_convolution import SIX_POINT_RADIUS
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
-from ..products.resumable_grids import BlockStore, making
+from ..products.resumable_grids import BlockStore, resumable_grid
 from .colours import COLOURS
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
-from .resampling import ANTIALIAS, KERNEL, RADIUS, resample
+from .resampling import ANTIALIAS, KERNEL, resample
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -112,7 +113,7 @@ def rectify_image(
     """
     step, error = _lattice_step(model, shape)
     scale = _widening(model, shape)
-    reach = [int(np.ceil(RADIUS * s)) + 1 for s in scale]
+    reach = [int(np.ceil(SIX_POINT_RADIUS * s)) + 1 for s in scale]
     names = ("image", *(COLOURS if source.colour else ()))
 
     def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
@@ -244,7 +245,7 @@ def rectify(
             }
             source.check_blocks(workers)
             grid = stack.enter_context(
-                making(
+                resumable_grid(
                     store,
                     model.shape,
                     layers,
@@ -275,6 +276,6 @@ def rectify(
             finished.append((grid, store, attrs))
         if strip is None:
             for grid, store, attrs in finished:
-                grid.publish(store, blocks(model.shape, SHARD), attrs)
+                grid.write_atomically(store, blocks(model.shape, SHARD), attrs)
             if epipolar_json is not None:
                 model.save(epipolar_json, provenance)

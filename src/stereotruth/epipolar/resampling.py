@@ -10,6 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inlined, inner, kernel
+from ..numerics.cubic_convolution import (
+    SIX_POINT_RADIUS,
+    six_point_weights,
+    six_point_weights_of_row,
+)
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -17,73 +22,12 @@ Picture = NDArray[np.float32]
 
 # Of waves of 6 px, Keys' six points leave 0.6 % rms, four points 2.1 %, Lanczos' eight 0.7 %; but
 # Lanczos bends a ramp by 0.015 px, and OpenCV's remap rounds positions to 1/32 px.
-RADIUS = 3  # px, of the interpolation kernel
 ANTIALIAS = 1.2  # source px per epipolar px above which the kernel is widened
 KERNEL = "cubic convolution, 6 x 6 taps (Keys 1981, fourth order), widened where downsampling"
 TILE = 64  # px; 64 x 64 px of float32 and their margins fit a cache of 32 KB
 NO_WEIGHT = 1e-6  # of 65535: less than a tenth of a digital number
-# Rows are taps, columns powers 3 to 0 of f: Keys' kernel at f + 2, f + 1, f, 1 - f, 2 - f, 3 - f
-TAP_POLYNOMIALS = (
-    np.array(
-        [
-            [1, -2, 1, 0],
-            [-7, 15, -8, 0],
-            [16, -28, 0, 12],
-            [-16, 20, 8, 0],
-            [7, -6, -1, 0],
-            [-1, 1, 0, 0],
-        ]
-    )
-    / 12
-).astype(np.float32)
 # Unsigned: of signed indices Numba asks whether they count from the end, a quarter slower.
 ONE, TWO, THREE, FOUR, FIVE, SIX, SEVEN = np.arange(1, 8, dtype=np.uint64)
-
-
-@inner
-def _kernel(s: float) -> float:
-    """Keys' six-point kernel (IEEE TASSP 29, 1981, section VI); reproduces cubic polynomials."""
-    s = abs(s)
-    if s < 1.0:
-        return (4.0 * s - 7.0) * s * s / 3.0 + 1.0
-    if s < 2.0:
-        return ((-7.0 * s + 36.0) * s - 59.0) * s / 12.0 + 2.5
-    if s < 3.0:
-        return ((s - 8.0) * s + 21.0) * s / 12.0 - 1.5
-    return 0.0
-
-
-@inner
-def tap_weights(at: float, first: int, scale: float, weights: Floats) -> None:
-    """Weights of the source samples first, first + 1, … for the value at ``at``; sum 1."""
-    if scale == 1.0:  # the same without branches
-        f = at - first - 2.0
-        e = 1.0 - f
-        weights[0] = (((f - 2.0) * f + 1.0) * f) / 12.0
-        weights[5] = (((e - 2.0) * e + 1.0) * e) / 12.0
-        weights[1] = (((-7.0 * f + 15.0) * f - 8.0) * f) / 12.0
-        weights[4] = (((-7.0 * e + 15.0) * e - 8.0) * e) / 12.0
-        weights[2] = (4.0 * f - 7.0) * f * f / 3.0 + 1.0
-        weights[3] = (4.0 * e - 7.0) * e * e / 3.0 + 1.0
-        return
-    total = 0.0
-    for k in range(weights.size):
-        weights[k] = _kernel((at - (first + k)) / scale)
-        total += weights[k]
-    for k in range(weights.size):
-        weights[k] /= total
-
-
-@inner
-def _row_weights(f: Picture, weights: Picture) -> None:
-    """Weights [6, n] of the taps of n px, each of which lies ``f`` in [0, 1] past its third tap.
-
-    One loop for each tap, which is vectorised.
-    """
-    for tap in range(6):
-        a, b, c, d = TAP_POLYNOMIALS[tap]
-        for k in range(f.size):
-            weights[tap, k] = ((a * f[k] + b) * f[k] + c) * f[k] + d
 
 
 @inlined
@@ -140,8 +84,8 @@ def _at_an_edge(
     (row, col) is the third tap. Samples of less weight than NO_WEIGHT are taken for 0.
     """
     exact_down, exact_across = np.empty(6), np.empty(6)
-    tap_weights(f_row[k], -2, 1.0, exact_down)
-    tap_weights(f_col[k], -2, 1.0, exact_across)
+    six_point_weights(f_row[k], -2, 1.0, exact_down)
+    six_point_weights(f_col[k], -2, 1.0, exact_across)
     patch = np.zeros(48, np.float32)  # six rows of eight
     for j in range(6):
         if abs(exact_down[j]) < NO_WEIGHT:
@@ -204,8 +148,8 @@ def _resample(source: Picture, lattice: Floats, step: int, out: NDArray[np.uint1
             for y in range(y0, min(y0 + TILE, out.shape[0])):
                 _along_row(lattice, step, y, x0, 0, col, f_col)
                 _along_row(lattice, step, y, x0, 1, row, f_row)
-                _row_weights(f_col, across)
-                _row_weights(f_row, down)
+                six_point_weights_of_row(f_col, across)
+                six_point_weights_of_row(f_row, down)
                 for k in range(width):
                     c, r = col[k], row[k]
                     value = np.float32(np.nan)
@@ -270,8 +214,8 @@ def _resample_widened(
     out: NDArray[np.uint16],
 ) -> int:
     """:func:`resample` with a kernel of any width."""
-    across = np.empty(2 * int(np.ceil(RADIUS * scale[0])))
-    down = np.empty(2 * int(np.ceil(RADIUS * scale[1])))
+    across = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[0])))
+    down = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[1])))
     width = out.shape[1]
     col, row = np.empty(width), np.empty(width)
     f_col, f_row = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -289,8 +233,8 @@ def _resample_widened(
             ):
                 continue
             before_col, before_row = 1 - across.size // 2, 1 - down.size // 2
-            tap_weights(f_col[x], before_col, scale[0], across)
-            tap_weights(f_row[x], before_row, scale[1], down)
+            six_point_weights(f_col[x], before_col, scale[0], across)
+            six_point_weights(f_row[x], before_row, scale[1], down)
             value = sample(source, int(row[x]) + before_row, int(col[x]) + before_col, down, across)
             if np.isnan(value):
                 continue

@@ -5,17 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..numerics.b_spline import cubic_weights
 from .model import ImageModel
-from .spline_kernels import cubic_weights
+from .spline_kernels import forward_with_slopes
 from .virtual_points import Points
 
 Floats = NDArray[np.float64]
 
 
 # Weights of the penalties, per coefficient and relative to the mean squared residual (px²).
-# A residual floor of r px can push a free direction by about r / (2 sqrt(RIDGE)); a real
-# coefficient of c px is biased by at most sqrt(RIDGE) c / 2.
-RIDGE = 1e-9
+# A residual floor of r px can push a free direction by about r / (2 sqrt(ridge)); a real
+# coefficient of c px is biased by at most sqrt(ridge) c / 2. The weakest is taken that keeps the
+# scale of the rows: the RPCs of small images may cover more metres of height than of ground, and
+# the rows would shrink to a tenth, with their residuals.
+RIDGES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+ROW_SCALE = (0.9, 1.1)  # of the left image
+SCALE_SAMPLES = 500  # places where it is asked
 SMOOTHNESS = 1e-10
 SIZES = (6, 8, 10, 12)  # coefficients per axis, tried in turn
 GOOD_RMS = 0.003  # px; no larger spline is tried below this
@@ -57,11 +62,12 @@ def _solve(design: Floats, target: Floats, *penalties: Floats) -> Floats:
 
 
 def _fit_images(
-    points: Points, surface: Points, rotation: Floats, n: int
+    points: Points, surface: Points, rotation: Floats, n: int, ridge: float
 ) -> tuple[ImageModel, ImageModel]:
     """Both image models with n × n coefficients per spline.
 
-    ``points`` make the rows, ``surface`` (at the reference height) the right image's x.
+    ``points`` make the rows, ``surface`` (at the reference height) the right image's x; ``ridge``
+    draws the left rows to those of the ``rotation``.
     """
     homogeneous = np.vstack([surface.right, np.ones(surface.right.shape[1])])
     wanted = rotation @ np.vstack([surface.left, np.ones(surface.left.shape[1])])
@@ -77,7 +83,7 @@ def _fit_images(
     right_design = _design(right_domain, n, points.right)
     smooth = np.sqrt(SMOOTHNESS / n**2) * _second_differences(n)
     nothing = np.zeros_like(smooth)
-    near = np.sqrt(RIDGE / n**2) * np.eye(n * n)
+    near = np.sqrt(ridge / n**2) * np.eye(n * n)
     y = _solve(
         np.hstack([left_design, -right_design]),
         rows(affine, points.right)[1] - rows(rotation, points.left)[1],
@@ -101,6 +107,27 @@ def y_parallax(left: ImageModel, right: ImageModel, points: Points) -> Floats:
     return left.forward(*points.left)[1] - right.forward(*points.right)[1]
 
 
+def _keeps_row_scale(left: ImageModel, points: Points) -> bool:
+    """Whether the left image's rows have about the scale of its pixels all over the points."""
+    every = max(points.left.shape[1] // SCALE_SAMPLES, 1)
+    slopes = np.array([
+        forward_with_slopes(left.packed, col, row)[2:] for col, row in points.left[:, ::every].T
+    ]).reshape(-1, 2, 2)  # fmt: skip
+    scales = np.linalg.det(slopes)
+    return bool(ROW_SCALE[0] <= scales.min() and scales.max() <= ROW_SCALE[1])
+
+
+def _fit_at_scale(
+    points: Points, surface: Points, rotation: Floats, n: int
+) -> tuple[ImageModel, ImageModel]:
+    """Both image models by the weakest of RIDGES that keeps the scale of the left rows."""
+    for ridge in RIDGES:
+        models = _fit_images(points, surface, rotation, n, ridge)
+        if _keeps_row_scale(models[0], points):
+            break
+    return models
+
+
 def grow(
     points: Points, checks: list[Points], surface: Points, rotation: Floats
 ) -> tuple[tuple[ImageModel, ImageModel], float]:
@@ -111,7 +138,7 @@ def grow(
     best: tuple[ImageModel, ImageModel] | None = None
     best_rms = np.inf
     for n in SIZES:
-        models = _fit_images(points, surface, rotation, n)
+        models = _fit_at_scale(points, surface, rotation, n)
         rms = max(float(np.sqrt(np.mean(y_parallax(*models, check) ** 2))) for check in checks)
         gain = 1.0 - rms / best_rms
         if best is None or gain > 0:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inlined, inner, kernel
+from ..numerics.b_spline import cubic_slopes, cubic_weights
 from .rpc import project_block
 
 Floats = NDArray[np.float64]
@@ -18,24 +19,6 @@ Floats = NDArray[np.float64]
 # m[12 + 2 n²] on, then those of x; [4 b + a] belongs to f**a g**b.
 _BLOCK = 256  # points worked on together
 POWERS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6  # of weights
-
-
-@inlined
-def cubic_weights(f: float) -> tuple[float, float, float, float]:
-    """Weights of the four coefficients around a place ``f`` in [0, 1] of a cell."""
-    e = 1.0 - f
-    return (
-        e * e * e / 6.0,
-        ((3.0 * f - 6.0) * f * f + 4.0) / 6.0,
-        ((3.0 * e - 6.0) * e * e + 4.0) / 6.0,
-        f * f * f / 6.0,
-    )
-
-
-@inner
-def _slopes(f: float) -> tuple[float, float, float, float]:
-    e = 1.0 - f
-    return -0.5 * e * e, (1.5 * f - 2.0) * f, (2.0 - 1.5 * e) * e, 0.5 * f * f
 
 
 @inner
@@ -75,8 +58,8 @@ def forward_with_slopes(
     inside_t = min(max(t, 0.0), top)
     i = min(int(inside_s), n - 4)
     j = min(int(inside_t), n - 4)
-    w, dw = cubic_weights(inside_s - i), _slopes(inside_s - i)
-    v, dv = cubic_weights(inside_t - j), _slopes(inside_t - j)
+    w, dw = cubic_weights(inside_s - i), cubic_slopes(inside_s - i)
+    v, dv = cubic_weights(inside_t - j), cubic_slopes(inside_t - j)
     beyond_s, beyond_t = s - inside_s, t - inside_t
     k = 12 + j * n + i
     ys = _patch(m, k, n, dw, v)

@@ -44,9 +44,14 @@ def tolerance_px(down: int, across: int) -> float:
 
 @kernel
 def _correlation(
-    left: Singles, warped: Singles, disparity: Singles, counted: Singles, slope: Singles, half: int,
+    left: Singles,
+    warped: Singles,
+    disparity: Singles,
+    counted: Singles,
+    slope: Singles,
+    half: int,
     out: Singles,
-) -> None:  # fmt: skip
+) -> None:
     """``counted``: disparity of the pixels that count, else NaN."""
     rows, cols = left.shape
     surface = np.empty(3 * BLOCK, np.float32)

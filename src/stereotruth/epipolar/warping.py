@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import kernel
+from ..numerics.cubic_convolution import four_point_value
 
 Floats = NDArray[np.float64]
 
@@ -27,15 +28,13 @@ def _warp(image: NDArray, at: Floats, out: Floats) -> None:
             a, b, c, d = image[y, i - 1], image[y, i], image[y, i + 1], image[y, i + 2]
             if a == 0.0 or b == 0.0 or c == 0.0 or d == 0.0:
                 continue
-            out[y, k] = b + 0.5 * f * (
-                c - a + f * (2.0 * a - 5.0 * b + 4.0 * c - d + f * (3.0 * (b - c) + d - a))
-            )
+            out[y, k] = four_point_value(a, b, c, d, f)
 
 
 def warp_rows(image: NDArray[np.floating], x: Floats) -> Floats:
     """Values float64[h, w] of an image [h, W] at columns ``x`` [h, w] of the same rows.
 
-    Cubic convolution (Keys, a = -1/2). NaN where x is NaN, where one of the four columns is nodata
+    Cubic convolution of four pixels. NaN where x is NaN, where one of the four columns is nodata
     (0) or outside the image.
     """
     out = np.empty(x.shape)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..job import progress
-from ..products.grids import Layer, blocks, building, create_grid
+from ..products.grids import Layer, atomic_store, blocks, create_grid
 from ..simulate.cities import CitySpec, SceneSpec
 from ..simulate.render import prepare
 from ..simulate.surfaces import ROOF, WALL
@@ -147,7 +147,7 @@ def write_grid_truth(
         "epipolar": model.to_dict(),
         "provenance": dict(provenance or {}),
     }
-    with building(out_zarr) as scratch, ThreadPoolExecutor(workers) as pool:
+    with atomic_store(out_zarr) as scratch, ThreadPoolExecutor(workers) as pool:
         arrays = create_grid(scratch, model.shape, layers, chunk=CHUNK, shard=SHARD, attrs=attrs)
 
         def write(window: tuple[slice, slice]) -> None:

@@ -20,7 +20,7 @@ from ..epipolar.image_reader import open_pair
 from ..epipolar.model import EpipolarModel
 from ..epipolar.rectify import rectify
 from ..errors import InputError
-from ..products.files import link, whole_folder
+from ..products.files import atomic_folder, link
 from ..products.grids import require_complete
 from ..products.rasters import write_tiff
 from ..simulate.cities import CitySpec
@@ -43,7 +43,10 @@ def make_city(number: int, folder: str | Path, *, size: int, seed: int, workers:
     """
     side = round(2 * size * (1 + MARGIN[0])) + MARGIN[1]
     city = training_city(number, seed, side)
-    with tempfile.TemporaryDirectory(prefix="stereotruth-") as scratch, whole_folder(folder) as out:
+    with (
+        tempfile.TemporaryDirectory(prefix="stereotruth-") as scratch,
+        atomic_folder(folder) as out,
+    ):
         model, images = _rectified(city, Path(scratch), seed, workers)
         row, col = ((n - 2 * size) // 2 for n in model.shape)
         if row < 0 or col < 0:
@@ -115,7 +118,7 @@ def gather(
     if len(lefts) < count:
         raise InputError(f"{len(lefts)} tiles instead of {count}", remedy="make more cities")
     others = [file for city in validation for file in sorted(Path(city).glob("left/*.tiff"))]
-    with whole_folder(folder) as out:
+    with atomic_folder(folder) as out:
         for split, files in zip(SPLITS, (lefts[:count], others)):
             for left in files:
                 for kind, word in zip(FOLDERS, ("left", "right", "disparity")):

@@ -21,7 +21,7 @@ from ..dataset.sift_matches import GROSS_PX
 from ..dataset.tile_classes import BUILDING, VEGETATION
 from ..dataset.warped_tile import warp_tile
 from ..epipolar.warping import CorrelationSum
-from ..error_statistics import ErrorSum
+from ..numerics.error_sums import ErrorSum
 from ..products import pictures
 from ..products.files import read_table, write_table
 from ..products.grids import require_complete

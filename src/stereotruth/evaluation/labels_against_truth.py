@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ..dataset.manifest import Tile, carries_label, labelled_tiles
 from ..dataset.sure_labels import tile_flags
-from ..error_statistics import LIMITS, Calibration, ErrorSum
 from ..errors import InputError
 from ..job import progress
+from ..numerics.error_sums import LIMITS, Calibration, ErrorSum
 from ..products.files import write_json, write_table
 from ..products.grids import blocks, open_grid
 from ..products.rasters import read_tile

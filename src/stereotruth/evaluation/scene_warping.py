@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..dataset.warped_tile import WarpedTile
 from ..epipolar.warping import CorrelationSum, agreement, warp_window
 from ..errors import InputError
-from ..products.files import replacing
 from ..products.grids import blocks, open_grid
-from ..products.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
 
 BLOCK = 1024  # px
 
@@ -54,45 +50,3 @@ def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> Sc
             SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
         )
     return total
-
-
-def evaluate_warping(left: str | Path, right: str | Path, disparity: str | Path) -> dict[str, Any]:
-    """Correlation of left and warped right image over the labelled pixels of a scene.
-
-    Takes and raises what :func:`warp_scene` does.
-    """
-    total = warp_scene(left, right, disparity).sums
-    return {"pixels": total.count, "correlation": round(total.coefficient, 6)}
-
-
-def draw_panels(tile: WarpedTile, path: str | Path) -> None:
-    """PNG of the left image, the warped right one, their difference and the disparity.
-
-    The difference is taken after a linear match of brightness.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15, 14.4), layout="constrained")
-    axes = figure.subplots(2, 2)
-    low, high = np.percentile(tile.left, (1, 99))
-    difference = tile.left - tile.sums.match(tile.warped)
-    spread = float(np.nanpercentile(np.abs(difference), 99)) if np.isfinite(difference).any() else 1
-    gray = {"cmap": "gray", "vmin": low, "vmax": high}
-    panels = (
-        (tile.left, "left", gray),
-        (tile.warped, f"warped right, correlation {tile.correlation:.3f}", gray),
-        (
-            difference,
-            "left − warped right, brought to its brightness",
-            {"cmap": DIFFERENCES, "vmin": -spread, "vmax": spread},
-        ),
-        (tile.disparity, "disparity (px)", {"cmap": DISPARITIES}),
-    )
-    for ax, (image, title, style) in zip(axes.ravel(), panels):
-        ax.set_facecolor("black" if style is gray else np.array(NO_VALUE) / 255)
-        shown = ax.imshow(image, interpolation="nearest", **style)
-        ax.set_title(f"{tile.name}: {title}", parse_math=False)
-        if style is not gray:
-            figure.colorbar(shown, ax=ax, shrink=0.7)
-    with replacing(path) as scratch:
-        figure.savefig(scratch, dpi=75)

@@ -13,7 +13,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
 from ..errors import InputError
-from .lattice import DEGREE_M
+from ..numerics.degrees import DEGREE_M
 
 VERTICAL_UNITS_KEY = 4099
 LINEAR_UNITS = {  # EPSG code: (name, metres)

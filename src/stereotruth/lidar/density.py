@@ -13,7 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .lattice import CELL_BITS, DEGREE_M, LATTICE_DEG
+from ..numerics.degrees import DEGREE_M
+from .lattice import CELL_BITS, LATTICE_DEG
 from .point_store import SQUARES, PointStore
 
 ENOUGH = 8.0  # points in a square that holds any, on the average

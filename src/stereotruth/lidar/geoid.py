@@ -12,13 +12,14 @@ from rasterio.windows import Window
 
 from ..errors import InputError
 from ..kernels import kernel
+from ..numerics.bilinear import between_four
 from ..products.ungeoreferenced import open_raster
 
 FORMATS = ("GTX", "GTiff")
 
 
 @kernel
-def _bilinear(
+def _undulations(
     rows: np.ndarray,
     grid: tuple[float, float, float, float],
     first_row: int,
@@ -63,8 +64,8 @@ def _bilinear(
             part = col - left
             right = min(left + 1, width - 1)
         top, below = top - first_row, below - first_row
-        out[i] = (1 - down) * ((1 - part) * rows[top, left] + part * rows[top, right]) + down * (
-            (1 - part) * rows[below, left] + part * rows[below, right]
+        out[i] = between_four(
+            rows[top, left], rows[top, right], rows[below, left], rows[below, right], part, down
         )
 
 
@@ -148,7 +149,7 @@ class GeoidGrid:
         rows = self._window(int(top), int(min(bottom + 1, self.height - 1)))
         undulation, inside = np.empty(lon.size), np.empty(lon.size, np.bool_)
         grid = (self.lon_first, self.step_lon, self.lat_first, self.step_lat)
-        _bilinear(
+        _undulations(
             rows, grid, self._first_row, self.height, self.around, lon, lat, undulation, inside
         )
         if not inside.all():

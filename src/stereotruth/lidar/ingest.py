@@ -13,7 +13,6 @@ bring them to the lattice and sort them by cell without an intermediate copy of 
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..job import progress
 from ..kernels import kernel
-from ..products.files import whole_folder
+from ..products.files import atomic_folder, sealed
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
@@ -150,7 +149,7 @@ def ingest(
     transform = transform_of(None)
     _refuse_coarse(header, transform, file)
     with (
-        whole_folder(store) as unfinished,
+        atomic_folder(store) as unfinished,
         TemporaryFile(dir=unfinished.parent) as disk,
     ):
         reading = (drop_classes, chunk_points, workers, disk)
@@ -160,58 +159,31 @@ def ingest(
             operation, transform = transform.operation, transform_of(own)
             if transform.operation != operation:  # the header's box led elsewhere
                 tally, runs = _read(file, header, transform, *reading)
-        notes = list(transform.notes)
-        if remark := surplus_of(header, file):
-            notes.append(remark)
-        units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
-        for remark in (
-            tally.compare_bounds(header, units_m, file),
-            tally.compare_returns(header, file),
-        ):
-            if remark:
-                notes.append(remark)
+        dropped = tally.dropped(drop_classes)
         if runs.written == 0:
             raise InputError(
-                f"no point is left of {tally.read}: {_listed(tally.dropped(drop_classes))}",
+                f"no point is left of {tally.read}: {_listed(dropped)}",
                 file=file,
                 remedy="remove the file, or drop fewer classes",
             )
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits)
-        lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
-        if remark := check_area(transform.system, lon, lat, file):
-            notes.append(remark)
-        if bounds[4] < -600 or bounds[5] > 9500:
-            notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
+        notes = _notes(file, header, transform, tally, bounds)
         cells_crc32 = runs.write(unfinished)
         summary = {
             "points": {
                 "header": header.point_count,
                 "read": tally.read,
                 "kept": runs.written,
-                "dropped": tally.dropped(drop_classes),
+                "dropped": dropped,
             },
             "classes": {str(c): int(n) for c, n in enumerate(tally.counts[0]) if n},
             "bounds": bounds,
             "crs": transform.describe(),
             "notes": notes,
         }
-        attrs = {
-            "kind": "points",
-            "format": FORMAT,
-            "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
-            f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
-            "row-major; the order of the file inside a cell",
-            "arrays": ARRAYS,
-            "scene": scene,
-            "source": file.name,
-            "cell_bits": CELL_BITS,
-            "cells_crc32": cells_crc32,
-            **summary,
-            "provenance": dict(provenance or {}),
-        }
-        text = json.dumps(attrs, indent=1, allow_nan=False)
-        (unfinished / ATTRIBUTES).write_text(text + "\n", encoding="utf-8")
+        about = {"scene": scene, "source": file.name, "cells_crc32": cells_crc32}
+        _write_attributes(unfinished, about, summary, dict(provenance or {}))
     for note in notes:
         log.warning("%s: %s", file.name, note)
     log.info(
@@ -219,11 +191,54 @@ def ingest(
         file.name,
         runs.written,
         tally.read,
-        _listed(tally.dropped(drop_classes)),
+        _listed(dropped),
         *bounds[4:],
     )
     log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
     return summary
+
+
+def _notes(
+    file: Path,
+    header: laspy.LasHeader,
+    transform: ToWGS84,
+    tally: PointTally,
+    bounds: Sequence[float],
+) -> list[str]:
+    """Remarks for the user on a file whose points have been read; they lie within ``bounds``."""
+    units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
+    lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
+    remarks = (
+        surplus_of(header, file),
+        tally.compare_bounds(header, units_m, file),
+        tally.compare_returns(header, file),
+        check_area(transform.system, lon, lat, file),
+    )
+    notes = [*transform.notes, *filter(None, remarks)]
+    if bounds[4] < -600 or bounds[5] > 9500:
+        notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
+    return notes
+
+
+def _write_attributes(
+    store: Path, about: Mapping[str, Any], summary: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> None:
+    """The attributes of a store beside its points; ``about``: scene, source, cells_crc32."""
+    attrs = {
+        "kind": "points",
+        "format": FORMAT,
+        "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
+        f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
+        "row-major; the order of the file inside a cell",
+        "arrays": ARRAYS,
+        "scene": about["scene"],
+        "source": about["source"],
+        "cell_bits": CELL_BITS,
+        "cells_crc32": about["cells_crc32"],
+        **summary,
+        "provenance": provenance,
+    }
+    (store / ATTRIBUTES).write_text(sealed(attrs), encoding="utf-8")
 
 
 def _read(

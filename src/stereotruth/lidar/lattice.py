@@ -35,6 +35,3 @@ def lattice_box(
         min(max(float(value), -1000.0), 1000.0) for value in (lon_min, lat_min, lon_max, lat_max)
     )
     return lowest(west), lowest(south), -lowest(-east), -lowest(-north)
-
-
-DEGREE_M = 111_320.0  # one degree of latitude, for judging resolutions only

@@ -15,7 +15,7 @@ A folder with plain arrays, which NumPy opens (little-endian; n points, m cells 
 ``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
                               of the cell's first point; ``lowest``, ``highest``: heights of its
                               points, steps; ``crc32`` of its points as they lie in the file
-``store.json``                attributes; ``cells_crc32`` of the file ``cells.npy``
+``store.json``                attributes, with ``cells_crc32`` of ``cells.npy`` and a digest
 ==============  ============  =====================================================================
 
 Points are written once and read once or twice, so that they are neither compressed nor cut into
@@ -25,7 +25,6 @@ dies of a mapped file that is cut short. What is read of a cell is held against 
 
 from __future__ import annotations
 
-import json
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,6 +39,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import kernel
+from ..products.files import read_json
+from ..products.provenance import own_digest
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
@@ -47,7 +48,7 @@ Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-FORMAT = 2  # of the files
+FORMAT = 3  # of the files
 POINTS, CELLS, ATTRIBUTES = "points.npy", "cells.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
@@ -185,14 +186,14 @@ class PointStore:
     def _attributes(self) -> dict[str, Any]:
         file = self.path / ATTRIBUTES
         try:
-            attrs = json.loads(file.read_text(encoding="utf-8"))
+            attrs = read_json(file)
         except FileNotFoundError as error:
             raise InputError(
                 "no such point store", file=self.path, remedy="run the stage that makes it"
             ) from error
-        except ValueError as error:
+        except InputError as error:
             raise self._damaged(ATTRIBUTES) from error
-        if not isinstance(attrs, dict) or attrs.get("kind") != "points":
+        if attrs.get("kind") != "points":
             raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
         if attrs.get("format") != FORMAT:
             raise InputError(
@@ -200,6 +201,8 @@ class PointStore:
                 file=self.path,
                 remedy="delete it and run the workflow again",
             )
+        if attrs.pop("digest", None) != own_digest(attrs):
+            raise self._damaged(ATTRIBUTES)
         return attrs
 
     def _cell_table(self) -> NDArray[np.void]:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..numerics.degrees import DEGREE_M
 from .ingest import _bounds, _refuse_coarse, _to_lattice
 from .las_files import read_header, surplus_of
-from .lattice import DEGREE_M
 from .to_wgs84 import check_area, to_wgs84
 
 Box = tuple[float, float, float, float]

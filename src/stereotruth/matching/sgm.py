@@ -31,7 +31,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -78,8 +79,9 @@ class GreyMapping(NamedTuple):
         return np.rint(np.clip(level, 0, width) + below + above + TAIL_LEVELS).astype(np.uint8)
 
 
+@dataclass(frozen=True, kw_only=True)
 class SemiGlobalMatcher:
-    """OpenCV's semi-global matching as a Matcher.
+    """OpenCV's semi-global matching as a Matcher. Raises InputError for values that cannot work.
 
     ``mode``: sgbm (five paths) | hh (eight) | 3way | hh4 (four). ``block_size``: px, odd. ``p1``,
     ``p2``: penalties of disparities that change by one and by more; null: 8 and 64 times the
@@ -90,61 +92,68 @@ class SemiGlobalMatcher:
     module; null: none is stated. ``workers``: threads, in modes that have any.
     """
 
-    margin_px = MARGIN_PX
-    invalid_outside = True  # what matches outside the right image has no disparity
+    mode: str = "hh4"
+    block_size: int = 3
+    p1: int | None = None
+    p2: int | None = None
+    uniqueness_percent: int = 5
+    left_right_px: int | None = 1
+    speckle_px: int = 100
+    speckle_range_px: int = 1
+    prefilter_cap: int = 31
+    uncertainty: str | None = None
+    workers: int = 1
 
-    def __init__(
-        self,
-        *,
-        mode: str = "hh4",
-        block_size: int = 3,
-        p1: int | None = None,
-        p2: int | None = None,
-        uniqueness_percent: int = 5,
-        left_right_px: int | None = 1,
-        speckle_px: int = 100,
-        speckle_range_px: int = 1,
-        prefilter_cap: int = 31,
-        uncertainty: str | None = None,
-        workers: int = 1,
-    ) -> None:
-        if mode not in MODES:
-            raise InputError(f"SGM has no mode {mode!r}", remedy=f"take one of {', '.join(MODES)}")
-        if block_size < 1 or block_size % 2 == 0:
+    margin_px: ClassVar[int] = MARGIN_PX
+    invalid_outside: ClassVar[bool] = True  # what matches outside the right image has no disparity
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
             raise InputError(
-                f"SGM's block_size of {block_size} px is not odd", remedy="take 1, 3, 5, …"
+                f"SGM has no mode {self.mode!r}", remedy=f"take one of {', '.join(MODES)}"
             )
-        if uncertainty not in UNCERTAINTIES:
+        if self.block_size < 1 or self.block_size % 2 == 0:
             raise InputError(
-                f"SGM has no uncertainty {uncertainty!r}",
+                f"SGM's block_size of {self.block_size} px is not odd", remedy="take 1, 3, 5, …"
+            )
+        if self.uncertainty not in UNCERTAINTIES:
+            raise InputError(
+                f"SGM has no uncertainty {self.uncertainty!r}",
                 remedy=f"take one of {', '.join(filter(None, UNCERTAINTIES))}, or null",
             )
-        area = block_size**2
-        p1, p2 = 8 * area if p1 is None else p1, 64 * area if p2 is None else p2
+        p1, p2 = self._penalties
         if not 0 < p1 < p2:
             raise InputError(
                 f"SGM's penalties p1 = {p1} and p2 = {p2} are not 0 < p1 < p2",
                 remedy="take a larger p2",
             )
-        self._settings = {
-            "mode": MODES[mode],
-            "blockSize": block_size,
-            "P1": p1,
-            "P2": p2,
-            "uniquenessRatio": uniqueness_percent,
-            "disp12MaxDiff": NO_CHECK if left_right_px is None else max(left_right_px, 1),
-            "speckleWindowSize": speckle_px,
-            "speckleRange": speckle_range_px,
-            "preFilterCap": prefilter_cap,
-        }
-        self._workers = workers
-        self._uncertainty = uncertainty
+
+    @property
+    def _penalties(self) -> tuple[int, int]:
+        area = self.block_size**2
+        return (
+            8 * area if self.p1 is None else self.p1,
+            64 * area if self.p2 is None else self.p2,
+        )
 
     def opencv(self, disparity_range: tuple[int, int]) -> cv2.StereoSGBM:
         """OpenCV's object for a disparity range: of the next multiple of 16 px."""
         low, high = disparity_range
         count = math.ceil((high - low) / STEP) * STEP
-        return cv2.StereoSGBM.create(minDisparity=low, numDisparities=count, **self._settings)
+        p1, p2 = self._penalties
+        return cv2.StereoSGBM.create(
+            minDisparity=low,
+            numDisparities=count,
+            mode=MODES[self.mode],
+            blockSize=self.block_size,
+            P1=p1,
+            P2=p2,
+            uniquenessRatio=self.uniqueness_percent,
+            disp12MaxDiff=NO_CHECK if self.left_right_px is None else max(self.left_right_px, 1),
+            speckleWindowSize=self.speckle_px,
+            speckleRange=self.speckle_range_px,
+            preFilterCap=self.prefilter_cap,
+        )
 
     def scaling(self, left: Any, right: Any) -> GreyMapping | None:
         """The mapping to 8 bits that all parts of two images share; None for images of 8 bits."""
@@ -165,7 +174,7 @@ class SemiGlobalMatcher:
         if left.ndim == 2 and left.dtype != np.uint8 and scaling is None:
             scaling = grey_mapping(left, right)
         padded = [pad(to_8_bits(image, scaling), before, after) for image in (left, right)]
-        with _threads(self._workers):
+        with _threads(self.workers):
             found = matcher.compute(*padded)[:, before : before + left.shape[1]]
         return _valid(found, left, right, low, high)
 
@@ -178,10 +187,10 @@ class SemiGlobalMatcher:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """The disparity, and its standard uncertainty [h, w] px if one is asked for."""
         found = self(left, right, disparity_range, scaling)
-        if self._uncertainty is None:
+        if self.uncertainty is None:
             return found, None
         scaling = scaling or self.scaling(left, right)
-        if self._uncertainty == "peak_ratio":
+        if self.uncertainty == "peak_ratio":
             images = (to_8_bits(image, scaling) for image in (left, right))
             return found, peak_ratio(found, *images, disparity_range)
         turned = (np.ascontiguousarray(image[:, ::-1]) for image in (right, left))

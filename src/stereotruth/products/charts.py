@@ -35,7 +35,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one kind, or a line (an SVG path)."""
+    """Points of one kind, or a line (an SVG path), perhaps ``filled``."""
 
     name: str
     colour: str
@@ -43,6 +43,7 @@ class Series:
     dash: str = ""
     path: str = ""
     points: tuple[Point, ...] = ()
+    filled: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,21 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..errors import InputError
+from .atomic_outputs import atomically
 from .locks import exclusive
-from .publication import publishing
+from .provenance import own_digest
+
+Made = TypeVar("Made")
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def atomic_file(path: str | Path) -> Iterator[Path]:
     """A scratch file beside ``path``, of its suffix, that takes its place if the block ends well.
 
     The folder is made. If the block fails, the scratch file goes and ``path`` stays as it was.
@@ -29,14 +32,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
     with exclusive(path):
         try:
             yield scratch
-            with publishing(path):
+            with atomically(path):
                 scratch.replace(path)
         finally:
             scratch.unlink(missing_ok=True)
 
 
 @contextmanager
-def whole_folder(path: str | Path) -> Iterator[Path]:
+def atomic_folder(path: str | Path) -> Iterator[Path]:
     """An empty scratch folder beside ``path`` that takes its place if the block ends well.
 
     If the block fails, the scratch folder goes and ``path`` stays as it was.
@@ -50,7 +53,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
         scratch.mkdir()
         try:
             yield scratch
-            with publishing(path):
+            with atomically(path):
                 if path.exists():
                     path.rename(old)
                 scratch.rename(path)
@@ -106,7 +109,7 @@ def growing_table(
     path: str | Path, columns: Iterable[str], line_end: str = "\n"
 ) -> Iterator[TableWriter]:
     """A CSV file with its header, whole when the block ends well; its rows go to what is given."""
-    with replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
+    with atomic_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as stream:
         writer = TableWriter(stream, list(columns), lineterminator=line_end)
         writer.writeheader()
         yield writer
@@ -135,7 +138,7 @@ def read_table(path: str | Path) -> Iterator[dict[str, str]]:
 
 def write_json(path: str | Path, values: Mapping[str, Any]) -> None:
     """A JSON file, whole or absent."""
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -150,6 +153,50 @@ def read_json(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def _damaged(path: str | Path) -> InputError:
+def sealed(values: Mapping[str, Any]) -> str:
+    """JSON with a digest of its own, by which :func:`read_sealed` knows that nothing changed."""
+    text = {"digest": own_digest(values), **values}
+    return json.dumps(text, indent=1, allow_nan=False) + "\n"
+
+
+def read_sealed(path: str | Path) -> dict[str, Any]:
+    """What :func:`sealed` was given. Raises InputError if it is not what was written."""
+    values, is_as_written = read_perhaps_edited(path)
+    if not is_as_written:
+        raise _damaged(path, "not what was written")
+    return values
+
+
+def read_perhaps_edited(path: str | Path) -> tuple[dict[str, Any], bool]:
+    """What a JSON file holds, and whether that is what :func:`sealed` was given."""
+    values = read_json(path)
+    return values, values.pop("digest", None) == own_digest(values)
+
+
+def _damaged(path: str | Path, why: str = "no JSON of ours") -> InputError:
     remedy = "run the workflow again, which makes it again"
-    return InputError("damaged: no JSON of ours", file=path, remedy=remedy)
+    return InputError(f"damaged: {why}", file=path, remedy=remedy)
+
+
+def read_record(
+    path: str | Path,
+    make: Callable[[Any], Made],
+    *,
+    what: str,
+    stage: str,
+    read: Callable[[str | Path], dict[str, Any]] = read_sealed,
+) -> Made:
+    """What ``make`` makes of a file of :func:`sealed`, as ``read`` reads it.
+
+    Raises InputError if that is missing or no ``what``; the ``stage`` makes it anew.
+    """
+    try:
+        return make(read(path))
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"no such {what}", file=path, remedy=f"run the {stage} stage") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"no {what} ({error})", file=path, remedy=f"run the {stage} stage again"
+        ) from error

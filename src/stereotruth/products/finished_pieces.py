@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .files import replacing
+from .files import atomic_file
 from .provenance import file_sha256
 
 FORMAT = 1  # of records
@@ -40,7 +40,7 @@ class Ledger:
         """Record that a piece is done; ``result`` is JSON-ready."""
         sums = {label: file_sha256(path) for label, path in files.items() if path.exists()}
         record = {"format": FORMAT, "key": key, "sha256": sums, "result": result}
-        with replacing(self._file(name)) as scratch:
+        with atomic_file(self._file(name)) as scratch:
             scratch.write_text(json.dumps(record))
         return Piece(sums, result)
 

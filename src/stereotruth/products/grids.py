@@ -1,12 +1,13 @@
 """Zarr stores that are whole or absent: pixel grids and others.
 
-A store is built as :func:`.files.whole_folder` builds folders and gets the attribute ``complete``
+A store is built as :func:`.files.atomic_folder` writes folders and gets the attribute ``complete``
 last, so that a killed run never leaves something that looks finished; the one opener of each kind
 of store checks that attribute.
 """
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,12 +22,15 @@ from zarr.codecs import BloscCodec, BloscShuffle
 from zarr.storage import LocalStore
 
 from ..errors import InputError
-from .files import replacing, whole_folder
+from .files import atomic_file, atomic_folder
+from .provenance import digest
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
+METADATA = "zarr.json"  # of a store: all of its arrays' with its own
+SEAL = "metadata_digest"  # attribute of a store
 CONVENTIONS = (
     "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
     "disparity = x_left - x_right in px of the epipolar grid"
@@ -64,15 +68,25 @@ class PlainStore(LocalStore):
 
 
 @contextmanager
-def building(path: str | Path) -> Iterator[Path]:
+def atomic_store(path: str | Path) -> Iterator[Path]:
     """An empty scratch folder whose store becomes ``path`` if the block ends well."""
-    with whole_folder(path) as scratch:
+    with atomic_folder(path) as scratch:
         yield scratch
         group = zarr.open_group(scratch, mode="r+")
         group.attrs["complete"] = True
         with warnings.catch_warnings():  # an extension of Zarr v3 that xarray reads by default
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
             zarr.consolidate_metadata(group.store)
+        seal(scratch)
+
+
+def seal(path: Path) -> None:
+    """Have the consolidated metadata keep a digest of their own."""
+    file = path / METADATA
+    found = json.loads(file.read_bytes())
+    found["attributes"].pop(SEAL, None)
+    found["attributes"][SEAL] = digest(found)
+    file.write_text(json.dumps(found, indent=2))
 
 
 def create_grid(
@@ -83,12 +97,14 @@ def create_grid(
     chunk: int,
     shard: int,
     attrs: Mapping[str, Any],
+    of: str = "epipolar grid",
 ) -> dict[str, zarr.Array]:
     """An empty [y, x] grid store of Zarr v3; returns its arrays by name.
 
     Arrays are stored in square chunks of ``chunk`` px inside shard files of ``shard`` px (a
     multiple). Writers must write whole shards: two writers in one shard spoil it. Coordinates
-    ``x`` and ``y`` hold the pixel's column and row. Pixels never written take no space.
+    ``x`` and ``y`` hold the pixel's column and row ``of`` the grid. Pixels never written take no
+    space.
     """
     if shard % chunk:
         raise ValueError(f"shard of {shard} px is no multiple of the chunk of {chunk} px")
@@ -114,7 +130,7 @@ def create_grid(
             dtype="int32",
             chunks=(size,),
             dimension_names=(name,),
-            attributes={"units": "px", "long_name": f"{axis} of the epipolar grid"},
+            attributes={"units": "px", "long_name": f"{axis} of the {of}"},
         )
         coordinate[:] = np.arange(size, dtype="int32")
     return arrays
@@ -153,13 +169,13 @@ class Strip:
 
     def tell(self, path: str | Path) -> None:
         """Write the file that tells that the strip is made."""
-        with replacing(path) as scratch:
+        with atomic_file(path) as scratch:
             scratch.write_text(f'{{"strip": "{self}"}}\n')
 
 
-def _damaged(path: str | Path, error: Exception) -> InputError:
+def _damaged(path: str | Path, why: str) -> InputError:
     return InputError(
-        f"damaged Zarr store ({type(error).__name__})",
+        f"damaged Zarr store ({why})",
         file=path,
         remedy="delete it and run the workflow again",
     )
@@ -173,12 +189,16 @@ def require_complete(path: str | Path) -> zarr.Group:
     try:
         group = zarr.open_group(path, mode="r")
         complete = group.attrs.get("complete", False)
+        found = json.loads(Path(path, METADATA).read_bytes())
+        whole = not complete or found["attributes"].pop(SEAL, None) == digest(found)
     except FileNotFoundError as error:
         raise InputError(
             "no such Zarr store", file=path, remedy="run the stage that makes it"
         ) from error
     except Exception as error:  # whatever a damaged zarr.json makes of Zarr
-        raise _damaged(path, error) from error
+        raise _damaged(path, type(error).__name__) from error
+    if not whole:
+        raise _damaged(path, f"{METADATA} is not what was written")
     if not complete:
         raise InputError(
             "half-written Zarr store", file=path, remedy="delete it and run the workflow again"
@@ -187,11 +207,17 @@ def require_complete(path: str | Path) -> zarr.Group:
 
 
 def open_grid(path: str | Path) -> xr.Dataset:
-    """A finished grid store as a lazy xarray Dataset, whose windows are read straight from Zarr."""
+    """A finished grid store as a lazy xarray Dataset, whose windows are read straight from Zarr.
+
+    Coordinates ``x`` and ``y`` are the pixels' columns and rows, whole numbers at their centres.
+    Each array has its ``units`` and ``long_name``, the dataset the epipolar model (``epipolar``)
+    and what it was made of. A pixel without a value holds NaN or what ``nodata`` says. Raises
+    InputError if the store is missing, was not finished or is damaged.
+    """
     import xarray as xr  # a quarter of a job's start-up, and most jobs need none
 
     require_complete(path)
     try:
         return xr.open_zarr(path, consolidated=True, mask_and_scale=False, chunks=None)
     except Exception as error:
-        raise _damaged(path, error) from error
+        raise _damaged(path, type(error).__name__) from error

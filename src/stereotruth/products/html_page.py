@@ -13,7 +13,7 @@ from typing import Any
 
 import jinja2
 
-from .files import replacing
+from .files import atomic_file
 from .html_tables import gate, minus, words
 
 SHARED = Path(__file__).parent  # of what all pages share
@@ -37,7 +37,7 @@ def write_page(out: str | Path, template: str | Path, values: Mapping[str, Any])
     )
     environment.filters |= FILTERS
     given = {"index": None, "paper": PAPER, **values}
-    with replacing(out) as scratch, scratch.open("w", encoding="utf-8") as stream:
+    with atomic_file(out) as scratch, scratch.open("w", encoding="utf-8") as stream:
         environment.get_template(template.name).stream(given).dump(stream)
 
 

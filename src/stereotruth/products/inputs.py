@@ -89,13 +89,22 @@ def stamp(path: str | Path) -> Stamp:
     return Stamp(place.hexdigest(), change.hexdigest(), young)
 
 
+def file_checksums(path: str | Path) -> dict[str, str]:
+    """SHA-256 of all files in a folder by their names in it; of a file itself, under no name."""
+    return {name: file_sha256(file) for name, file in _files(Path(path))}
+
+
+def combined(sums: Mapping[str, str]) -> str:
+    """One checksum for a file, or for the names and checksums of all files in a folder."""
+    if "" in sums:
+        return sums[""]
+    lines = (f"{value} {name}\n" for name, value in sums.items())
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 def checksum(path: str | Path) -> str:
     """SHA-256 of a file, or of the names and checksums of all files in a folder."""
-    path = Path(path)
-    if not path.is_dir():
-        return file_sha256(path)
-    lines = (f"{file_sha256(file)} {name}\n" for name, file in _files(path))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return combined(file_checksums(path))
 
 
 class Checksums:
@@ -103,44 +112,38 @@ class Checksums:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self._known: dict[str, tuple[Stamp, str]] = {}
 
     def of(self, path: str | Path) -> tuple[Stamp, str]:
         """Stamp and checksum of a file or folder. Raises InputError if it cannot be read."""
+        kept = self.folder / hashlib.sha256(str(Path(path).absolute()).encode()).hexdigest()
         try:
-            return self._of(Path(path))
+            now = stamp(path)
+            place, change, found = self._read(kept)
+            if (place, change) != (now.place, now.change):
+                found = checksum(path)
+                if not now.young and stamp(path) == now:
+                    self._write(kept, f"{now.place} {now.change} {found}")
         except OSError as error:
             raise InputError(
                 f"cannot be read: {error.strerror}",
                 file=error.filename or path,
                 remedy="see that it is there, and that you may read it",
             ) from None
+        return now, found
 
-    def _of(self, path: Path) -> tuple[Stamp, str]:
-        now = stamp(path)
-        name = hashlib.sha256(str(path.absolute()).encode()).hexdigest()
-        before = self._known.get(name) or self._stored(name)
-        if before is None or (before[0].place, before[0].change) != (now.place, now.change):
-            before = now, checksum(path)
-            if not now.young and stamp(path) == now:
-                self._known[name] = before
-                self._store(name, now, before[1])
-        return now, before[1]
-
-    def _stored(self, name: str) -> tuple[Stamp, str] | None:
+    def _read(self, kept: Path) -> tuple[str, str, str]:
         try:
-            place, change, found = (self.folder / name).read_text().split()
+            place, change, found = kept.read_text().split()
         except (OSError, ValueError):
-            return None
-        self._known[name] = Stamp(place, change, False), found
-        return self._known[name]
+            return "", "", ""
+        return place, change, found
 
-    def _store(self, name: str, now: Stamp, found: str) -> None:
-        scratch = self.folder / f"{name}.{os.getpid()}"
+    def _write(self, kept: Path, text: str) -> None:
+        scratch = kept.with_name(f"{kept.name}.{os.getpid()}")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            scratch.write_text(f"{now.place} {now.change} {found}")
-            scratch.replace(self.folder / name)
+            scratch.write_text(text)
+            scratch.replace(kept)
         except OSError:  # a full disk, one that is read-only: it will be computed again
             with suppress(OSError):
                 scratch.unlink()

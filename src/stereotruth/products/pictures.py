@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
-from .files import replacing
+from .files import atomic_file
 
 Picture = NDArray[np.uint8]
 
@@ -87,7 +87,7 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     ticks = {id(label) for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
     for text in figure.findobj(Text):
         text.set_parse_math(id(text) in ticks)  # powers of ten of logarithmic axes
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
 
 
@@ -95,12 +95,14 @@ QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the pi
 
 
 def encode(picture: Picture, limit: int) -> str:
-    """A data URI of a grey or RGB picture as WebP of at most ``limit`` bytes.
+    """A data URI of a grey, RGB or RGBA picture as WebP of at most ``limit`` bytes.
 
     Scaled down where even the lowest quality does not fit, then the best quality that fits (one
     pixel always does).
     """
-    colour = picture[..., ::-1] if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    order = {2: cv2.COLOR_GRAY2BGR, 3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    channels = picture.shape[2] if picture.ndim == 3 else 2
+    colour = cv2.cvtColor(np.ascontiguousarray(picture), order[channels])
     data = _webp(colour, QUALITIES[-1])
     while data.size > limit and (side := max(colour.shape[:2])) > 1:
         factor = min(0.9, np.sqrt(limit / data.size))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioIOError
 
 from ..errors import InputError
-from .files import replacing
+from .files import atomic_file
 from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
@@ -171,7 +171,7 @@ def read_flags(path: str | Path) -> tuple[NDArray[np.uint8], dict[int, str]]:
 def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
     """Write a disparity map as a TIFF of 32-bit floats with nodata NaN."""
     with (
-        replacing(path) as scratch,
+        atomic_file(path) as scratch,
         open_raster(
             scratch,
             "w",

@@ -13,17 +13,16 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from .inputs import Checksums
+from .inputs import Checksums, combined, file_checksums
 from .provenance import digest
 from .runs import KEPT
 
-RECORDS = Path("results", ".records")
-PLACES = (RECORDS / "made", KEPT / "made")
+PLACES = (Path("results", ".records", "made"), KEPT / "made")
 BEGUN = ".begun"  # suffix of the mark of a job that has not ended
 DIGESTS = ("code", "script", "measuring", "templates")  # settings whose values say nothing
 
@@ -33,13 +32,38 @@ class Record:
     """What a job has made of what.
 
     ``run``: see :mod:`.runs`; ``settings``: parameters and digests of code, JSON-ready; ``inputs``
-    and ``outputs``: SHA-256 by name (:func:`names_of`).
+    and ``outputs``: SHA-256 by name (:func:`names_of`); ``files``: of folders among the outputs,
+    the beginnings of the SHA-256 of their files, by which a damaged one is named.
     """
 
     run: str
     settings: Mapping[str, Any]
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
+    files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, run: str, settings: Mapping, inputs: Mapping, outputs: Iterable[str]) -> Record:
+        """The record of outputs as they are now."""
+        sums = {path: file_checksums(path) for path in outputs}
+        files = {path: _short(of) for path, of in sums.items() if Path(path).is_dir()}
+        made = {path: combined(of) for path, of in sums.items()}
+        return cls(run, settings, dict(inputs), made, files)
+
+    def damage(self, path: str) -> str:
+        """Which files of an output are not what was made, in words; the output, if it is a file."""
+        was = self.files.get(path)
+        if was is None or not Path(path).is_dir():
+            return path
+        now = _short(file_checksums(path))
+        names = sorted(name for name in {*was, *now} if was.get(name) != now.get(name))
+        said = [f"{path}/{name}{'' if name in now else ' (missing)'}" for name in names]
+        more = f" and {len(said) - 3} more files" if len(said) > 3 else ""
+        return (", ".join(said[:3]) or path) + more
+
+
+def _short(sums: Mapping[str, str]) -> dict[str, str]:
+    return {name: value[:12] for name, value in sums.items()}
 
 
 class DamagedRecord(Exception):
@@ -160,7 +184,7 @@ def why_due(
         return _older(outputs, inputs)
     for path in filter(os.path.lexists, outputs):
         if _checksum(path) != record.outputs.get(path):
-            return f"{path} is not what was made: made again"
+            return f"{record.damage(path)} is not what was made: made again"
     if other := set(inputs) ^ set(record.inputs):
         return f"other input: {', '.join(sorted(other))}"
     if changed := [p for p in inputs if _checksum(p) not in ("", record.inputs[p])]:

@@ -12,8 +12,8 @@ any rule, so that it outlives jobs, killed or not:
 
 A later job takes over the blocks whose records have the key that it would give them, and makes the
 others: after a kill those that were in flight, after one more LiDAR file those that it touches.
-:meth:`BlockStore.publish` puts hard links to all files (copies where there are no links) into the
-final place, in one step. Whatever was taken over, the published bytes are those of a fresh run.
+:meth:`BlockStore.write_atomically` puts hard links to all files (copies where there are no links)
+into the final place, in one step. Whatever was taken over, the bytes are those of a fresh run.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from typing import Any
 import zarr
 from numpy.typing import NDArray
 
-from .files import link, replacing
+from .atomic_outputs import marks_of_inputs
+from .files import atomic_file, link
 from .finished_pieces import Ledger
-from .grids import Layer, building, create_grid
+from .grids import Layer, atomic_store, create_grid
 from .inputs import Marks, refuse_replaced
 from .locks import FileLock
 from .provenance import digest
-from .publication import marks_of_inputs
 
 log = logging.getLogger("stereotruth")
 Block = tuple[slice, slice]
@@ -104,7 +104,9 @@ class BlockStore:
         """What the makers of finished blocks gave as ``result``."""
         return [self._done.get(self._name(block)).result for block in blocks]
 
-    def publish(self, path: str | Path, blocks: Iterable[Block], attrs: Mapping[str, Any]) -> None:
+    def write_atomically(
+        self, path: str | Path, blocks: Iterable[Block], attrs: Mapping[str, Any]
+    ) -> None:
         """Put the whole grid to ``path``, with ``attrs`` and the digest ``content`` of its pixels.
 
         The pixels of two stores are the same if ``content`` is.
@@ -116,7 +118,7 @@ class BlockStore:
                 content[str(file.relative_to(self.store))] = sums.get(name)
                 files += [file] if name in sums else []
         layout = json.loads((self.folder / "layout.json").read_text())
-        with building(path) as unfinished:
+        with atomic_store(path) as unfinished:
             metadata = _only_metadata(self)
             shutil.copytree(self.store, unfinished, ignore=metadata, dirs_exist_ok=True)
             for file in files:
@@ -131,7 +133,7 @@ def _only_metadata(store: BlockStore) -> Any:
 
 
 @contextmanager
-def making(
+def resumable_grid(
     path: str | Path,
     shape: tuple[int, int],
     layers: Mapping[str, Layer],
@@ -191,5 +193,5 @@ def _lay_out(
     for old in (store.store, store.folder / "done"):
         shutil.rmtree(old, ignore_errors=True)
     create_grid(store.store, shape, layers, chunk=chunk, shard=store.shard, attrs={})
-    with replacing(store.folder / "layout.json") as scratch:
+    with atomic_file(store.folder / "layout.json") as scratch:
         scratch.write_text(json.dumps(layout))

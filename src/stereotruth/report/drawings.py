@@ -1,4 +1,7 @@
-"""Geometry of the page's line drawings, in the units of their SVG view boxes (y down)."""
+"""A page's residuals as arrows, and its charts: histograms of disparities, calibration.
+
+In the units of their SVG view boxes (y down).
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
+from ..products.charts import Axis, Chart, Point, Series, look
+from ..products.html_tables import minus
 from ..products.pictures import round_length
 
 SIDE = 300.0  # longer side of a frame of residuals
 SHARE = 1 / 8  # of the frame, taken by the longest arrow
 WIDTH, HEIGHT = 420.0, 150.0  # of a histogram
 BARS = 80  # most bars of a histogram
+RIGHT = (68.3, 95.4)  # % of normal errors below once and twice their uncertainty
 
 
 @dataclass(frozen=True)
@@ -79,22 +84,7 @@ def arrow_frame(
     return ArrowFrame(title, width, height, tuple(arrows), key, round(key * arrow, 1))
 
 
-@dataclass(frozen=True)
-class Histogram:
-    """A histogram's outline as an SVG path, and ticks as (x, text)."""
-
-    title: str
-    colour: str
-    count: int
-    mean: float
-    path: str
-    ticks: tuple[tuple[float, str], ...]
-    peak: float
-
-
-def histograms(
-    counted: Sequence[tuple[str, str, Mapping[int, int]]],
-) -> list[Histogram]:
+def histograms(counted: Sequence[tuple[str, str, Mapping[int, int]]]) -> list[Chart]:
     """Histograms of pixels by whole px, (title, colour, counts) each, on one common axis.
 
     Columns are joined where there are many; those beyond the permille at either end of all
@@ -112,61 +102,70 @@ def histograms(
     high = int(values[min(np.searchsorted(share, 0.999), len(values) - 1)]) + 1
     step = max(1, math.ceil((high - low) / BARS))
     high = low + step * math.ceil((high - low) / step)
-    scale = WIDTH / (high - low)
-    ticks = [t for t in MaxNLocator(6, integer=True).tick_values(low, high) if low <= t <= high]
-    found = []
-    for title, colour, counts in counted:
-        number = sum(counts.values())
-        if not number:
-            continue
-        bars = np.zeros((high - low) // step)
-        for value, count in counts.items():
-            if low <= value < high:
-                bars[(value - low) // step] += count
-        peak = bars.max() / number
-        path = [f"M0 {HEIGHT:g}"]
-        for k, bar in enumerate(bars):
-            y = HEIGHT * (1 - bar / max(bars.max(), 1))
-            path.append(f"V{y:.1f}H{(k + 1) * step * scale:.1f}")
-        found.append(
-            Histogram(
-                title=title,
-                colour=colour,
-                count=number,
-                mean=sum((v + 0.5) * c for v, c in counts.items()) / number,
-                path="".join([*path, f"V{HEIGHT:g}Z"]),
-                ticks=tuple((round((t - low) * scale, 1), f"{t:g}") for t in ticks),
-                peak=peak / step,
-            )
-        )
-    return found
+    x = Axis(low, high, WIDTH)
+    return [
+        _histogram(title, colour, counts, x, step)
+        for title, colour, counts in counted
+        if sum(counts.values())
+    ]
 
 
-@dataclass(frozen=True)
-class Calibration:
+def _histogram(title: str, colour: str, counts: Mapping[int, int], x: Axis, step: int) -> Chart:
+    """The histogram of one kind of pixels, in columns of ``step`` px."""
+    number = sum(counts.values())
+    bars = np.zeros(round((x.high - x.low) / step))
+    for value, count in counts.items():
+        if x.low <= value < x.high:
+            bars[round(value - x.low) // step] += count
+    y = Axis(0.0, max(100 * float(bars.max()) / number / step, 1e-9), HEIGHT, turned=True)
+    path = [f"M0 {HEIGHT:g}"]
+    for k, bar in enumerate(bars):
+        path.append(f"V{y.at(100 * bar / number / step):g}H{x.at(x.low + (k + 1) * step):g}")
+    mean = sum((v + 0.5) * c for v, c in counts.items()) / number
+    area = Series(title, colour, path="".join([*path, f"V{HEIGHT:g}Z"]), filled=True)
+    return Chart(
+        title=f"histogram of disparities, {title}",
+        caption=f"{number / 1e6:.2f} million labels, mean {minus(f'{mean:.1f}')} px",
+        x_title="disparity, px",
+        y_title="% of the labels per px",
+        x_ticks=x.ticks(),
+        y_ticks=y.ticks()[-1:],
+        series=(area,),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+def calibration(deciles: Sequence[Mapping[str, float]], caption: str) -> Chart | None:
     """Shares of errors below once and twice their uncertainty, by groups of rising uncertainty.
 
-    ``groups``: (x, y of the one, y of the other, mean uncertainty, what to say); ``right``: (y,
-    share in percent) of both where the uncertainty is right.
+    ``deciles``: of the labels, by their uncertainty; dashed lines stand where it is right.
     """
-
-    groups: tuple[tuple[float, float, float, str, str], ...]
-    right: tuple[tuple[float, str], ...]
-
-
-def calibration(deciles: Sequence[Mapping[str, float]]) -> Calibration | None:
-    """Groups of labels (deciles of their uncertainty) in a frame of ``WIDTH`` by ``HEIGHT``."""
     if not deciles:
         return None
-
-    def y(share: float) -> float:
-        return round(HEIGHT * (1 - share), 1)
-
+    y = Axis(0.0, 100.0, HEIGHT, turned=True)
     step = WIDTH / len(deciles)
-    groups = []
+    once, twice, ticks = [], [], []
     for k, group in enumerate(deciles):
-        once, twice = group["share_below_1"], group["share_below_2"]
-        sigma = f"{group['mean_uncertainty']:.3f}"
-        text = f"uncertainty {sigma} px: {100 * once:.1f} % below once, {100 * twice:.1f} % twice"
-        groups.append((round((k + 0.5) * step, 1), y(once), y(twice), sigma, text))
-    return Calibration(tuple(groups), tuple((y(p / 100), f"{p} %") for p in (68.3, 95.4)))
+        shares = 100 * group["share_below_1"], 100 * group["share_below_2"]
+        sigma, at = f"{group['mean_uncertainty']:.3f}", round((k + 0.5) * step, 1)
+        text = f"uncertainty {sigma} px: {shares[0]:.1f} % below once, {shares[1]:.1f} % twice"
+        once.append(Point(at, y.at(shares[0]), text))
+        twice.append(Point(at, y.at(shares[1]), text))
+        ticks.append((at, sigma))
+    right = "".join(f"M0 {y.at(p):g}H{WIDTH:g}" for p in RIGHT)
+    return Chart(
+        title="shares of the errors below their uncertainty",
+        caption=caption,
+        x_title="uncertainty, px: groups of labels",
+        y_title="",
+        x_ticks=tuple(ticks),
+        y_ticks=tuple((y.at(p), f"{p:g} %") for p in (0.0, *RIGHT)),
+        series=(
+            Series("below once", look(0)[0], points=tuple(once)),
+            Series("below twice", look(1)[0], shape=1, points=tuple(twice)),
+            Series("where it is right", "var(--dim)", dash="5 4", path=right),
+        ),
+        width=WIDTH,
+        height=HEIGHT,
+    )

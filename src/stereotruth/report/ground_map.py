@@ -107,7 +107,9 @@ def ground_map(
             if dataset.crs != rasterio.crs.CRS.from_user_input(to_map.target_crs):
                 continue
             bands, box = dataset.read(), dataset.bounds
-        picture = np.moveaxis(np.where(bands[3] > 0, bands[:3], 255).astype(np.uint8), 0, -1)
+        # transparent where the scene shows nothing: other scenes lie below
+        grounded = np.where(bands[3] > 0, bands, np.array([255, 255, 255, 0])[:, None, None])
+        picture = np.moveaxis(grounded.astype(np.uint8), 0, -1)
         (left, right), (top, bottom) = at(
             np.array([box.left, box.right]), np.array([box.top, box.bottom])
         ).tolist()

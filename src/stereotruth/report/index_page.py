@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..errors import in_number
 from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
@@ -97,7 +98,8 @@ def _city(root: Path, out: Path, page: Path) -> dict[str, Any]:
         counts = export.get("splits", {}).get("realised", {})
         split = ", ".join(f"{n} {of}" for of, n in counts.items() if n)
         size = f"{export['size_px']} × {export['size_px']} px"
-        facts.append(f"{export['labelled_pairs']} labelled pairs of {size} ({split})")
+        pairs = in_number(export["labelled_pairs"], "labelled pair")
+        facts.append(f"{pairs} of {size} ({split})")
         shares = export["share_of_pixels"]
         labelled = sum(share for status, share in shares.items() if status.startswith("labelled"))
         facts.append(f"{100 * labelled:.1f} % of their pixels labelled")

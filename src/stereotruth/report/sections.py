@@ -11,6 +11,7 @@ import numpy as np
 from ..dataset import quick_looks
 from ..dataset.manifest import Tile
 from ..dataset.split_names import NONE, SPLITS
+from ..products.charts import Chart
 from ..products.html_tables import Table, cells_of, columns_of, limit, missed, table, words
 from . import drawings
 from .tile_pictures import TilePictures
@@ -109,7 +110,7 @@ def _points(record: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def histograms(
     rows: Sequence[Mapping[str, str]], made: Mapping[str, TilePictures]
-) -> dict[str, list[drawings.Histogram]]:
+) -> dict[str, list[Chart]]:
     """Disparities of the tiles' files, by scene and by split."""
 
     def counted(key: str, value: str) -> dict[int, int]:
@@ -211,12 +212,25 @@ def exact_truth(
         "whole": table([r for r in rows if not r["scope"].startswith("tile ")]),
         "tiles": table([r for r in rows if r["scope"].startswith("tile ")]),
         "status": table(by_status),
-        "calibration": drawings.calibration(calibration.get("deciles", [])),
-        "below": [calibration.get("share_below_1"), calibration.get("share_below_2")],
+        "calibration": drawings.calibration(
+            calibration.get("deciles", []), _below_uncertainty(calibration)
+        ),
         "meaning": {
             words(k): v for k, v in record.get("meaning", {}).items() if isinstance(v, str)
         },
     }
+
+
+def _below_uncertainty(calibration: Mapping[str, Any]) -> str:
+    """What share of the errors is below their uncertainty, over all labels."""
+    once, twice = (calibration.get(f"share_below_{k}") for k in (1, 2))
+    text = "Errors below once and twice their uncertainty."
+    if once is None or twice is None:
+        return text
+    return (
+        f"{text} {100 * once:.1f} % of the errors are below their uncertainty (68.3 % is right), "
+        f"{100 * twice:.1f} % below twice theirs (95.4 %)."
+    )
 
 
 def quality_gates(record: Mapping[str, Any]) -> dict[str, Any] | None:

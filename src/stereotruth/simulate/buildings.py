@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,6 +14,29 @@ from .surfaces import CELL_M, IN_IMAGES, IN_LIDAR, Surfaces, terrain_heights
 from .zones import BUILT, ZONE_KINDS
 
 FLAT, GRAVEL, TILES, SHEET = range(4)
+
+
+@dataclass(frozen=True)
+class House:
+    """A building to be: a box, perhaps with a wing that makes an L, and with small ones on top.
+
+    Metres: its middle (``cx``, ``cy``) in plan, ``length`` along ``angle`` (radians), ``height`` of
+    the eaves over the highest ground below, ``rise`` of a gabled roof over them, ``wing`` (length,
+    width), ``steepest`` difference of the ground that it bears. ``top``: whether there may be small
+    boxes on a flat roof; ``cover``: of the roof, None for one that goes with its form.
+    """
+
+    cx: float
+    cy: float
+    angle: float
+    length: float
+    width: float
+    height: float
+    rise: float = 0.0
+    wing: tuple[float, float] | None = None
+    steepest: float = 4.0
+    top: bool = True
+    cover: int | None = None
 
 
 class _Builder:
@@ -40,14 +64,11 @@ class _Builder:
             for cx, cy, ax, ay, bx, by, width, height in self.around
         )
 
-    def add(
-        self, zone: int, cx: float, cy: float, angle: float, length: float, width: float,
-        height: float, rise: float = 0.0, wing: tuple[float, float] | None = None,
-        steepest: float = 4.0, top: bool = True, cover: int | None = None,
-    ) -> bool:  # fmt: skip
-        """One building: a box, perhaps with a wing (length, width) that makes an L, and on top."""
-        ux, uy = math.cos(angle), math.sin(angle)
-        a, b = length / 2, width / 2
+    def add(self, zone: int, house: House) -> bool:
+        """Build a house of a zone (-1: of any) if it fits; whether it does."""
+        cx, cy, wing, rise = house.cx, house.cy, house.wing, house.rise
+        ux, uy = math.cos(house.angle), math.sin(house.angle)
+        a, b = house.length / 2, house.width / 2
         if not self._near(cx - a * ux + b * uy, cy - a * uy - b * ux):
             return False
         here = self.zone_cells[int((cy - self.s.y0) / CELL_M)][int((cx - self.s.x0) / CELL_M)]
@@ -71,18 +92,20 @@ class _Builder:
         if self.city.character.flat_roofs:
             rise = 0.0
         z = terrain_heights(self.s, corners)[:, 0]
-        if z.min() < self.s.water + 0.6 or z.max() - z.min() > steepest:
+        if z.min() < self.s.water + 0.6 or z.max() - z.min() > house.steepest:
             return False
         rng = self.rng
-        eaves = z.max() + height
+        eaves = z.max() + house.height
         roof = min(max(rng.lognormal(math.log(0.33), 0.42), 0.12), 0.85)
         walls = rng.uniform(0.22, 0.55)
+        cover = house.cover
         if cover is None:
             cover = TILES if rise > 1.2 else (FLAT, GRAVEL, FLAT, SHEET)[rng.integers(4)]
         for part in parts:
             self._put(part, eaves, rise if wing is None else 0.0, roof, walls, cover)
-        if top and rise == 0 and min(length, width) > 9.5 and height > 9:
-            for _ in range(int(rng.integers(1, 3 if length < 35 else 4))):
+        broad = min(house.length, house.width) > 9.5
+        if house.top and rise == 0 and broad and house.height > 9:
+            for _ in range(int(rng.integers(1, 3 if house.length < 35 else 4))):
                 ta, tb = rng.uniform(1.6, 3.4), rng.uniform(1.4, 2.6)
                 du = rng.uniform(-1, 1) * (a - ta - 2.2)
                 dv = rng.uniform(-1, 1) * (b - tb - 1.8)
@@ -112,10 +135,11 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                 length, width = rng.uniform(15, min(31, pitch_w - 9)), rng.uniform(15, 23)
                 x, y = at((i + 0.5) * pitch_w + rng.uniform(-2, 2), (j + 0.5) * pitch_h)
                 tall = rng.uniform(*towers)
-                if build.add(zone, x, y, angle, length, width, tall) and podium:
+                if build.add(zone, House(x, y, angle, length, width, tall)) and podium:
                     build.groups -= 1  # the podium goes with its tower
-                    build.add(zone, x, y, angle, min(length + 12, pitch_w - 4), width + 12,
-                              rng.uniform(7, 11), top=False)  # fmt: skip
+                    length = min(length + 12, pitch_w - 4)
+                    low = rng.uniform(7, 11)
+                    build.add(zone, House(x, y, angle, length, width + 12, low, top=False))
     elif kind == "slabs":
         lanes = 3
         for j in range(lanes):
@@ -124,7 +148,8 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
             while p < w - 26:
                 length = min(rng.uniform(32, 58), w - 2 - p)
                 x, y = at(p + length / 2, (j + 0.5) * h / lanes)
-                build.add(zone, x, y, angle, length, rng.uniform(11, 13.5), 3.0 * storeys + 1)
+                width = rng.uniform(11, 13.5)
+                build.add(zone, House(x, y, angle, length, width, 3.0 * storeys + 1))
                 p += length + rng.uniform(7, 12)
     elif kind == "lowrise":
         columns, lanes = max(1, int(w // 21)), max(1, int(h // 18))
@@ -136,8 +161,9 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                 length, width = rng.uniform(11, pitch_w - 2.5), rng.uniform(9, pitch_h - 3)
                 x, y = at((i + 0.5) * pitch_w, (j + 0.5) * pitch_h)
                 rise = rng.uniform(1.5, 3) if rng.random() < 0.25 else 0.0
-                build.add(zone, x, y, angle + rng.normal(0, 0.015), length, width,
-                          3.1 * int(rng.integers(2, 7)), rise)  # fmt: skip
+                turned = angle + rng.normal(0, 0.015)
+                height = 3.1 * int(rng.integers(2, 7))
+                build.add(zone, House(x, y, turned, length, width, height, rise))
     elif kind == "village":
         columns, lanes = max(1, int(w // 17)), max(1, int(h // 16))
         pitch_w, pitch_h = w / columns, h / lanes
@@ -151,9 +177,10 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                 wing = None
                 if not gabled and rng.random() < 0.25:
                     length, width, wing = 12.0, 6.5, (6.0, 5.0)
-                build.add(zone, x, y, angle + rng.normal(0, 0.05), length, width,
-                          3.0 * int(rng.integers(1, 4)) + 0.5,
-                          rng.uniform(1.8, 3.0) if gabled else 0.0, wing)  # fmt: skip
+                turned = angle + rng.normal(0, 0.05)
+                height = 3.0 * int(rng.integers(1, 4)) + 0.5
+                rise = rng.uniform(1.8, 3.0) if gabled else 0.0
+                build.add(zone, House(x, y, turned, length, width, height, rise, wing))
     elif kind == "industry":
         lanes = 2 if rng.random() < 0.6 else 3
         for j in range(lanes):
@@ -163,20 +190,13 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                 x, y = at(p + length / 2, (j + 0.5) * h / lanes)
                 wide = rng.uniform(0.62, 0.8) * h / lanes
                 if rng.random() < 0.25 and lanes == 2:
-                    build.add(zone, x, y - 0.0, angle, length, wide * 0.5, rng.uniform(8, 14),
-                              wing=(wide * 0.3, 18.0), cover=GRAVEL)  # fmt: skip
+                    height, wing = rng.uniform(8, 14), (wide * 0.3, 18.0)
+                    hall = House(x, y, angle, length, wide * 0.5, height, wing=wing, cover=GRAVEL)
                 else:
-                    build.add(
-                        zone,
-                        x,
-                        y,
-                        angle,
-                        length,
-                        wide,
-                        rng.uniform(8, 13),
-                        rng.uniform(1.5, 3.0) if rng.random() < 0.6 else 0.0,
-                        cover=SHEET,
-                    )
+                    height = rng.uniform(8, 13)
+                    rise = rng.uniform(1.5, 3.0) if rng.random() < 0.6 else 0.0
+                    hall = House(x, y, angle, length, wide, height, rise, cover=SHEET)
+                build.add(zone, hall)
                 p += length + rng.uniform(9, 16)
 
 
@@ -218,10 +238,10 @@ def place_buildings(
             zone = int(sites.query((px, py))[1])
             if ZONE_KINDS[int(s.zones[zone, 7])] in BUILT or rng.random() < 0.25:
                 continue
-            build.add(zone, px, py, rng.uniform(-0.6, 0.6), rng.uniform(11, 17),
-                      rng.uniform(8.5, 11), rng.uniform(5, 10),
-                      rng.uniform(1.5, 2.6) if rng.random() < 0.2 else 0.0,
-                      steepest=7.0)  # fmt: skip
+            turned, length = rng.uniform(-0.6, 0.6), rng.uniform(11, 17)
+            width, height = rng.uniform(8.5, 11), rng.uniform(5, 10)
+            rise = rng.uniform(1.5, 2.6) if rng.random() < 0.2 else 0.0
+            build.add(zone, House(px, py, turned, length, width, height, rise, steepest=7.0))
     return build
 
 

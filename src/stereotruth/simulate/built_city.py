@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..products.files import replacing
+from ..products.files import atomic_file
 from .cities import CitySpec
 from .surfaces import Surfaces
 
@@ -15,7 +15,7 @@ from .surfaces import Surfaces
 def write_surfaces(city: CitySpec, out_npz: str | Path) -> None:
     """Build a city and write its surfaces: one array per field of :class:`.surfaces.Surfaces`."""
     built = surfaces_of(city)
-    with replacing(out_npz) as scratch, scratch.open("wb") as stream:
+    with atomic_file(out_npz) as scratch, scratch.open("wb") as stream:
         np.savez(stream, **built._asdict())
 
 

@@ -12,6 +12,7 @@ below. Positions and directions come out in the world frame of the city (see ``g
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -164,25 +165,47 @@ def locate(
     return origin + (z - origin[:, 2])[:, None] * toward
 
 
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """How a satellite flies over the target and looks at it.
+
+    ``look_deg`` along the track, negative looks back; ``aside_m``: distance of the target from the
+    ground track; ``yaw_rad`` beside yaw steering; ``drift`` float64[3, 2]: rate and bend of roll,
+    pitch and yaw, rad/s and rad/s².
+    """
+
+    look_deg: float
+    aside_m: float
+    ascending: bool
+    yaw_rad: float = 0.0
+    drift: np.ndarray = field(default_factory=lambda: np.zeros((3, 2)))
+
+    @classmethod
+    def drawn(cls, view: str, seed: int, *, ascending: bool) -> Pass:
+        """Of one view of a pair, ``"left"`` or ``"right"``, both taken on one pass of a ``seed``.
+
+        Drawn are the target's distance from the track (±30 km), a yaw of up to 0.7 degrees, and
+        the drift of the attitude; the track is the same for both views.
+        """
+        track = np.random.default_rng([seed, 1])
+        own = np.random.default_rng([seed, 2 if view == "left" else 3])
+        aside = track.uniform(-30e3, 30e3)
+        yaw = math.radians(track.uniform(-0.4, 0.4) + own.uniform(-0.3, 0.3))
+        return cls(LOOK_DEG[view], aside, ascending, yaw, drift_of_attitude(own))
+
+
+def drift_of_attitude(rng: np.random.Generator) -> np.ndarray:
+    """Rate and bend of roll, pitch and yaw [3, 2], see :class:`Pass`."""
+    return rng.normal(size=(3, 2)) * [[2e-5, 1.5e-5], [2e-5, 1.5e-5], [4e-5, 3e-5]]
+
+
 def aim(
-    frame: LocalFrame,
-    target: np.ndarray,
-    view: str,
-    *,
-    gsd: float,
-    cols: int,
-    rows: int,
-    seed: int,
-    ascending: bool,
+    frame: LocalFrame, target: np.ndarray, flown: Pass, *, gsd: float, cols: int, rows: int
 ) -> np.ndarray:
     """A camera whose image centre shows the world point ``target`` [3].
 
-    ``gsd``: metres per px at the target, across and along track. ``seed`` draws the track's
-    distance from the target (±30 km), attitude drift and a yaw of up to 0.7 degrees; the track is
-    the same for both views of a seed, as both are taken on one pass.
+    ``gsd``: metres per px at the target, across (at right angles to the ray) and along track.
     """
-    track = np.random.default_rng([seed, 1])
-    own = np.random.default_rng([seed, 2 if view == "left" else 3])
     cam = np.zeros(SIZE)
     cam[FRAME : FRAME + 12] = frame.packed()
     ground = frame.to_ecef(target)[0]
@@ -192,21 +215,20 @@ def aim(
     # inertial heading from the inclination; P lies above the target, aside by the track's offset
     latitude = math.asin(up[2])
     azimuth = math.asin(math.cos(math.radians(INCLINATION_DEG)) / math.cos(latitude))
-    if not ascending:
+    if not flown.ascending:
         azimuth = math.pi - azimuth
     east = np.cross([0.0, 0.0, 1.0], up)
     east /= np.linalg.norm(east)
     north = np.cross(up, east)
     forward = math.sin(azimuth) * east + math.cos(azimuth) * north
-    aside = track.uniform(-30e3, 30e3) / cam[RADIUS]
+    aside = flown.aside_m / cam[RADIUS]
     cam[P : P + 3] = math.cos(aside) * up + math.sin(aside) * np.cross(up, forward)
     cam[Q : Q + 3] = forward
-    cam[LOOK] = math.tan(math.radians(LOOK_DEG[view]))
+    cam[LOOK] = math.tan(math.radians(flown.look_deg))
     cam[COL0] = (cols - 1) / 2
     cam[ROWS_MID] = (rows - 1) / 2
-    cam[YAW] = math.radians(track.uniform(-0.4, 0.4) + own.uniform(-0.3, 0.3))
-    drift = own.normal(size=(3, 2)) * [[2e-5, 1.5e-5], [2e-5, 1.5e-5], [4e-5, 3e-5]]
-    for axis, (rate, bend) in zip((ROLL, PITCH, YAW), drift):
+    cam[YAW] = flown.yaw_rad
+    for axis, (rate, bend) in zip((ROLL, PITCH, YAW), flown.drift):
         cam[axis + 1], cam[axis + 2] = rate, bend
     cam[TIME_REF] = cam[TIME0] = -cam[LOOK] * ALTITUDE_M / 7000.0
     line = np.empty(12)

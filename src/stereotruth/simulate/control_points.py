@@ -13,13 +13,12 @@ from ..products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .layout import scene_coordinates
-from .render import ImagedScene, prepare
+from .render import Camera, ImagedScene, prepare
 from .surfaces import (
     ANY_VIEW,
     IN_IMAGES,
     IN_LIDAR,
-    LEFT_VIEW,
-    RIGHT_VIEW,
+    Surfaces,
     cast,
     terrain_heights,
 )
@@ -36,42 +35,40 @@ FRAME_MARGIN_PX = 30.0
 
 
 @kernel
-def _see(s, above_left, above_right, left, right, size, xyz, tolerance, image, seen):
-    """Image coordinates (left col, row, right col, row) of points, and whether both views do."""
+def _see(s, shown, above, cam, cols, rows, xyz, tolerance, image, seen):
+    """Image coordinates (col, row) of points in one image, and whether it shows them."""
     line = np.empty(12)
+    m = FRAME_MARGIN_PX
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        lc, lr = project_point(left, x, y, z, 0.5 * size[1], line)
-        free = seen_from(s, above_left, x, y, z, line, LEFT_VIEW, tolerance)
-        rc, rr = project_point(right, x, y, z, 0.5 * size[3], line)
-        both = seen_from(s, above_right, x, y, z, line, RIGHT_VIEW, tolerance)
-        image[n, 0], image[n, 1], image[n, 2], image[n, 3] = lc, lr, rc, rr
-        m = FRAME_MARGIN_PX
-        seen[n] = (
-            free and both
-            and m < lc < size[0] - m and m < lr < size[1] - m
-            and m < rc < size[2] - m and m < rr < size[3] - m
-        )  # fmt: skip
+        col, row = project_point(cam, x, y, z, 0.5 * rows, line)
+        free = seen_from(s, above, x, y, z, line, shown, tolerance)
+        image[n, 0], image[n, 1] = col, row
+        seen[n] = free and m < col < cols - m and m < row < rows - m
 
 
-def _sizes(ready: ImagedScene) -> np.ndarray:
-    return np.array(
-        [ready.left.cols, ready.left.rows, ready.right.cols, ready.right.rows], dtype=np.float64
-    )
+def visible_in(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image coordinates [n, 2] (col, row) of world points [n, 3], and whether the image shows them.
 
-
-def _visible(ready: ImagedScene, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    image = np.empty((len(xyz), 4))
-    seen = np.zeros(len(xyz), bool)
-    left, right = ready.left, ready.right
-    kernel_args = (ready.surfaces, left.horizon, right.horizon, left.cam, right.cam, _sizes(ready))
-    _see(*kernel_args, np.ascontiguousarray(xyz), 0.005, image, seen)
+    What lies within FRAME_MARGIN_PX of the frame does not count as shown.
+    """
+    image, seen = np.empty((len(xyz), 2)), np.zeros(len(xyz), bool)
+    _see(
+        camera.surfaces, camera.shown, camera.horizon, camera.cam, float(camera.cols),
+        float(camera.rows), np.ascontiguousarray(xyz), 0.005, image, seen,
+    )  # fmt: skip
     return image, seen
 
 
-def _roof_corners(ready: ImagedScene) -> tuple[np.ndarray, np.ndarray]:
+def _visible(ready: ImagedScene, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image coordinates [n, 4] in left and right, and whether both show the points."""
+    left, in_left = visible_in(ready.left, xyz)
+    right, in_right = visible_in(ready.right, xyz)
+    return np.column_stack([left, right]), in_left & in_right
+
+
+def roof_corners(s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
     """Corners [n, 3] of flat roofs that stand free, unchanged, and the building of each."""
-    s = ready.surfaces
     b = s.boxes
     area = b[:, 4] * b[:, 5]
     use = np.flatnonzero((b[:, 7] == 0) & (s.box_view == (IN_IMAGES | IN_LIDAR)) & (area > 20))
@@ -99,7 +96,7 @@ def _roof_corners(ready: ImagedScene) -> tuple[np.ndarray, np.ndarray]:
     return xyz[free], owner[free]
 
 
-def _spread(where: np.ndarray, count: int, start: np.ndarray) -> list[int]:
+def spread_out(where: np.ndarray, count: int, start: np.ndarray) -> list[int]:
     """Indices of ``count`` points [n, 2], each as far as can be from those before (and start)."""
     chosen: list[int] = []
     distance = np.full(len(where), np.inf)
@@ -135,11 +132,11 @@ def make_points(
     """
     ready = prepare(city, scene)
     s = ready.surfaces
-    xyz, owner = _roof_corners(ready)
+    xyz, owner = roof_corners(s)
     image, seen = _visible(ready, xyz)
     xyz, owner, image = xyz[seen], owner[seen], image[seen]
     middle = np.array([[(ready.left.cols - 1) / 2, (ready.left.rows - 1) / 2]])
-    chosen = _spread(image[:, :2], GCP_COUNT, middle)
+    chosen = spread_out(image[:, :2], GCP_COUNT, middle)
     chosen.sort(key=lambda n: (image[n, 1] // 400, image[n, 0]))
     names = [f"G{n:02d}" for n in range(1, len(chosen) + 1)]
     exact = _table(ready, names, xyz[chosen], image[chosen])
@@ -150,7 +147,7 @@ def make_points(
     others = ~np.isin(owner, owner[chosen])
     own = np.random.default_rng([scene.pose_seed, 8])
     corners = np.flatnonzero(others)
-    corners = corners[_spread(image[corners, :2], CHECKPOINT_COUNT // 2, image[chosen, :2])]
+    corners = corners[spread_out(image[corners, :2], CHECKPOINT_COUNT // 2, image[chosen, :2])]
     # open ground that is seen from above as well: no crown or roof over it
     xy = np.array(scene.centre_m) + own.uniform(-1, 1, (4000, 2)) * 0.65 * max(
         scene.cols, scene.rows
@@ -163,7 +160,7 @@ def make_points(
     spots, seen = _visible(ready, ground)
     ground, spots = ground[seen], spots[seen]
     used = np.concatenate([image[chosen, :2], image[corners, :2]])
-    flat = _spread(spots[:, :2], CHECKPOINT_COUNT - len(corners), used)
+    flat = spread_out(spots[:, :2], CHECKPOINT_COUNT - len(corners), used)
     where = np.concatenate([xyz[corners], ground[flat]])
     names = [f"C{n:03d}" for n in range(1, len(where) + 1)]
     checks = _table(ready, names, where, np.concatenate([image[corners], spots[flat]]))

@@ -14,7 +14,7 @@ import pyproj
 
 from ..errors import InputError
 from ..kernels import inlined, kernel
-from ..products.files import replacing
+from ..products.files import atomic_file
 from .built_city import surfaces_of
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
 from .geodesy import LocalFrame
@@ -288,7 +288,7 @@ def simulate_lidar_tile(
     info = np.empty((len(xyz), 6), np.int32)
     header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
     counts = np.zeros(32, np.int64)
-    with replacing(out_laz) as scratch, laspy.open(
+    with atomic_file(out_laz) as scratch, laspy.open(
         scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
     ) as writer:  # fmt: skip
         for strip, first, last in work:

@@ -15,11 +15,11 @@ from rasterio.rpc import RPC as RPCMetadata
 from ..errors import InputError
 from ..job import progress
 from ..kernels import inlined, kernel
-from ..products.files import replacing
+from ..products.files import atomic_file
 from .appearance import reflectance
 from .built_city import surfaces_of
-from .camera import aim, direction, pose, rays
-from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
+from .camera import Pass, aim, direction, pose, rays
+from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
 from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
@@ -50,15 +50,20 @@ PSF_SIGMA_PX = 0.42
 RPC_MARGIN_M = 130.0
 SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
+LEFT_COLLAR, RIGHT_COLLAR = 1, 2  # see in_collar
+COLLARS = {"left": LEFT_COLLAR, "right": RIGHT_COLLAR}
+NOISE_SEEDS = {"left": 1, "right": 0}
 
 
 class Camera(NamedTuple):
-    """One view of a scene: packed camera, image size, biased RPCs, horizon of its rays.
+    """One image: packed camera, its size, biased RPCs, horizon of its rays.
 
-    ``surfaces``: the city's by the sun of the view; ``shown``: bits of the objects in the view.
+    ``name``: of the image, or of the view of a scene. ``surfaces``: the city's by the sun of the
+    image; ``shown``: bits of the objects in it. ``collar``: see :func:`in_collar`. ``radiometry``:
+    dark value and digital numbers per reflectance; ``noise_seed``: of the sensor noise.
     """
 
-    view: str
+    name: str
     cam: np.ndarray
     cols: int
     rows: int
@@ -66,6 +71,17 @@ class Camera(NamedTuple):
     horizon: np.ndarray
     surfaces: Surfaces
     shown: int
+    collar: int
+    radiometry: tuple[float, float]
+    noise_seed: int
+
+
+class Relief(NamedTuple):
+    """Heights of a scene, m above the frame's: lowest ground, middle of the ground, highest top."""
+
+    low: float
+    middle: float
+    top: float
 
 
 class ImagedScene(NamedTuple):
@@ -91,7 +107,35 @@ def prepare(city: CitySpec, scene: SceneSpec, built: str | Path | None = None) -
 def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScene:
     surfaces = surfaces_of(city, built)
     frame = frame_of(city)
-    # heights of the ground that the left image can show
+    relief = relief_of(city, scene, surfaces)
+    target = np.array([*scene.centre_m, relief.middle])
+    # the forward view takes in all that the backward view shows, however high it stands
+    rise = max(relief.top - relief.middle, relief.middle - relief.low)
+    lean = rise * math.tan(math.radians(29)) + 45
+    right_cols = math.ceil(scene.cols * LEFT_GSD_M / RIGHT_GSD_M + 2 * 60 + 0.02 * scene.rows)
+    right_rows = math.ceil(
+        scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
+    )
+    cameras = []
+    for view, gsd, cols, rows in (
+        ("left", LEFT_GSD_M, scene.cols, scene.rows),
+        ("right", RIGHT_GSD_M, right_cols, right_rows),
+    ):
+        flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
+        cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
+        rpc = biased_rpc(cam, frame, relief, (cols, rows), (scene.pose_seed, view))
+        own = by_sun_of(surfaces, getattr(city, view).sun_deg)
+        cameras.append(
+            Camera(
+                view, cam, cols, rows, rpc, horizon_of(cam, cols, rows, surfaces), own,
+                SHOWN[view], COLLARS[view], RADIOMETRY[view], NOISE_SEEDS[view],
+            )
+        )  # fmt: skip
+    return ImagedScene(city, scene, frame, surfaces, *cameras)
+
+
+def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
+    """Heights of the ground that the left image can show, and of what stands there."""
     ny, nx = surfaces.cell_top.shape
     xx, yy = np.meshgrid(
         surfaces.x0 + 20 + 20 * np.arange(int(nx * 8 / 20) - 1),
@@ -106,54 +150,58 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
         near = scene_coordinates(city, scene, surfaces.boxes[:, :2])
         inside = (np.abs(near) < half_size(scene) + 100).all(axis=1)
         objects = objects[np.append(True, inside)]
-    top = float(objects.max())
-    middle = (low + high) / 2
-    target = np.array([*scene.centre_m, middle])
+    return Relief(low, (low + high) / 2, float(objects.max()))
+
+
+def biased_rpc(
+    cam: np.ndarray,
+    frame: LocalFrame,
+    relief: Relief,
+    size: tuple[int, int],
+    drawn: tuple[int, str],
+    *,
+    margin_m: float = RPC_MARGIN_M,
+) -> FittedRPC:
+    """The RPCs of a camera of an image of ``size`` (cols, rows), by a bias as ``drawn``.
+
+    They hold ``margin_m`` above and below all that stands there. ``drawn``: seed and view of
+    :func:`.rpcs.draw_bias`. Raises RuntimeError if the RPCs cannot follow the camera.
+    """
+    cols, rows = size
     heights = (
-        frame.height + low - RPC_MARGIN_M,
-        frame.height + top + RPC_MARGIN_M,
+        frame.height + relief.low - margin_m,
+        frame.height + relief.top + margin_m,
     )
-    # the forward view takes in all that the backward view shows, however high it stands
-    lean = (max(top - middle, middle - low)) * math.tan(math.radians(29)) + 45
-    right_cols = math.ceil(scene.cols * LEFT_GSD_M / RIGHT_GSD_M + 2 * 60 + 0.02 * scene.rows)
-    right_rows = math.ceil(
-        scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
-    )
-    cameras = []
-    for view, gsd, cols, rows in (
-        ("left", LEFT_GSD_M, scene.cols, scene.rows),
-        ("right", RIGHT_GSD_M, right_cols, right_rows),
-    ):
-        cam = aim(frame, target, view, gsd=gsd, cols=cols, rows=rows,
-                  seed=scene.pose_seed, ascending=scene.ascending)  # fmt: skip
-        bias = draw_bias(cols, rows, scene.pose_seed, view)
-        rpc = fit_rpc(cam, frame, cols=cols, rows=rows, heights=heights, bias=bias)
-        if rpc.rms_px > 0.01:
-            raise RuntimeError(f"{scene.name} {view}: RPCs miss the camera by {rpc.rms_px:.3f} px")
-        _, toward = rays(cam, [[(cols - 1) / 2, (rows - 1) / 2]])
-        above = horizon(surfaces.cell_top, toward[0, 0], toward[0, 1])
-        own = by_sun_of(surfaces, getattr(city, view))
-        cameras.append(Camera(view, cam, cols, rows, rpc, above, own, SHOWN[view]))
-    return ImagedScene(city, scene, frame, surfaces, *cameras)
+    bias = draw_bias(cols, rows, *drawn)
+    rpc = fit_rpc(cam, frame, cols=cols, rows=rows, heights=heights, bias=bias)
+    if rpc.rms_px > 0.01:
+        raise RuntimeError(f"RPCs of seed {drawn} miss the camera by {rpc.rms_px:.3f} px")
+    return rpc
 
 
-def by_sun_of(surfaces: Surfaces, view: ViewSpec) -> Surfaces:
-    """A city's surfaces by the sun of a view."""
-    if view.sun_deg is None:
+def horizon_of(cam: np.ndarray, cols: int, rows: int, surfaces: Surfaces) -> np.ndarray:
+    """The horizon toward a camera, of the ray in the middle of its image."""
+    _, toward = rays(cam, [[(cols - 1) / 2, (rows - 1) / 2]])
+    return horizon(surfaces.cell_top, toward[0, 0], toward[0, 1])
+
+
+def by_sun_of(surfaces: Surfaces, sun_deg: tuple[float, float] | None) -> Surfaces:
+    """A city's surfaces by a sun of an azimuth and elevation; None: by the city's own."""
+    if sun_deg is None:
         return surfaces
-    sun = direction_of_sun(*view.sun_deg)
+    sun = direction_of_sun(*sun_deg)
     top = horizon(surfaces.cell_top, sun[0] / sun[2], sun[1] / sun[2])
     return surfaces._replace(sun=sun, sun_top=top)
 
 
 @inlined
-def in_collar(left, col, row, cols, rows):
+def in_collar(collar, col, row, cols, rows):
     """Whether an image position lies in the strip without data along the frame.
 
-    Wedges along the first rows and last columns of the left image, along the last rows and first
-    columns of the right one.
+    LEFT_COLLAR: wedges along the first rows and last columns, as in the left image of a pair;
+    RIGHT_COLLAR: along the last rows and first columns.
     """
-    if left:
+    if collar == LEFT_COLLAR:
         return row < 3 + 14 * col / cols or col > cols - 4 - 9 * row / rows
     return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
 
@@ -164,6 +212,12 @@ def _ray(cam, line, col):
     dx, dy, dz = direction(cam, line, col)
     bx, by = dx / dz, dy / dz
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
+
+
+@inlined
+def _lane(work, at):
+    """Four values of one lane, the first of which lies there."""
+    return work[at], work[at + LANES], work[at + 2 * LANES], work[at + 3 * LANES]
 
 
 @inlined
@@ -191,13 +245,14 @@ def _ground_below(s, cam, lines, col, first, ground, before, work):
     for k in range(LANES):
         at = SPLINE + k
         z, zx, zy = spline(
-            s, work[F + k], work[G + k],
-            work[at], work[at + LANES], work[at + 2 * LANES], work[at + 3 * LANES],
-            work[at + 4 * LANES], work[at + 5 * LANES], work[at + 6 * LANES], work[at + 7 * LANES],
-            work[at + 8 * LANES], work[at + 9 * LANES], work[at + 10 * LANES],
-            work[at + 11 * LANES], work[at + 12 * LANES], work[at + 13 * LANES],
-            work[at + 14 * LANES], work[at + 15 * LANES],
-        )  # fmt: skip
+            s,
+            work[F + k],
+            work[G + k],
+            _lane(work, at),
+            _lane(work, at + 4 * LANES),
+            _lane(work, at + 8 * LANES),
+            _lane(work, at + 12 * LANES),
+        )
         step = (z - work[Z + k]) / (1 - zx * work[BX + k] - zy * work[BY + k])
         work[ZX + k], work[ZY + k], work[STEP + k] = zx, zy, step
         work[Z + k] += step
@@ -293,12 +348,16 @@ def simulate_image(
     if view not in ("left", "right"):
         raise InputError(f"no view {view!r}", remedy="ask for left or right")
     ready = prepare(city, scene, built)
-    camera: Camera = getattr(ready, view)
+    return render(getattr(ready, view), f"{scene.name} {view}", out_tif, seed=seed)
+
+
+def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict[str, float]:
+    """Write what a camera shows; ``name`` is for the log. See :func:`simulate_image`."""
     log.info(
-        "%s %s: %d x %d px; RPCs follow the camera within %.1e px rms (bias apart)",
-        scene.name, view, camera.cols, camera.rows, camera.rpc.rms_px,
+        "%s: %d x %d px; RPCs follow the camera within %.1e px rms (bias apart)",
+        name, camera.cols, camera.rows, camera.rpc.rms_px,
     )  # fmt: skip
-    dark, gain = RADIOMETRY[view]
+    dark, gain = camera.radiometry
     cols, rows = camera.cols, camera.rows
     profile = dict(
         driver="GTiff", width=cols, height=rows, count=1, dtype="uint16", nodata=0, tiled=True,
@@ -307,22 +366,22 @@ def simulate_image(
     )  # fmt: skip
     col_index = np.arange(cols, dtype=np.float64)[None, :]
     strips = range(0, rows, STRIP_ROWS)
-    with replacing(out_tif) as scratch:
+    with atomic_file(out_tif) as scratch:
         image = np.zeros((rows, cols), np.uint16)
-        for first in progress(strips, len(strips), f"{scene.name} {view}"):
+        for first in progress(strips, len(strips), name):
             count = min(STRIP_ROWS, rows - first)
             half = np.empty((2 * (count + 4), 2 * (cols + 4)), np.float32)
             _shade_rows(
                 camera.surfaces, camera.horizon, camera.shown, camera.cam, first - 2.0, half
             )
             signal = dark + gain * _decimate(half)
-            rng = np.random.default_rng([seed, view == "left", first])
+            rng = np.random.default_rng([seed, camera.noise_seed, first])
             noise = rng.standard_normal(signal.shape, dtype=np.float32)
             # read-out noise and shot noise: 3 DN at 100, 5 DN at 600
             signal += noise * np.sqrt(4.0 + 0.035 * signal)
             values = np.clip(np.rint(signal), 1, FULL_SCALE).astype(np.uint16)
             row = np.arange(first, first + count, dtype=np.float64)[:, None]
-            values[_collar(view, col_index, row, cols, rows)] = 0
+            values[_collar(camera.collar, col_index, row, cols, rows)] = 0
             image[first : first + count] = values
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
@@ -330,8 +389,8 @@ def simulate_image(
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
 
 
-def _collar(view: str, col: np.ndarray, row: np.ndarray, cols: int, rows: int) -> np.ndarray:
+def _collar(collar: int, col: np.ndarray, row: np.ndarray, cols: int, rows: int) -> np.ndarray:
     """Vectorised :func:`in_collar`."""
-    if view == "left":
+    if collar == LEFT_COLLAR:
         return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
     return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)

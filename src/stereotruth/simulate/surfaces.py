@@ -89,25 +89,26 @@ def spline_cell(s, x, y):
 
 
 @inlined
-def spline(s, f, g, c00, c01, c02, c03, c10, c11, c12, c13, c20, c21, c22, c23, c30, c31, c32, c33):
-    """Terrain z and its derivatives at (f, g) of a cell, by the coefficients (row, column) around.
+def _dot(a, c):
+    return a[0] * c[0] + a[1] * c[1] + a[2] * c[2] + a[3] * c[3]
+
+
+@inlined
+def spline(s, f, g, c0, c1, c2, c3):
+    """Terrain z and its derivatives at (f, g) of a cell, by the four rows of coefficients around.
 
     From six times the spline's weights and twice their derivatives: a division each would be half
     of the time.
     """
     f1, g1 = 1 - f, 1 - g
-    a0, a1 = f1 * f1 * f1, 4 + f * f * (3 * f - 6)
-    a2, a3 = 4 + f1 * f1 * (3 * f1 - 6), f * f * f
-    d0, d1 = -f1 * f1, f * (3 * f - 4)
-    d2, d3 = f1 * (4 - 3 * f1), f * f
+    a = f1 * f1 * f1, 4 + f * f * (3 * f - 6), 4 + f1 * f1 * (3 * f1 - 6), f * f * f
+    d = -f1 * f1, f * (3 * f - 4), f1 * (4 - 3 * f1), f * f
     b0, b1 = g1 * g1 * g1, 4 + g * g * (3 * g - 6)
     b2, b3 = 4 + g1 * g1 * (3 * g1 - 6), g * g * g
     e0, e1 = -g1 * g1, g * (3 * g - 4)
     e2, e3 = g1 * (4 - 3 * g1), g * g
-    r0, q0 = a0 * c00 + a1 * c01 + a2 * c02 + a3 * c03, d0 * c00 + d1 * c01 + d2 * c02 + d3 * c03
-    r1, q1 = a0 * c10 + a1 * c11 + a2 * c12 + a3 * c13, d0 * c10 + d1 * c11 + d2 * c12 + d3 * c13
-    r2, q2 = a0 * c20 + a1 * c21 + a2 * c22 + a3 * c23, d0 * c20 + d1 * c21 + d2 * c22 + d3 * c23
-    r3, q3 = a0 * c30 + a1 * c31 + a2 * c32 + a3 * c33, d0 * c30 + d1 * c31 + d2 * c32 + d3 * c33
+    r0, r1, r2, r3 = _dot(a, c0), _dot(a, c1), _dot(a, c2), _dot(a, c3)
+    q0, q1, q2, q3 = _dot(d, c0), _dot(d, c1), _dot(d, c2), _dot(d, c3)
     z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
     zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
     zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
@@ -124,10 +125,14 @@ def terrain_at(s, x, y):
     j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
     i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
     return spline(
-        s, f, g,
-        c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3], c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3],
-        c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3], c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3],
-    )  # fmt: skip
+        s,
+        f,
+        g,
+        (c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3]),
+        (c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3]),
+        (c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3]),
+        (c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3]),
+    )
 
 
 @inlined

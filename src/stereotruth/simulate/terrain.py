@@ -15,9 +15,12 @@ BROAD_STEP_M = 2.0
 
 
 def spectral_noise(
-    rng: np.random.Generator, shape: tuple[int, int], step: float, band: tuple[float, float],
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    step: float,
+    band: tuple[float, float],
     slope: float,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Periodic Gaussian noise [ny, nx] of unit spread.
 
     Wavelengths within ``band`` (m); amplitude falls as frequency to the power ``-slope``.

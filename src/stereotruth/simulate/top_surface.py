@@ -1,4 +1,7 @@
-"""The top surface of a synthetic city at any place, exactly: what a surface model should hold."""
+"""The top surface of a synthetic city at any place, exactly: what a surface model should hold.
+
+No rule makes it: the tests and benchmarks of surface models are held against it.
+"""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import zarr
@@ -12,13 +12,13 @@ from zarr.codecs import BloscCodec, BloscShuffle
 
 from ..job import progress
 from ..kernels import inlined, kernel
-from ..products.grids import PlainStore, building
+from ..products.grids import PlainStore, atomic_store
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
-from .geodesy import world_to_geodetic_point
+from .geodesy import LocalFrame, world_to_geodetic_point
 from .lidar_coverage import coverage, covered
-from .render import in_collar, prepare
-from .surfaces import IN_LIDAR, LEFT_VIEW, NONE, RIGHT_VIEW, above_ground, cast, stands_in
+from .render import Camera, in_collar, prepare
+from .surfaces import IN_LIDAR, NONE, above_ground, cast, stands_in
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,6 +56,25 @@ FLAGS = {"surface": SURFACES, "changed": CHANGES}
 REALS = [name for name, (dtype, _, _) in LAYERS.items() if dtype == "float64"]
 
 
+class Views(NamedTuple):
+    """Both images: the ``first``, in which positions lie, and the ``second``.
+
+    Each of: its camera; what may stand above the ground (``above``); the bit of what it shows
+    (``shown``); the kind of its ``collar``. ``size``: cols, rows of the first, cols, rows of the
+    second.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    above_first: np.ndarray
+    above_second: np.ndarray
+    shown_first: int
+    shown_second: int
+    collar_first: int
+    collar_second: int
+    size: np.ndarray
+
+
 @inlined
 def seen_from(s, above, x, y, z, line, view, tolerance):
     """Whether nothing hides a world point from the position in ``line``, a camera's pose."""
@@ -66,29 +85,14 @@ def seen_from(s, above, x, y, z, line, view, tolerance):
 
 
 @kernel
-def _truth_points(
-    s,
-    is_left,
-    above_left,
-    above_right,
-    left,
-    right,
-    frame,
-    cover,
-    size,
-    image_col,
-    image_row,
-    real,
-    flags,
-):
-    """The truth at left image positions [n]; neighbours should follow each other.
+def _truth_points(s, views, frame, cover, image_col, image_row, real, flags):
+    """The truth at positions [n] of the first of two ``views``; neighbours follow each other.
 
-    ``size``: left cols, rows, right cols, rows. real[5, n] and flags[6, n]: values of LAYERS in
-    their order. Positions outside the left frame, in its collar, or NaN get NaN and 0. Without
-    ``is_left``, the image of the positions is the right one, and what is called right the left.
+    real[5, n] and flags[6, n]: values of LAYERS in their order. Positions outside the first
+    frame, in its collar, or NaN get NaN and 0.
     """
+    left, right, above_left, above_right, shown, shown_there, collar, collar_there, size = views
     line, other = np.empty(12), np.empty(12)
-    shown, shown_there = (LEFT_VIEW, RIGHT_VIEW) if is_left else (RIGHT_VIEW, LEFT_VIEW)
     guess = 0.0
     right_row = 0.5 * size[3]
     posed = np.nan
@@ -96,7 +100,7 @@ def _truth_points(
         c, row = image_col[k], image_row[k]
         if not (
             c >= -0.5 and row >= -0.5 and c <= size[0] - 0.5 and row <= size[1] - 0.5
-        ) or in_collar(is_left, c, row, size[0], size[1]):
+        ) or in_collar(collar, c, row, size[0], size[1]):
             real[:, k] = np.nan
             flags[:, k] = 0
             continue
@@ -117,7 +121,7 @@ def _truth_points(
             and right_row >= 0
             and col <= size[2] - 1
             and right_row <= size[3] - 1
-            and not in_collar(not is_left, col, right_row, size[2], size[3])
+            and not in_collar(collar_there, col, right_row, size[2], size[3])
         )
         there = inside and stands_in(s, kind, index, shown_there)
         scanned, _, _, _ = above_ground(s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground)
@@ -146,17 +150,38 @@ def truth_at(
     "right", positions are of the right image, and the layers named right tell of the left one.
     """
     ready = prepare(city, scene)
-    left, right = ready.left, ready.right
-    if view == "right":
-        left, right = right, left
-    size = np.array([left.cols, left.rows, right.cols, right.rows], dtype=np.float64)
+    cameras = (ready.left, ready.right) if view == "left" else (ready.right, ready.left)
+    return truth_between(cameras, ready.frame, coverage(city, scene), col, row)
+
+
+def truth_between(
+    cameras: tuple[Camera, Camera],
+    frame: LocalFrame,
+    cover: np.ndarray,
+    col: np.ndarray,
+    row: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """The layers of LAYERS at positions (col, row) of the first of two images of one city.
+
+    What is called right is the second image. ``cover``: of :func:`.lidar_coverage.coverage`.
+    """
+    first, second = cameras
+    size = np.array([first.cols, first.rows, second.cols, second.rows], dtype=np.float64)
     at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
     real = np.empty((len(REALS), at[0].size))
     flags = np.empty((len(LAYERS) - len(REALS), at[0].size), np.uint8)
-    _truth_points(
-        ready.surfaces, view == "left", left.horizon, right.horizon, left.cam, right.cam,
-        ready.frame.packed(), coverage(city, scene), size, *at, real, flags,
-    )  # fmt: skip
+    views = Views(
+        first.cam,
+        second.cam,
+        first.horizon,
+        second.horizon,
+        first.shown,
+        second.shown,
+        first.collar,
+        second.collar,
+        size,
+    )
+    _truth_points(first.surfaces, views, frame.packed(), cover, *at, real, flags)
     return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
 
 
@@ -169,7 +194,7 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
     """
     left = prepare(city, scene).left
     totals = np.zeros(3)
-    with building(out_zarr) as scratch:
+    with atomic_store(out_zarr) as scratch:
         group = zarr.open_group(PlainStore(scratch), mode="w", zarr_format=3)
         group.attrs.update({
             "conventions": "arrays are [row, col] of the left image; pixel (0, 0) is the centre "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.alignment.adjustment import estimate
+from stereotruth.alignment.adjustment import Equations, estimate
 
 # ------------------------------------------------------------------------------- the estimate
 
@@ -42,12 +42,12 @@ def test_uncertainty_of_the_estimate_is_honest(of_class):
         errors += rng.normal(0, of_class, (5, 2))[fifth]
         bad = rng.random(len(design)) < 0.2
         errors[bad] += rng.uniform(-3, 3, (bad.sum(), 2))
-        found = estimate(design, design @ truth + errors, own, sites, prior, where)
+        found = estimate(Equations(design, design @ truth + errors, own, sites, where), prior)
         at = design[:5].reshape(-1, 12)
         sigma = np.sqrt(np.einsum("na,ab,nb->n", at, found.covariance, at))
         ratios.append(at @ (found.parameters - truth) / sigma)
         shared.append(found.shared)
-        nothing = estimate(design, errors, own, sites, prior, where)
+        nothing = estimate(Equations(design, errors, own, sites, where), prior)
         chances.append(nothing.statistic / nothing.freedom)
     ratios = np.abs(ratios)
     assert 0.6 < (ratios < 1).mean() < 0.76

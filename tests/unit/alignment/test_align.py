@@ -117,13 +117,6 @@ def test_wrong_height_is_left_out_of_the_steep_view_too(images, tmp_path):
         assert [g.id for g in fit.left_out] == ["G08"]
 
 
-def test_opencv_leaves_a_gross_blunder_out_too(images, tmp_path):
-    rows = make_gcps(12)
-    rows[3]["left_col"] += 20.0
-    result = run(images, tmp_path, rows, estimator="opencv")
-    assert "G04" in [g.id for g in result.left_fit.left_out]
-
-
 def test_contradiction_among_four_points_is_refused(images, tmp_path):
     rows = make_gcps(4)
     rows[2]["left_col"] += 40.0

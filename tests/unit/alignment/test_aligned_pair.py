@@ -37,3 +37,17 @@ def test_json_keeps_everything(images, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
         ["gcps.csv", *(p.name for p in paths)]
     )
+
+
+def test_an_edited_alignment_is_used_as_it_is_and_told(images, tmp_path, caplog):
+    """A user moves an alignment by hand and names the copy in ``alignment.fixed``."""
+    file = tmp_path / "alignment.json"
+    run(images, tmp_path, make_gcps(10)).save(file)
+    Alignment.load(file)
+    assert not caplog.records
+    values = json.loads(file.read_text())
+    values["right"]["affine"][0][2] += 0.15
+    file.write_text(json.dumps(values))
+    moved = Alignment.load(file)
+    assert moved.right_fit.affine[0][2] == values["right"]["affine"][0][2]
+    assert "alignment.json: edited since it was made" in caplog.text

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.control_points import COLUMNS, read_gcps
+from stereotruth.alignment.control_points import COLUMNS, images_measured, read_gcps
 from stereotruth.errors import InputError
 
 # -------------------------------------------------------------------------------------- files
@@ -92,7 +92,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such alignment"):
         Alignment.load(tmp_path / "none.json")
     (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(InputError, match="not an alignment"):
+    with pytest.raises(InputError, match=r"x\.json: no alignment"):
         Alignment.load(tmp_path / "x.json")
 
 
@@ -112,3 +112,49 @@ def test_ids_that_were_written_as_text_for_spreadsheets_come_back(tmp_path):
     file = tmp_path / "gcps.csv"
     file.write_text(",".join(COLUMNS) + "\n'=1+2,115.1,30.2,50,1.5,2.5,,\n")
     assert read_gcps(file).ids == ("=1+2",)
+
+
+LONG_FORM = """id,lon,lat,height,image,col,row
+A,115.1,30.2,50,one,1.5,2.5
+A,115.1,30.2,50,two,3.5,4.5
+B,115.2,30.2,60,two,7,8
+C,115.3,30.2,70,three,5,6
+"""
+
+
+def test_the_long_form_gives_a_pair_the_points_that_it_shows(tmp_path):
+    file = tmp_path / "gcps.csv"
+    file.write_text(LONG_FORM)
+    points = read_gcps(file, "Test-1", ("two", "one"))
+    assert points.ids == ("A", "B")
+    assert points.left.tolist() == [[3.5, 4.5], [7.0, 8.0]]
+    assert points.right[0].tolist() == [1.5, 2.5]
+    assert points.in_right.tolist() == [True, False]
+    assert points.line == (2, 4)
+    assert images_measured(file) == {"one": 2, "two": 3, "three": 5}
+
+
+@pytest.mark.parametrize(
+    ("images", "line", "message"),
+    [
+        (None, "", "scene's images have no names"),
+        (("one", ""), "", "scene's images have no names"),
+        (("four", "five"), "", "no point is measured in four or five"),
+        (("one", "two"), "A,115.1,30.2,51,three,1,2", "lines 2 and 6: point A has two places"),
+        (("one", "two"), "A,115.1,30.2,50,one,1,2", "point A is measured twice in image one"),
+        (("one", "two"), "D,115.1,30.2,50,one,1,", "line 6, point D: row is empty"),
+        (("one", "two"), "D,115.1,30.2,50,one,1,x", "line 6, point D: .*'x' is no number"),
+    ],
+)
+def test_faults_of_the_long_form_are_named(tmp_path, images, line, message):
+    file = tmp_path / "gcps.csv"
+    file.write_text(f"{LONG_FORM}{line}\n")
+    with pytest.raises(InputError, match=message):
+        read_gcps(file, "Test-1", images)
+
+
+def test_a_pair_s_file_names_no_images(tmp_path):
+    file = tmp_path / "gcps.csv"
+    file.write_text(",".join(COLUMNS) + "\nA,115.1,30.2,50,1.5,2.5,3.5,4.5\n")
+    assert images_measured(file) == {}
+    assert read_gcps(file, "", ("one", "two")).ids == ("A",)

@@ -10,7 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.alignment.adjustment import Estimate, estimate
+from stereotruth.alignment.adjustment import Equations, Estimate, estimate
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import GcpResidual
 from stereotruth.alignment.lidar_checks import (
@@ -130,7 +130,8 @@ def estimated(shifts: np.ndarray, sigma: float, rng: np.random.Generator, noise:
     observed = design @ truth + rng.normal(0, noise, (n, 2))
     prior = np.eye(12) * sigma**2
     where = np.column_stack([u, v])
-    return estimate(design, observed, np.full(n, noise), np.arange(n) // 9, prior, where)
+    equations = Equations(design, observed, np.full(n, noise), np.arange(n) // 9, where)
+    return estimate(equations, prior)
 
 
 def test_a_fault_of_height_is_measured_with_an_honest_deviation():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import rasterio
 
-from stereotruth.command.add_scene import add_scene
+from stereotruth.command.add_scene import add_scene, list_scenes, remove_scene
 from stereotruth.command.check import check_project
 from stereotruth.errors import InputError
 from stereotruth.sheets import read_cities, read_scenes
@@ -89,10 +89,66 @@ def test_views_of_a_delivery(folder, make, left, right):
 
 
 def test_images_that_are_named_keep_their_order(folder):
-    lines = add_scene([folder / "right.tif", folder / "left.tif"], lidar="lidar", city="Good")
-    assert row()["left_image"].endswith("right.tif")
+    first, second = copied(folder, "a", "b")
+    lines = add_scene([second, first], lidar="lidar", city="Good")
+    assert row()["left_image"].endswith("b.tif")
     assert any("left looks forward" in line for line in lines)
     assert row()["scene"] == "Good-2"
+
+
+def copied(folder, left, right):
+    """Copies of the good scene's images under other names, in a folder of their own."""
+    (folder / "named").mkdir()
+    return [
+        Path(shutil.copy(folder / f"{view}.tif", folder / "named" / f"{name}.tif"))
+        for view, name in (("left", left), ("right", right))
+    ]
+
+
+def test_control_points_say_which_image_is_left(folder):
+    """Their columns belong to one image each, whatever the view angle says."""
+    with (folder / "gcps.csv").open(newline="") as stream:
+        points = list(csv.DictReader(stream))
+    other = {"left": "right", "right": "left"}
+    with (folder / "exchanged.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, points[0])
+        writer.writeheader()
+        for point in points:
+            sides = {
+                f"{view}_{axis}": point[f"{other[view]}_{axis}"]
+                for view in other for axis in ("col", "row")
+            }  # fmt: skip
+            writer.writerow(point | sides)
+    copied(folder, "a", "b")
+    lines = add_scene([folder / "named"], lidar="lidar", gcps="exchanged.csv", city="Good")
+    assert row()["left_image"].endswith("b.tif")
+    assert any("sides by the control points" in line for line in lines)
+    (folder / "named").rename(folder / "plain")
+    copied(folder, "left", "right")
+    with pytest.raises(InputError, match=r"control points miss by .* with left\.tif as left"):
+        add_scene([folder / "named"], lidar="lidar", gcps="exchanged.csv", city="Good")
+
+
+def test_a_pair_is_added_once_listed_and_removed(folder):
+    with pytest.raises(InputError, match="scene 'Good-1' has these two images already"):
+        add_scene([folder / "left.tif", folder / "right.tif"], lidar="lidar", city="Good")
+    before = (folder / "scenes.tsv").read_text()
+    images = copied(folder, "a", "b")
+    add_scene(images, lidar="lidar", city="Good", name="Other")
+    assert [line.split()[0] for line in list_scenes()] == ["Good-1", "Other"]
+    with pytest.raises(InputError, match="no scene 'Othre'"):
+        remove_scene("Othre")
+    assert "Other taken out" in remove_scene("Other")
+    assert (folder / "scenes.tsv").read_text() == before
+
+
+def test_lidar_elsewhere_is_refused(folder):
+    """The good LiDAR lies in zone 50; as zone 39 it is 66 degrees away."""
+    write_lidar(folder, system=None)
+    images = copied(folder, "a", "b")
+    with pytest.raises(InputError, match="degrees away from the images"):
+        add_scene(images, lidar="lidar", lidar_crs="EPSG:32639", city="Good")
+    assert len(list_scenes()) == 1
 
 
 @pytest.mark.parametrize(

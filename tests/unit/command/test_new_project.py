@@ -8,7 +8,7 @@ import yaml
 from stereotruth.command.new_project import KEYS, begin, configuration_text
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
-from stereotruth.project import configured, with_defaults
+from stereotruth.project import configured
 from stereotruth.sheets import read_cities, read_scenes
 
 
@@ -31,7 +31,7 @@ def test_what_is_commented_are_the_defaults():
     assert set(values) == set(KEYS) | {"scenes", "cities"}
     assert all(set(values[section]) == set(keys) for section, keys in KEYS.items() if keys)
     sheets = {"scenes": "scenes.tsv", "cities": "cities.tsv"}
-    assert Configuration.of(with_defaults(values)) == Configuration.of(with_defaults(sheets))
+    assert Configuration.of(values) == Configuration.of(sheets)
 
 
 def test_nothing_is_written_over(tmp_path):

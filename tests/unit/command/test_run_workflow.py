@@ -15,7 +15,7 @@ from stereotruth.command.run_workflow import (
     run_workflow,
 )
 from stereotruth.errors import InputError
-from stereotruth.project import FILES
+from stereotruth.project import FILES, configured
 
 SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
 
@@ -40,9 +40,31 @@ def test_options_are_passed_on(tmp_path, monkeypatch, given, passed):
     assert arguments_for(given) == [*SNAKEFILE, *passed]
 
 
-def test_without_a_configuration_the_defaults_hold(tmp_path, monkeypatch):
+def test_a_profile_of_the_package_is_named_without_its_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert arguments_for(["tiles/Qichun", "-j1"]) == [*SNAKEFILE, "tiles/Qichun", "-j1"]
+    (tmp_path / "config.yaml").touch()
+    shipped = str(FILES / "profiles" / "default")
+    assert arguments_for(["--profile", "default"])[2:4] == ["--profile", shipped]
+    assert arguments_for(["--profile=default"])[2] == f"--profile={shipped}"
+    assert arguments_for(["--profile", "my-site"])[3] == "my-site"
+    monkeypatch.setattr("stereotruth.command.run_workflow.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="pip install snakemake-executor-plugin-slurm"):
+        arguments_for(["--profile", "slurm"])
+
+
+def test_the_built_in_cities_are_asked_for_by_name(tmp_path, monkeypatch):
+    """In a folder of a project the message says where the project is."""
+    (tmp_path / "config.yaml").touch()
+    inside = tmp_path / "tiles" / "A"
+    inside.mkdir(parents=True)
+    monkeypatch.chdir(inside)
+    with pytest.raises(InputError, match=r"no config\.yaml here.*did you mean: cd \.\./\.\."):
+        arguments_for(["tiles/A"])
+    with pytest.raises(InputError, match=r"no config\.yaml here"):
+        configured()
+    assert arguments_for(["--example", "tiles/Qichun", "-j1"]) == [
+        *SNAKEFILE, "tiles/Qichun", "-j1"
+    ]  # fmt: skip
 
 
 RUN = """\

@@ -15,6 +15,7 @@ from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.splits import shared_ground
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.errors import InputError
+from stereotruth.products.grids import seal
 
 from ...synthetic.pictures import colours_in, read_picture, share_of
 from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run
@@ -95,12 +96,12 @@ def test_offset_is_whole_and_of_tile_or_scene(
 
 
 def test_overlapping_tiles_share_no_ground_across_splits(scene: SceneFiles, tmp_path: Path) -> None:
-    summary = run([scene], tmp_path / "T", stride=SIZE // 2)
+    summary = run([scene], tmp_path / "T", stride=SIZE * 3 // 4)
     assert summary["splits"]["realised"]["none"] > 0
     assert all(summary["splits"]["realised"][s] > 0 for s in ("train", "val", "test"))
     assert shared_ground(tmp_path / "T" / "manifest.csv") == []
     with pytest.raises(InputError, match="share ground"):
-        run([scene], tmp_path / "S", stride=SIZE // 2, strict=True)
+        run([scene], tmp_path / "S", stride=SIZE * 3 // 4, strict=True)
     assert not (tmp_path / "S").exists()
 
 
@@ -124,10 +125,12 @@ def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None
     assert "project.recipe" not in caught.value.remedy
     grid = zarr.open_group(scene.disparity, mode="r+")
     grid.attrs["points_per_px"] = 0.42
+    seal(scene.disparity)
     with pytest.raises(InputError, match="not one labelled") as caught:
         run([scene], tmp_path / "T", min_labelled=0.99)
     assert "s1 0.42" in caught.value.remedy and "project.recipe: surface" in caught.value.remedy
     del grid.attrs["points_per_px"]
+    seal(scene.disparity)
     refusal = "not refined: the tie points contradict each other (0.61 px, 40 % blunders)"
     file = tmp_path / "alignment.json"
     views = {view: {"rms": {"after": 0.2}} for view in ("left", "right")}

@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 
 from stereotruth.dataset.sure_labels import NAME, TOO_UNCERTAIN
-from stereotruth.disparity.crowns import RoughSurface, _higher, _narrowest
-from stereotruth.disparity.label_window import label_window
+from stereotruth.disparity.crowns import _clearance, _higher
+from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.smooth_triangles import Scale
 from stereotruth.disparity.status import Status, is_labelled
-from stereotruth.lidar.lattice import LATTICE_M
 
 from ...synthetic.box_scene import Scene, on_ground, write_points
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
-from ...synthetic.strewn_points import CELL_M, surface_of
 
 THROUGH = 0.25  # share of the pulses
 DEPTH_M = 9.0
@@ -89,33 +86,14 @@ def test_any_cut_gives_the_same_crowns(wood, view) -> None:
             assert values.tobytes() == np.ascontiguousarray(whole[name][where]).tobytes(), name
 
 
-def test_points_that_went_through_are_left_out_but_not_the_ground_of_a_gap() -> None:
-    """A rough canopy 8 m above the ground with a gap of 8 m; a quarter of the pulses go through."""
-    rng = np.random.default_rng(2)
-
-    def height(x, y):
-        top = 8.0 + rng.uniform(-0.8, 0.8, x.size)
-        gap = np.hypot(x - 25.0, y - 25.0) < 4.0
-        return np.where(gap | (rng.random(x.size) < 0.25), 0.0, top)
-
-    surface = surface_of(height)
-    tops = RoughSurface.of(surface, Scale.of(1.0, CELL_M), 1.0).vertices
-    x, y = (q / 3000 * CELL_M for q in (tops.lon_q, tops.lat_q))
-    low = tops.h_q * LATTICE_M < 4.0
-    far = np.hypot(x - 25.0, y - 25.0)
-    well_inside = (np.abs(x - 25.0) < 17.0) & (np.abs(y - 25.0) < 17.0)
-    assert low[far < 3.0].all() and (far < 3.0).sum() > 10
-    assert low[(far > 6.0) & well_inside].mean() < 0.05
-
-
 def test_what_is_higher_and_what_turns_away() -> None:
     flat = np.zeros((5, 40))
     flat[2, 20] = 3.0
     assert _higher(flat, 1)[2, 19] == _higher(flat, 1)[3, 21] == 3.0
     assert _higher(flat, 1)[2, 18] == 0.0 and _higher(flat, 3)[2, 18] == 3.0
     assert np.isnan(_higher(np.full((3, 3), np.nan), 1)).all()
-    narrow = _narrowest(flat)
-    assert narrow[0, 5] == 1.0
-    assert narrow[2, 19] == 1.0 - 3.0  # hidden by its neighbour,
-    assert narrow[2, 17] == 0.0 and narrow[2, 16] == 1.0  # as the pixel is that lies 3 px beside it
-    assert narrow[2, 21] == 1.0
+    near = _clearance(np.zeros((5, 40)), flat, 0)
+    assert np.isinf(near[0, 5]) and np.isinf(near[2, 21])
+    assert near[2, 19] == 1.0 - 3.0  # covered by its neighbour,
+    assert near[2, 17] == 0.0 and near[2, 16] == 1.0  # as the pixel is that lies 3 px beside it
+    assert np.isinf(near[1, 17]) and _clearance(np.zeros((5, 40)), flat, 1)[1, 17] == 0.0

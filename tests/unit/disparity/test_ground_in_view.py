@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity import label_window as module
-from stereotruth.disparity.ground_in_view import GroundInView
+from stereotruth.disparity import recipe as module
+from stereotruth.disparity.ground_in_view import ground_in_view
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.vertices import PART, Vertices
+from stereotruth.surface.region import Region
+from stereotruth.surface.scale import PART
+from stereotruth.surface.vertices import Vertices
 
 from ...synthetic.box_scene import Scene
 
@@ -36,8 +38,7 @@ def vertices(height_at) -> Vertices:
 def in_view(height_at) -> np.ndarray:
     """Squares of 8 px that a window of 40 by 40 px in the middle may see."""
     found = vertices(height_at)
-    args = Leaning(), (80, 80), (40, 40), CELL
-    return GroundInView.of(found, 32.0 * PART, *args).squares
+    return ground_in_view(found, 32.0 * PART, CELL, Leaning(), (80, 80), (40, 40)).squares
 
 
 def test_of_even_ground_it_is_the_window() -> None:
@@ -61,7 +62,7 @@ def test_vertices_in_the_halo_and_triangles_that_touch_stay() -> None:
     found = vertices(lambda x, y: 0.0 * x)
     squares = np.zeros((25, 25), np.bool_)
     squares[10, 10] = True  # cells 160 to 175
-    view = GroundInView(squares)
+    view = Region(squares)
     kept = view.with_halo(found, 20)
     assert kept.x.min() // PART in range(110, 141) and kept.x.max() // PART in range(195, 225)
     assert kept.y.min() == kept.x.min() and len(kept.h_q) == len(kept.count)
@@ -78,17 +79,17 @@ def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) 
     box = Scene(tmp_path_factory.mktemp("box"), box=True, spacing=2.5)
     scene = SceneInputs(*box.images, (box.store,), Settings(), view)
     windows = [(slice(r, r + 50), slice(c, c + 50)) for r in (90, 140) for c in (60, 110, 160)]
-    found = [module.label_window(scene, *window)[0] for window in windows]
+    labels = [module.label_window(scene, *window)[0] for window in windows]
     sizes = []
 
     def everything(*args):
-        surface, few = made(*args[:4]), made(*args)
-        sizes.append((len(surface.smooth), len(few.smooth)))
+        surface, few = made(*args[:2]), made(*args)
+        sizes.append((len(surface.facet), len(few.facet)))
         return surface
 
     made = module.ground_surface
     monkeypatch.setattr(module, "ground_surface", everything)
-    for window, layers in zip(windows, found):
+    for window, layers in zip(windows, labels):
         for name, values in module.label_window(scene, *window)[0].items():
             assert values.tobytes() == layers[name].tobytes(), name
     whole, seen = np.sum(sizes, axis=0)

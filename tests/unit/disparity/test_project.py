@@ -11,14 +11,14 @@ import pyproj
 import pytest
 import zarr
 
-import stereotruth.disparity.label_window as module
+import stereotruth.disparity.recipe as module
 from stereotruth.alignment.label_uncertainty import label_covariance
-from stereotruth.disparity.label_window import label_window
+from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
+from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
-from stereotruth.disparity.surface_between import between_labels
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
@@ -123,18 +123,18 @@ def brute_force(scene: Scene, on_surface: bool) -> dict[tuple[int, int], tuple[f
 def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, np.ndarray]]:
     """What each pixel's own points give on the surface that its centre sees, before triangles of
     points around it are asked, and the layers of the grid."""
-    found = []
+    recorded = []
 
-    def recorded(between, own, *rest):
-        found.append(own)
-        return between_labels(between, own, *rest)
+    def record(visible, own, *rest):
+        recorded.append(own.labels)
+        return facet_labels(visible, own, *rest)
 
-    monkeypatch.setattr(module, "between_labels", recorded)
+    monkeypatch.setattr(module, "facet_labels", record)
     inputs = SceneInputs(*scene.images, (scene.store,), Settings(correlation_threshold=-1))
     rows, cols = scene.model.shape
     layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
     inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
-    own = found[0]
+    own = recorded[0]
     return Labels(own.disparity[inner], own.slope[:, *inner], own.variance[inner]), layers
 
 

@@ -10,7 +10,7 @@ import pytest
 import zarr
 
 from stereotruth.disparity.status import Status, is_labelled
-from stereotruth.products.grids import Layer, building, create_grid, open_grid
+from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
 
 from ...synthetic.box_scene import Scene, dilated, project_with
 
@@ -35,7 +35,7 @@ def masked(plane, tmp_path_factory) -> list[Path]:
         pixels[where] = rng.integers(3000, 60000, pixels[where].shape)
         mask[where] = 1
         attrs = {k: given.attrs[k] for k in ("epipolar", "provenance")}
-        with building(folder / source.name) as scratch:
+        with atomic_store(folder / source.name) as scratch:
             grid = create_grid(scratch, pixels.shape, layers, chunk=256, shard=1024, attrs=attrs)
             grid["image"][:], grid["mask"][:] = pixels, mask
         stores.append(folder / source.name)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.epipolar.rpc import RPC, SCALARS, VECTORS, SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.errors import InputError
+from stereotruth.simulate import site_images
+from stereotruth.simulate.sites import drawn_site
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, camera
 from ...synthetic.real_data import MARSEILLE
@@ -161,3 +163,24 @@ def test_a_huge_height_range() -> None:
     )
     _, y_left, _, y_right = model.ground_to_epipolar(*ground())
     assert np.abs(y_left - y_right).max() < 0.01
+
+
+def test_small_images_with_a_wide_range_of_heights_keep_their_rows(monkeypatch) -> None:
+    """Crops of 700 px whose RPCs cover 1200 m of height, of two passes: rows shrank to a tenth, or
+    the model could not be inverted."""
+    monkeypatch.setattr(site_images, "RPC_MARGIN_M", 600.0)
+    site_images.camera_of.cache_clear()
+    site = drawn_site(1, 4242, images=2, side_px=700, seasons=False)
+    sensors, sizes = [], []
+    for image in site.images:
+        seen = site_images.camera_of(site, image)
+        values = dict(zip(SCALARS, seen.rpc.numbers)) | dict(zip(VECTORS, seen.rpc.coefficients))
+        sensors.append(SensorModel(RPC(**values)))
+        sizes.append((seen.cols, seen.rows))
+    site_images.camera_of.cache_clear()
+    model = fit_epipolar(*sensors, *sizes, sensors[0].rpc.height_off)
+    for view in ("left", "right"):
+        low, high = model.report[f"scale_{view}"]
+        assert low > 0.85 and high < 1.15
+    assert model.shape[0] > 0.85 * sizes[0][1]
+    assert model.report["y_parallax_over_image_footprints"]["rms_px"] < 0.1

@@ -92,7 +92,11 @@ def test_a_spoiled_json_is_refused(curved: EpipolarModel, tmp_path: Path) -> Non
     with pytest.raises(InputError, match="no such epipolar model"):
         EpipolarModel.load(path)
     path.write_text(json.dumps(curved.to_dict())[:-100])
-    with pytest.raises(InputError, match=r"epipolar.json: not an epipolar model"):
+    with pytest.raises(InputError, match=r"epipolar.json: damaged: no JSON of ours"):
+        EpipolarModel.load(path)
+    curved.save(path)
+    path.write_text(path.read_text().replace("across", "along"))
+    with pytest.raises(InputError, match=r"epipolar.json: damaged: not what was written"):
         EpipolarModel.load(path)
 
 
@@ -173,6 +177,6 @@ def test_a_point_comes_out_the_same_in_any_company(curved: EpipolarModel) -> Non
         assert np.array_equal(curved.ground_to_epipolar(*points[:, k]), whole[:, k : k + 1])
 
 
-def test_the_same_fit_twice(curved: EpipolarModel) -> None:
+def test_the_same_fit_twice(curved: EpipolarModel, anew: None) -> None:
     again = fit(curved.left, curved.right)
     assert again.to_dict() == curved.to_dict()

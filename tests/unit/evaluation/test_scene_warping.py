@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from warped_panels import draw_panels
 
 from stereotruth.dataset import warped_tile
 from stereotruth.epipolar import warping
-from stereotruth.evaluation import scene_warping
+from stereotruth.evaluation.scene_warping import warp_scene
 from stereotruth.products import grids
 
 from ...synthetic.truth_scene import write_disparity
@@ -28,18 +29,18 @@ def test_warping_finds_the_left_image_again(scene, tmp_path):
     layer = grids.Layer("uint16", 0, {"units": "DN", "long_name": "image"})
     stores = []
     for name, image in (("left", texture(x, y)), ("right", right)):
-        with grids.building(tmp_path / f"{name}.zarr") as scratch:
+        with grids.atomic_store(tmp_path / f"{name}.zarr") as scratch:
             arrays = grids.create_grid(
                 scratch, shape, {"image": layer}, chunk=128, shard=256, attrs={}
             )
             arrays["image"][:] = np.rint(image).astype("uint16")
         stores.append(tmp_path / f"{name}.zarr")
     right_way = write_disparity(scene, tmp_path / "d.zarr", disparity)
-    figures = scene_warping.evaluate_warping(*stores, right_way)
-    assert figures["correlation"] > 0.9999
-    assert figures["pixels"] > 0.9 * disparity.size * (shape[1] - 20) / shape[1]
+    sums = warp_scene(*stores, right_way).sums
+    assert sums.coefficient > 0.9999
+    assert sums.count > 0.9 * disparity.size * (shape[1] - 20) / shape[1]
     wrong_way = write_disparity(scene, tmp_path / "e.zarr", -disparity)
-    assert scene_warping.evaluate_warping(*stores, wrong_way)["correlation"] < 0.9
+    assert warp_scene(*stores, wrong_way).sums.coefficient < 0.9
 
     values = np.rint(texture(x, y))[:64, :64]
     tile = warped_tile.WarpedTile(
@@ -49,5 +50,5 @@ def test_warping_finds_the_left_image_again(scene, tmp_path):
         disparity[:64, :64],
     )
     assert tile.correlation > 0.9999
-    scene_warping.draw_panels(tile, tmp_path / "panels" / "T_1.png")
+    draw_panels(tile, tmp_path / "panels" / "T_1.png")
     assert [p.name for p in (tmp_path / "panels").iterdir()] == ["T_1.png"]

@@ -22,6 +22,7 @@ from stereotruth.lidar.point_store import (
     open_stores,
     query_points,
 )
+from stereotruth.numerics.degrees import DEGREE_M
 
 from ...synthetic.las import SOUTH, WEST, everything, write_las
 
@@ -105,7 +106,7 @@ def test_two_stores_hold_what_one_does(tmp_path) -> None:
     boxes = boxes_of(whole)
     assert np.array_equal(boxes_of(*parts), boxes)
     width = (boxes[:, 2] - boxes[:, 0]) * np.cos(np.radians(boxes[:, 1]))
-    covered_m2 = (width * (boxes[:, 3] - boxes[:, 1])).sum() * lattice.DEGREE_M**2
+    covered_m2 = (width * (boxes[:, 3] - boxes[:, 1])).sum() * DEGREE_M**2
     assert covered_m2 == pytest.approx(0.49e6, abs=0.2e6)  # whole cells
     inside = (expected.lon[:, None] >= boxes[:, 0]) & (expected.lon[:, None] < boxes[:, 2])
     inside &= (expected.lat[:, None] >= boxes[:, 1]) & (expected.lat[:, None] < boxes[:, 3])

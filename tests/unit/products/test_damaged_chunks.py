@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
+from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.damaged_chunks import damage_behind, damaged_chunk
-from stereotruth.products.grids import Layer, building, create_grid, require_complete
-from stereotruth.products.publication import publication
+from stereotruth.products.grids import Layer, atomic_store, create_grid, require_complete
 
 LAYERS = {"image": Layer("uint16", 0, {"units": "DN", "long_name": "image"})}
 
@@ -19,7 +19,7 @@ LAYERS = {"image": Layer("uint16", 0, {"units": "DN", "long_name": "image"})}
 def store(tmp_path):
     path = tmp_path / "left.zarr"
     values = np.random.default_rng(0).integers(0, 900, (64, 64)).astype(np.uint16)
-    with building(path) as scratch:
+    with atomic_store(path) as scratch:
         create_grid(scratch, (64, 64), LAYERS, chunk=16, shard=32, attrs={})["image"][:] = values
     return path
 
@@ -49,7 +49,7 @@ def test_a_job_that_reads_it_says_so(damaged, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with (
         pytest.raises(InputError, match=r"left\.zarr/image/c/1/0: damaged"),
-        publication([str(damaged)], ["out.txt"], {}),
+        atomic_outputs([str(damaged)], ["out.txt"], {}),
     ):
         require_complete(damaged)["image"][:]
 

@@ -8,15 +8,15 @@ import xarray as xr
 import zarr
 
 from stereotruth.errors import InputError
-from stereotruth.products.files import replacing
-from stereotruth.products.grids import Layer, blocks, building, create_grid, open_grid
-from stereotruth.products.resumable_grids import making
+from stereotruth.products.files import atomic_file
+from stereotruth.products.grids import Layer, atomic_store, blocks, create_grid, open_grid
+from stereotruth.products.resumable_grids import resumable_grid
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
 
 
 def make(path, shape=(70, 100)):
-    with building(path) as scratch:
+    with atomic_store(path) as scratch:
         arrays = create_grid(scratch, shape, LAYERS, chunk=16, shard=32, attrs={"epipolar": {}})
         arrays["disparity"][32:64, 0:32] = 5.0
     return path
@@ -38,7 +38,7 @@ def test_it_is_zarr_3_and_sharded(tmp_path):
 
 
 def test_a_failed_build_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), building(tmp_path / "d.zarr") as scratch:
+    with pytest.raises(RuntimeError), atomic_store(tmp_path / "d.zarr") as scratch:
         create_grid(scratch, (8, 8), LAYERS, chunk=8, shard=8, attrs={})
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
@@ -66,7 +66,7 @@ def test_shards_must_hold_whole_chunks(tmp_path):
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "new" / "a.json"
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         scratch.write_text("{}")
         assert scratch.suffix == ".json"
         assert not path.exists()
@@ -77,7 +77,7 @@ def test_a_file_appears_when_it_is_whole(tmp_path):
 def test_a_failed_write_leaves_what_was_there(tmp_path):
     path = tmp_path / "a.json"
     path.write_text("old")
-    with pytest.raises(RuntimeError), replacing(path) as scratch:
+    with pytest.raises(RuntimeError), atomic_file(path) as scratch:
         scratch.write_text("half")
         raise RuntimeError
     assert path.read_text() == "old"
@@ -92,9 +92,9 @@ def test_a_grid_is_made_and_published_where_there_are_no_hard_links(tmp_path, mo
 
     monkeypatch.setattr("os.link", refused)
     block, path = (slice(0, 64), slice(0, 64)), tmp_path / "grid.zarr"
-    with making(path, (64, 64), LAYERS, chunk=32, shard=64) as store:
+    with resumable_grid(path, (64, 64), LAYERS, chunk=32, shard=64) as store:
         store.write(block, "key", {"disparity": np.ones((64, 64), "float32")}, None)
-        store.publish(path, [block], {"scene": "A-1"})
+        store.write_atomically(path, [block], {"scene": "A-1"})
     assert open_grid(path).disparity.values.sum() == 64 * 64
 
 

@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from stereotruth.products.files import replacing
+from stereotruth.products.files import atomic_file
 from stereotruth.products.locks import FileLock, exclusive
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -59,6 +59,6 @@ def test_writers_take_turns(tmp_path) -> None:
 
 
 def test_a_product_leaves_no_lock(tmp_path) -> None:
-    with replacing(tmp_path / "a.json") as scratch:
+    with atomic_file(tmp_path / "a.json") as scratch:
         scratch.write_text("1")
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

@@ -32,8 +32,8 @@ def here(tmp_path, monkeypatch) -> Path:
 
 
 def record(inputs: list[str], outputs: list[str], settings=SETTINGS) -> None:
-    sums = ({path: checksum(path) for path in paths} for paths in (inputs, outputs))
-    write_record(Record("run", settings, *sums))
+    sums = {path: checksum(path) for path in inputs}
+    write_record(Record.of("run", settings, sums, outputs))
 
 
 def why(outputs=("a.json", "a"), inputs=("in.csv",), settings=SETTINGS) -> str:
@@ -79,13 +79,23 @@ def test_another_set_of_inputs_is_due_but_for_marks_of_strips():
 
 
 @pytest.mark.parametrize("file", ["a.json", "a/1", "a/2"])
-def test_a_product_that_is_not_what_was_made_is_due_itself(file):
+def test_a_product_that_is_not_what_was_made_is_due_and_the_file_is_named(file):
     Path(file).write_text("damaged")
-    assert why() == f"{file.split('/')[0]} is not what was made: made again"
+    assert why() == f"{file} is not what was made: made again"
 
 
 def test_a_deleted_file_of_a_folder_is_due():
     Path("a/1").unlink()
+    assert why() == "a/1 (missing) is not what was made: made again"
+
+
+def test_of_many_damaged_files_the_first_are_named():
+    for number in range(2, 8):
+        Path(f"a/{number}").touch()
+    named = "a/2, a/3, a/4 and 3 more files"
+    assert why() == f"{named} is not what was made: made again"
+    shutil.rmtree("a")
+    Path("a").write_text("a file in the folder's place")
     assert why() == "a is not what was made: made again"
 
 

@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from stereotruth.products.grids import Layer, Strip, blocks, open_grid
-from stereotruth.products.resumable_grids import making
+from stereotruth.products.resumable_grids import resumable_grid
 
 from ...synthetic.stores import Killed, tree
 
@@ -37,14 +37,14 @@ def work(
     keys = keys or ["a"] * len(BLOCKS)
     part = BLOCKS if strip is None else strip.of(BLOCKS)
     made = []
-    with making(path, SHAPE, LAYERS, **SIZES, shared=strip is not None) as store:
+    with resumable_grid(path, SHAPE, LAYERS, **SIZES, shared=strip is not None) as store:
         for number in store.missing(part, keys, workers=2):
             if stop_after is not None and len(made) >= stop_after:
                 raise Killed
             write(store, part[number], keys[number])
             made.append(BLOCKS.index(part[number]))
         if strip is None:
-            store.publish(path, BLOCKS, attrs | {"sum": sum(store.results(BLOCKS))})
+            store.write_atomically(path, BLOCKS, attrs | {"sum": sum(store.results(BLOCKS))})
     return made
 
 
@@ -125,10 +125,10 @@ def test_what_a_killed_writer_left_counts_for_nothing(tmp_path, fresh) -> None:
 def test_another_shape_starts_anew(tmp_path) -> None:
     path = tmp_path / "x.zarr"
     work(path)
-    with making(path, (32, 32), LAYERS, **SIZES) as store:
+    with resumable_grid(path, (32, 32), LAYERS, **SIZES) as store:
         assert store.missing([(slice(0, 32), slice(0, 32))], ["a"], 1) == [0]
         write(store, (slice(0, 32), slice(0, 32)), "a")
-        store.publish(path, [(slice(0, 32), slice(0, 32))], ATTRS)
+        store.write_atomically(path, [(slice(0, 32), slice(0, 32))], ATTRS)
     assert open_grid(path)["disparity"].shape == (32, 32)
 
 
@@ -160,7 +160,7 @@ def test_strips_have_names() -> None:
 
 
 def _hold(path: Path, entered, leave, shared: bool) -> None:
-    with making(path, SHAPE, LAYERS, **SIZES, shared=shared):
+    with resumable_grid(path, SHAPE, LAYERS, **SIZES, shared=shared):
         entered.set()
         leave.wait(20)
 
@@ -196,7 +196,7 @@ def test_records_hold_no_time_or_place(tmp_path) -> None:
 
 def test_a_block_tells_whether_it_is_there(tmp_path):
     """Only if it was made of the same; else what is there of it goes."""
-    with making(tmp_path / "grid.zarr", SHAPE, LAYERS, **SIZES) as store:
+    with resumable_grid(tmp_path / "grid.zarr", SHAPE, LAYERS, **SIZES) as store:
         values = np.ones((32, 32), np.float32)
         store.write(BLOCKS[0], "a", {"disparity": values}, 1)
         assert store.has(BLOCKS[0], "a")

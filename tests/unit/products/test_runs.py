@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
-import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.runs import RUN, Run, begin_run, end_older_jobs, listed
-
-linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+from stereotruth.products.runs import RUN, Run, begin_run
 
 
 @pytest.fixture
@@ -44,51 +39,6 @@ def test_a_job_that_starts_late_belongs_to_the_run_that_started_it(folder, monke
 
 def test_without_a_run_there_is_nothing_to_refuse(folder):
     Run(folder).refuse_older()
-
-
-CHILD = """
-import sys, time
-from pathlib import Path
-from stereotruth.products.runs import listed
-with listed(Path(sys.argv[1])):
-    print("at work", flush=True)
-    time.sleep(60)
-"""
-
-
-@pytest.fixture
-def child(folder):
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(folder)], stdout=subprocess.PIPE, text=True
-    )
-    process.stdout.readline()
-    yield process
-    process.kill()
-    process.wait()
-
-
-@linux
-@pytest.mark.parametrize("stopped", [False, True])
-def test_jobs_of_earlier_runs_are_ended(folder, child, stopped):
-    if stopped:
-        child.send_signal(signal.SIGSTOP)
-    with listed(folder):  # this process stays
-        end_older_jobs(folder)
-        assert child.wait(10) == -signal.SIGKILL
-        assert len(list((folder / "jobs").iterdir())) == 1
-    assert list((folder / "jobs").iterdir()) == []
-
-
-@linux
-@pytest.mark.parametrize("other", [{"start": "1"}, {"boot": "x"}, {"pids": "x"}])
-def test_other_processes_are_left_alone(folder, child, other):
-    """Of another machine, or with the number of one that has ended."""
-    (file,) = (folder / "jobs").iterdir()
-    file.write_text(json.dumps(json.loads(file.read_text()) | other))
-    end_older_jobs(folder)
-    time.sleep(0.2)
-    assert child.poll() is None
-    assert file.exists() == ("start" not in other)
 
 
 WATCHED = """

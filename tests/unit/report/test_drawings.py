@@ -19,12 +19,15 @@ def test_calibrated_groups_lie_on_the_lines():
         {"mean_uncertainty": sigma, "share_below_1": once, "share_below_2": twice}
         for sigma, once, twice in ((0.1, 0.683, 0.954), (0.3, 0.25, 1.0))
     ]
-    drawn = drawings.calibration(deciles)
-    right, wrong = drawn.groups
-    assert [y for y, _ in drawn.right] == pytest.approx([right[1], right[2]], abs=0.11)
-    assert wrong[:3] == (0.75 * drawings.WIDTH, 0.75 * drawings.HEIGHT, 0.0)
-    assert (right[3], wrong[3]) == ("0.100", "0.300")
-    assert drawings.calibration([]) is None
+    drawn = drawings.calibration(deciles, "caption")
+    once, twice, right = drawn.series
+    lines = [float(y) for y in re.findall(r"M0 ([\d.]+)H", right.path)]
+    assert lines == pytest.approx([once.points[0].y, twice.points[0].y], abs=0.11)
+    wrong = once.points[1]
+    assert (wrong.x, wrong.y) == (0.75 * drawings.WIDTH, 0.75 * drawings.HEIGHT)
+    assert twice.points[1].y == 0.0
+    assert [text for _, text in drawn.x_ticks] == ["0.100", "0.300"]
+    assert drawings.calibration([], "") is None
 
 
 def test_arrows_have_the_length_of_their_key(tmp_path):
@@ -47,12 +50,14 @@ def test_arrows_have_the_length_of_their_key(tmp_path):
 def test_histograms_share_their_axis_and_keep_every_label():
     one, two = {0: 10, 5: 30}, {-40: 60, 59: 20}
     first, second = drawings.histograms([("one", "red", one), ("two", "red", two)])
-    assert first.count == 40 and second.count == 80
-    assert first.mean == pytest.approx((0.5 * 10 + 5.5 * 30) / 40)
-    assert first.ticks == second.ticks
+    assert first.caption == "0.00 million labels, mean 4.2 px"
+    assert second.caption.endswith("mean −14.8 px")
+    assert first.x_ticks == second.x_ticks
     bar = drawings.WIDTH / 50  # px of two: −40 … 60
-    heights = [float(y) for y in re.findall(r"V([\d.]+)H", first.path)]
+    path = first.series[0].path
+    heights = [float(y) for y in re.findall(r"V([\d.]+)H", path)]
     assert len(heights) == 50
     assert heights[20] == pytest.approx(drawings.HEIGHT * (1 - 10 / 30), abs=0.1)
     assert heights[22] == 0
-    assert re.findall(r"H([\d.]+)", first.path)[0] == f"{bar:.1f}"
+    assert re.findall(r"H([\d.]+)", path)[0] == f"{bar:g}"
+    assert [text for _, text in first.y_ticks] == ["32"]  # % per px, of 75 in 2 px

@@ -13,6 +13,7 @@ import pytest
 from stereotruth.errors import InputError
 from stereotruth.products.html_page import PAPER
 from stereotruth.report import page
+from stereotruth.report.city_files import CityFiles
 
 from ...browser import look, needs_chromium, screenshot
 from ...synthetic.reported_city import CITY, REASON, alignment, write_city
@@ -77,16 +78,18 @@ def made(tmp_path_factory) -> Path:
     out.parent.mkdir()
     page.write_report(
         CITY,
-        folder / "tiles",
+        CityFiles(
+            folder / "tiles",
+            coverage=coverage,
+            alignments={"S-1": alignment(folder / "alignment.json")},
+            refinements={"S-1": refinement(folder / "refined.json", applied=True)},
+            refinement_figures={"S-1": coverage, "S-2": folder / "none.png"},
+            truth=folder / "truth.json",
+            truth_table=folder / "truth.csv",
+            table4=folder / "table4.csv",
+        ),
         out,
         index=folder / "index.html",
-        coverage=coverage,
-        alignments={"S-1": alignment(folder / "alignment.json")},
-        refinements={"S-1": refinement(folder / "refined.json", applied=True)},
-        refinement_figures={"S-1": coverage, "S-2": folder / "none.png"},
-        truth=folder / "truth.json",
-        truth_table=folder / "truth.csv",
-        table4=folder / "table4.csv",
         sliders=2,
         workers=2,
     )
@@ -98,7 +101,9 @@ def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch)
     monkeypatch.setattr(page, "PICTURE_BYTES", 200_000)
     sizes = []
     for sliders in (0, 4, 12):
-        page.write_report(CITY, tmp_path / "tiles", tmp_path / "index.html", sliders=sliders)
+        page.write_report(
+            CITY, CityFiles(tmp_path / "tiles"), tmp_path / "index.html", sliders=sliders
+        )
         text = (tmp_path / "index.html").read_text()
         sizes.append(sum(map(len, re.findall(r'src="(data:[^"]*)"', text))))
         assert len(re.findall('class="stack"', text)) == sliders
@@ -109,10 +114,10 @@ def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch)
 
 def test_the_page_is_the_same_again_with_any_workers(made, tmp_path):
     city = made.parents[1]
-    write = dict(coverage=city / "coverage.png", sliders=2)
+    files = CityFiles(city / "tiles", coverage=city / "coverage.png")
     texts = []
     for workers in (1, 3):
-        page.write_report(CITY, city / "tiles", tmp_path / "p.html", workers=workers, **write)
+        page.write_report(CITY, files, tmp_path / "p.html", workers=workers, sliders=2)
         texts.append((tmp_path / "p.html").read_bytes())
     assert texts[0] == texts[1]
 
@@ -171,10 +176,12 @@ def test_a_refinement_is_shown_with_before_and_after(tmp_path, applied):
     write_city(tmp_path / "tiles", 1)
     page.write_report(
         "City",
-        tmp_path / "tiles",
+        CityFiles(
+            tmp_path / "tiles",
+            alignments={"S-1": alignment(tmp_path / "a.json")},
+            refinements={"S-1": refinement(tmp_path / "r.json", applied)},
+        ),
         tmp_path / "index.html",
-        alignments={"S-1": alignment(tmp_path / "a.json")},
-        refinements={"S-1": refinement(tmp_path / "r.json", applied)},
     )
     text = (tmp_path / "index.html").read_text()
     frames = re.findall(r"<figcaption>(.*? image, .*?)</figcaption>", text)
@@ -208,7 +215,7 @@ def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
         },
     }
     (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
-    page.write_report("City", tmp_path / "tiles", tmp_path / "index.html")
+    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html")
     text = (tmp_path / "index.html").read_text()
     section = re.search(r'<section id="quality">.*?</section>', text, re.DOTALL)[0]
     assert "Limits: y-parallax ≤ 0.5 px; SIFT matches ≥ 10." in section
@@ -229,7 +236,7 @@ def test_doubts_and_what_the_images_say_by_surface_are_listed(tmp_path):
         "surfaces": {"S-1": {"roofs": {"matches": 400, "bias_px": 0.1512}}},
     }
     (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
-    page.write_report("City", tmp_path / "tiles", tmp_path / "index.html")
+    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html")
     section = re.search(
         r'<section id="quality">.*?</section>', (tmp_path / "index.html").read_text(), re.DOTALL
     )[0]
@@ -240,7 +247,9 @@ def test_doubts_and_what_the_images_say_by_surface_are_listed(tmp_path):
 def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path):
     write_city(tmp_path / "tiles", 2)
     page.write_report(
-        "Bare", tmp_path / "tiles", tmp_path / "index.html", truth="none", truth_table="none"
+        "Bare",
+        CityFiles(tmp_path / "tiles", truth="none", truth_table="none"),
+        tmp_path / "index.html",
     )
     text = (tmp_path / "index.html").read_text()
     sections = re.findall(r'<section id="(\w+)"', text)
@@ -252,7 +261,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
 
 def test_without_a_manifest_it_says_what_to_do(tmp_path):
     with pytest.raises(InputError, match="no manifest"):
-        page.write_report("None", tmp_path, tmp_path / "index.html")
+        page.write_report("None", CityFiles(tmp_path), tmp_path / "index.html")
 
 
 # ------------------------------------------------------------------------------ in a browser

@@ -70,7 +70,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.inputs",
         "products.locks",
         "products.provenance",
-        "products.publication",
+        "products.atomic_outputs",
         "products.records",
         "products.remote_files",
         "products.runs",

@@ -27,7 +27,7 @@ import numpy as np
 from ...dataset.split_names import SPLITS
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
-from ...products.files import replacing, whole_folder, write_table
+from ...products.files import atomic_file, atomic_folder, write_table
 from ...products.finished_pieces import Ledger
 from ...products.html_page import way
 from ...products.inputs import marks, refuse_replaced
@@ -69,7 +69,7 @@ def audit(
     audited = decide(pairs, measured, shared, limits)
     summary = summarise(dataset, audited, shared, limits)
     text = json.dumps(summary, indent=2) + "\n"
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         write_table(scratch / "pairs.csv", table_rows(audited))
         (scratch / "summary.json").write_text(text, encoding="utf-8")
         (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
@@ -101,7 +101,7 @@ def _measure_all(
         piece = ledger.find(pair.name, key, products)
         if piece is None:
             found = features(read_image(pair.left))
-            with replacing(products["features"]) as scratch:
+            with atomic_file(products["features"]) as scratch:
                 np.savez(scratch, **asdict(found))
             figures = measure(dataset, pair)
             refuse_replaced(before)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ...epipolar.one_surface import BEND, SURFACE_PX
 from ...kernels import inner, kernel
+from ...numerics.cubic_convolution import four_point_weights
 from .estimates import Estimate, cells, ratio
 
 Bools = NDArray[np.bool_]
@@ -75,15 +76,6 @@ class Scan:
 def _beats(there: Floats, here: Floats) -> Bools:
     with np.errstate(invalid="ignore"):
         return (there >= CLEAR) & (there - here >= MARGIN)
-
-
-@inner
-def _weights(f: float, out: Floats) -> None:
-    """Cubic convolution (Keys 1981, a = -1/2) at ``f`` px after the second of four pixels."""
-    out[0] = -0.5 * f + f * f - 0.5 * f * f * f
-    out[1] = 1.0 - 2.5 * f * f + 1.5 * f * f * f
-    out[2] = 0.5 * f + 2.0 * f * f - 1.5 * f * f * f
-    out[3] = -0.5 * f * f + 0.5 * f * f * f
 
 
 @inner
@@ -177,11 +169,11 @@ def _scan(
                 at = x - d
                 i = int(np.floor(at))
                 values[n], rows[n], first[n] = left[y, x] - left[y0, x0], y, i - 1
-                _weights(at - i, taps[n])
+                four_point_weights(at - i, taps[n])
                 at += 0.5
                 i = int(np.floor(at))
                 before[n] = i - 1
-                _weights(at - i, between[n])
+                four_point_weights(at - i, between[n])
                 n += 1
         if n < MIN_SUPPORT:
             continue

@@ -3,8 +3,8 @@
 Matches close to each other share texture, surface and error: they are no independent evidence. A
 tile is cut into cells; the variance is that of the cells' sums (cluster-robust, Liang & Zeger
 1986), confidence limits are Student's with as many degrees of freedom as there are cells, less the
-coefficients. The estimate is Tukey's biweight (tuning constant 4.685: 95 % efficient for normal
-errors), started from the median, so that mismatches do no harm.
+coefficients. The estimate is Tukey's biweight, started from the median, so that mismatches do no
+harm.
 """
 
 from __future__ import annotations
@@ -15,13 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from ...numerics.robust import (
+    TUKEY,
+    biweight,
+    median_and_nmad,
+    reweighted_fit,
+    robust_sigma,
+    tukey_weights,
+)
+
 Floats = NDArray[np.float64]
 
 
-TUNING = 4.685
-TO_SIGMA = 1.4826
 SMALLEST_SCALE = 0.02  # px: less is no noise of a match
-ITERATIONS = 50
 CELLS = 8  # along the longer side of what was measured; each of
 CELL_PX = (32, 128)  # at least and at most
 MIN_CELLS = 4
@@ -65,7 +71,7 @@ def cells(x: Floats, y: Floats) -> NDArray[np.int64]:
 
 def scale_of(values: Floats) -> float:
     """Normalised median absolute deviation, no less than ``SMALLEST_SCALE``."""
-    return max(TO_SIGMA * float(np.median(np.abs(values - np.median(values)))), SMALLEST_SCALE)
+    return max(median_and_nmad(values)[1], SMALLEST_SCALE)
 
 
 def robust_fit(design: Floats, values: Floats, groups: NDArray[np.int64]) -> list[Estimate]:
@@ -79,22 +85,13 @@ def robust_fit(design: Floats, values: Floats, groups: NDArray[np.int64]) -> lis
     freedom = names.size - p
     if names.size < MIN_CELLS or freedom < 1 or values.size < 3 * p:
         return [NOTHING] * p
-    at = np.zeros(p)
-    at[0] = np.median(values)
-    scale = scale_of(values)
-    for _ in range(ITERATIONS):
-        u = (values - design @ at) / (TUNING * scale)
-        weight = np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0)
-        normal = (design * weight[:, None]).T @ design
-        step = np.linalg.lstsq(normal, design.T @ (weight * (values - design @ at)), rcond=None)[0]
-        at = at + step
-        if np.abs(step).max() < 1e-6 * max(scale, 1e-3):
-            break
-        scale = scale_of(values - design @ at)
+    start = np.zeros(p)
+    start[0] = np.median(values)
+    at = reweighted_fit(design, values, tukey_weights, least_sigma=SMALLEST_SCALE, start=start)
     residual = values - design @ at
-    u = residual / (TUNING * scale)
+    u = residual / (TUKEY * robust_sigma(residual, SMALLEST_SCALE))
     inside = np.abs(u) < 1.0
-    psi = np.where(inside, residual * (1.0 - u * u) ** 2, 0.0)
+    psi = residual * biweight(u)
     curvature = np.where(inside, (1.0 - u * u) * (1.0 - 5.0 * u * u), 0.0)
     bread = np.linalg.pinv((design * curvature[:, None]).T @ design)
     sums = np.zeros((names.size, p))

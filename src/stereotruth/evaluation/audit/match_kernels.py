@@ -13,6 +13,7 @@ from ...alignment.window_fit import (
     weighted_mean,
 )
 from ...kernels import inner, kernel
+from ...numerics.b_spline import cubic_slopes, cubic_weights
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -27,37 +28,23 @@ LABEL_MOVE_PX = 3.0  # by which that may move the match: a window's middle may s
 
 
 @inner
-def _taps(f: float, value: Floats, slope: Floats) -> None:
-    """Weights of four coefficients, the second of which lies ``f`` px before the position."""
-    g = 1.0 - f
-    value[0] = g * g * g / 6.0
-    value[1] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
-    value[2] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
-    value[3] = f * f * f / 6.0
-    slope[0] = -g * g / 2.0
-    slope[1] = (3.0 * f * f - 4.0 * f) / 2.0
-    slope[2] = (4.0 * g - 3.0 * g * g) / 2.0
-    slope[3] = f * f / 2.0
-
-
-@inner
-def _sample(c: Picture, x: float, y: float, taps: Floats, out: Floats, k: int) -> bool:
+def _sample(c: Picture, x: float, y: float, out: Floats, k: int) -> bool:
     """Fill ``out[k]`` by value and slopes of a spline; False next to its border and outside."""
     if not (x >= 2.0 and y >= 2.0 and x <= c.shape[1] - 4.0 and y <= c.shape[0] - 4.0):
         return False
     i, j = int(np.floor(x)), int(np.floor(y))
-    _taps(x - i, taps[0], taps[1])
-    _taps(y - j, taps[2], taps[3])
+    across, across_slope = cubic_weights(x - i), cubic_slopes(x - i)
+    weight, slope = cubic_weights(y - j), cubic_slopes(y - j)
     value, along, down = 0.0, 0.0, 0.0
     for b in range(4):
         v, s = 0.0, 0.0
         for a in range(4):
             p = c[j - 1 + b, i - 1 + a]
-            v += taps[0, a] * p
-            s += taps[1, a] * p
-        value += taps[2, b] * v
-        along += taps[2, b] * s
-        down += taps[3, b] * v
+            v += across[a] * p
+            s += across_slope[a] * p
+        value += weight[b] * v
+        along += weight[b] * s
+        down += slope[b] * v
     out[k, 0], out[k, 1], out[k, 2] = value, along, down
     return True
 
@@ -95,13 +82,12 @@ def _match(
     side = weight.shape[0]
     half, n = side // 2, side * side
     out[:] = np.nan
-    taps = np.empty((4, 4))
     a, b, weights = np.empty((n, 3)), np.empty((n, 3)), weight.reshape(-1)
     u, v = np.empty(n), np.empty(n)  # from the middle pixel
     total = 0.0
     for k in range(n):
         u[k], v[k] = k % side - half, k // side - half
-        if not _sample(left, x0 + u[k], y0 + v[k], taps, a, k):
+        if not _sample(left, x0 + u[k], y0 + v[k], a, k):
             return
         total += weights[k]
     mean_a = weighted_mean(a, weights)
@@ -110,7 +96,7 @@ def _match(
     for _ in range(ITERATIONS):
         for k in range(n):
             x = x0 + u[k] - (at[0] + at[1] * u[k] + at[2] * v[k])
-            if not _sample(right, x, y0 + v[k] + at[3], taps, b, k):
+            if not _sample(right, x, y0 + v[k] + at[3], b, k):
                 return
         mean_b = weighted_mean(b, weights)
         gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)
@@ -179,7 +165,6 @@ def _offset(
         return
     if np.isnan(labels[y0, x0]):
         return
-    taps = np.empty((4, 4))
     place, a, b = np.empty((weight.size, 2)), np.empty((weight.size, 3)), np.empty((weight.size, 3))
     some = np.empty(weight.size)
     n, total, whole = 0, 0.0, 0.0
@@ -190,7 +175,7 @@ def _offset(
             if np.isnan(labels[y, x]):
                 continue
             place[n, 0], place[n, 1] = x - labels[y, x], y
-            _sample(left, float(x), float(y), taps, a, n)
+            _sample(left, float(x), float(y), a, n)
             some[n] = weight[j, i]
             total += weight[j, i]
             n += 1
@@ -202,7 +187,7 @@ def _offset(
     offset, parallax = first, p
     for _ in range(ITERATIONS):
         for k in range(n):
-            if not _sample(right, place[k, 0] + offset, place[k, 1] + parallax, taps, b, k):
+            if not _sample(right, place[k, 0] + offset, place[k, 1] + parallax, b, k):
                 return
         mean_b = weighted_mean(b, weights)
         gain, correlation = gain_and_correlation(a, b, weights, mean_a, mean_b)

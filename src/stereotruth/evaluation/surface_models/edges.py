@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from ...numerics.error_sums import quantile_bin
 from .height_raster import Floats
 from .reference import BUILDING, NONE, OTHER, TREE, WATER, Lattice
 
@@ -259,10 +260,8 @@ class EdgeErrors:
         lacking = dict.fromkeys(("position_error_m", "median_m", "p90_m", "outward_m"))
         if not n:
             return {"edges": self.edges, **shares, **lacking}
-        total = np.cumsum(self.histogram)
         median, p90 = (
-            (float(np.searchsorted(total, share * n)) + 0.5) * REACH_M / BINS
-            for share in (0.5, 0.9)
+            (quantile_bin(self.histogram, share) + 0.5) * REACH_M / BINS for share in (0.5, 0.9)
         )
         values = {
             **shares,

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from ...numerics.error_sums import ErrorSum, Scale
 from .edges import near_steps
 from .height_raster import Floats
 from .reference import BUILDING, GROUND, OTHER, TREE, WATER, Lattice
 
-LIMITS_M = (1.0, 3.0)
-BIN_M = 0.005
-BINS = 40_001  # to ±100 m; what is beyond counts into the outer bins
+METRES = Scale((1.0, 3.0), 0.005, 40_001)  # to ±100 m
 STEP_REACH_M = 3.0  # around a step, or the shadow of one: heights there say where the edge is
 CROWN_REACH_M = 1.5  # around a crown, below which slanting pulses reach the ground
 SLOPES_DEG = (0.0, 5.0, 15.0, 30.0, 90.0)
@@ -29,62 +28,33 @@ STEPS = "beside steps and trees"
 class HeightErrors:
     """Errors in m of a stratum: model less reference."""
 
-    points: int = 0  # of the reference
-    count: int = 0  # of them, where the model has a height
-    total: float = 0.0
-    absolute: float = 0.0
-    square: float = 0.0
-    beyond: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(LIMITS_M), np.int64))
-    histogram: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, np.int64))
+    points: int = 0  # of the reference; the errors are those where the model has a height
+    errors: ErrorSum = field(default_factory=lambda: ErrorSum(METRES))
 
     def add(self, errors: Floats) -> None:
         """Add errors [n], NaN where the model has no height."""
         self.points += errors.size
-        errors = errors[np.isfinite(errors)]
-        size = np.abs(errors)
-        self.count += errors.size
-        self.total += float(errors.sum())
-        self.absolute += float(size.sum())
-        self.square += float((errors * errors).sum())
-        self.beyond += [int((size > limit).sum()) for limit in LIMITS_M]
-        index = np.clip(np.rint(errors / BIN_M) + BINS // 2, 0, BINS - 1).astype(np.int64)
-        self.histogram += np.bincount(index, minlength=BINS)
+        self.errors.add(errors[np.isfinite(errors)])
 
     def figures(self) -> dict[str, float | int | None]:
         """JSON-ready; ``known_share``: completeness, of the reference's points."""
-        names = [f"share_over_{limit:g}_m" for limit in LIMITS_M]
-        medians = ("median_m", "nmad_m", "le90_m")
-        if not self.count:
-            lacking = ("mean_m", "mean_absolute_m", "rms_m", *medians, *names)
-            share = 0.0 if self.points else None
-            return {"points": self.points, "known_share": share, **dict.fromkeys(lacking)}
-        n, middle = self.count, BINS // 2
-        median = _quantile(self.histogram, 0.5)
+        e = self.errors
+        shares = e.shares_beyond("m")
+        if not e.count:
+            lacking = ("mean_m", "mean_absolute_m", "rms_m", "median_m", "nmad_m", "le90_m")
+            known = 0.0 if self.points else None
+            return {"points": self.points, "known_share": known, **dict.fromkeys(lacking), **shares}
         values = {
-            "known_share": n / self.points,
-            "mean_m": self.total / n,
-            "mean_absolute_m": self.absolute / n,
-            "rms_m": (self.square / n) ** 0.5,
-            "median_m": (median - middle) * BIN_M,
-            "nmad_m": 1.4826 * _quantile(_folded(self.histogram, median), 0.5) * BIN_M,
-            "le90_m": _quantile(_folded(self.histogram, middle), 0.9) * BIN_M,
-            **{name: int(k) / n for name, k in zip(names, self.beyond)},
+            "known_share": e.count / self.points,
+            "mean_m": e.bias,
+            "mean_absolute_m": e.mean_absolute,
+            "rms_m": e.rms,
+            "median_m": e.median,
+            "nmad_m": e.nmad,
+            "le90_m": e.quantile_of_size(0.9),
+            **shares,
         }
         return {"points": self.points} | {k: round(float(v), 4) for k, v in values.items()}
-
-
-def _quantile(histogram: NDArray[np.int64], share: float) -> int:
-    total = np.cumsum(histogram)
-    return int(np.searchsorted(total, share * total[-1]))
-
-
-def _folded(histogram: NDArray[np.int64], middle: int) -> NDArray[np.int64]:
-    """Histogram of the distances to the bin ``middle``."""
-    above, below = histogram[middle:], histogram[:middle][::-1]
-    folded = np.zeros(max(above.size, below.size + 1), dtype=np.int64)
-    folded[: above.size] = above
-    folded[1 : 1 + below.size] += below
-    return folded
 
 
 def slopes(lattice: Lattice) -> Floats:

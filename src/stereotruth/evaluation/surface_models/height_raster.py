@@ -21,6 +21,7 @@ from rasterio.windows import Window as RasterWindow
 from ...errors import InputError
 from ...lidar.declared_crs import LidarCRS, interpret
 from ...lidar.geoid import GeoidGrid
+from ...numerics.bilinear import bilinear
 
 Floats = NDArray[np.float64]
 Heights = NDArray[np.float32]
@@ -164,14 +165,4 @@ class Window:
 
     def at(self, x: Floats, y: Floats) -> Floats:
         """Heights at places, of any shape, bilinear; NaN where one of the four cells lacks."""
-        col, row = self.cells(x, y)
-        h, w = self.heights.shape
-        with np.errstate(invalid="ignore"):  # of places that are NaN
-            inside = (row >= 0) & (col >= 0) & (row < h - 1) & (col < w - 1)
-        col, row = np.where(inside, col, 0.0), np.where(inside, row, 0.0)
-        j, i = col.astype(np.int64), row.astype(np.int64)
-        u, v = col - j, row - i
-        z = self.heights
-        found = (1 - v) * ((1 - u) * z[i, j] + u * z[i, j + 1])
-        found += v * ((1 - u) * z[i + 1, j] + u * z[i + 1, j + 1])
-        return np.where(inside, found, np.nan)
+        return bilinear(self.heights, *self.cells(x, y))

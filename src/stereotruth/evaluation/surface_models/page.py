@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...products.files import whole_folder, write_json, write_table
+from ...products.files import atomic_folder, write_json, write_table
 from ...products.html_page import way, write_page
 from ...products.html_tables import Headline, minus, table
 from ...products.pictures import colours, encode, encode_file, gradient, save_figure, shrink
@@ -44,7 +44,7 @@ def write_verdict(
     figures = verdict.figures()
     rows = [{"stratum": name, **of} for name, of in figures["errors"].items() if of["points"]]
     rows.append({"stratum": "as delivered, all but trees and water", **figures["as_delivered"]})
-    with whole_folder(folder) as scratch:
+    with atomic_folder(folder) as scratch:
         write_json(scratch / "scores.json", figures)
         write_table(scratch / "errors.csv", rows)
         _draw_profile(scratch / "edges.png", figures["edge_profile"])

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from ...error_statistics import median_and_nmad
 from ...kernels import kernel
+from ...numerics.robust import huber_weights, median_and_nmad, reweighted_fit
 from .edges import Edges, measure
 from .height_raster import Floats, Window
 
@@ -188,14 +188,7 @@ def _tilt(parts: Sequence[Part], shift: Floats) -> Floats:
 
 def _huber(columns: Floats, values: Floats) -> Floats:
     """Coefficients of a linear fit with Huber's weights, least scale LEAST_SCALE_M."""
-    found, left = np.zeros(columns.shape[1]), values
-    for _ in range(12):
-        size = np.abs(left)
-        scale = max(1.4826 * float(np.median(size)), LEAST_SCALE_M)
-        root = np.sqrt(1.345 * scale / np.maximum(size, 1.345 * scale))
-        found = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
-        left = values - columns @ found
-    return found
+    return reweighted_fit(columns, values, huber_weights, least_sigma=LEAST_SCALE_M)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from ...products.files import read_table
 from ...products.pictures import save_figure
 from .scores import ALL
-from .tables import Table
+from .tables import Table, nothing, plain_table
 
 Row = Mapping[str, Any]
 Curve = tuple[list[float], list[float], list[float]]
@@ -36,7 +36,7 @@ def confidence_table(methods: Sequence[Row]) -> Table:
         if row["stratum"] == name and row["pixels"]
     ]
     if not rows:
-        return Table("confidence", title, [], [(NONE, ["Method"], [])])
+        return nothing("confidence", title, NONE)
     lines = [
         [
             f"{row['method']}, {row['stratum'].replace('_', ' ')}",
@@ -63,7 +63,7 @@ def confidence_table(methods: Sequence[Row]) -> Table:
         "oracle's, 0 at best; of ignorance: as a share of that of uncertainties that know nothing. "
         "σ times: what the uncertainties would have to be multiplied by for one σ to hold 68.27 %."
     )
-    return Table("confidence", title, rows, [(caption, heading, lines)])
+    return Table("confidence", title, rows, [(caption, plain_table(heading, lines))])
 
 
 def read_curves(folder: str | Path) -> dict[str, Curve]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...products.files import read_table
 from .scores import CONFIDENCE, MIN_TILES, resampled
-from .tables import FILLED, Table, with_interval
+from .tables import FILLED, Table, nothing, plain_table, with_interval
 
 Sums = dict[str, NDArray[np.float64]]  # by tile: labelled pixels, and a figure's sum over them
 Row = dict[str, Any]
@@ -63,7 +63,7 @@ def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: 
     """
     title = "Differences: method by method on the same tiles"
     if len(methods) < 2:
-        return Table("differences", title, [], [("One method alone.", ["Method"], [])])
+        return nothing("differences", title, "One method alone.")
     limit = methods[0]["thresholds_px"][0]
     names = {"epe_px": "filled_epe_px", "d1_share": f"filled_d1_{limit:g}_px_share"}
     tiles = [read_tiles(folder, list(names.values())) for folder in folders]
@@ -98,7 +98,7 @@ def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: 
         f"Difference of {FILLED}, with 95 % confidence by resampling the tiles of both methods "
         "together: negative where the first of the two is better."
     )
-    return Table("differences", title, rows, [(caption, heading, lines)])
+    return Table("differences", title, rows, [(caption, plain_table(heading, lines))])
 
 
 def _rounded(value: float | None) -> float | None:

@@ -56,7 +56,7 @@ def write_benchmark(
             *((of["label"], str(way(out, folder)), "") for of, folder in zip(methods, scores)),
         ],
         "charts": [chart for chart in charts if chart],
-        "sections": sections(tables, methods, methods[0]["thresholds_px"]),
+        "sections": sections(tables),
         "figure": None if figure is None else encode_file(Path(figure), FIGURE_BYTES, FIGURE_PX),
         "curves": None if curves is None else encode_file(Path(curves), FIGURE_BYTES, FIGURE_PX),
         "panels": {

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...errors import InputError, without_secrets
 from ...job import progress
-from ...products.files import link, whole_folder
+from ...products.files import atomic_folder, link
 from ...products.finished_pieces import Ledger
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
@@ -131,7 +131,7 @@ def predict(
         "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         for pair in pairs:
             for source, target in zip(*(_maps(top, pair).values() for top in (work, scratch))):
                 if source.exists():
@@ -182,6 +182,7 @@ class _Runs:
 
 
 def _images(pair: Pair) -> tuple[NDArray[Any], NDArray[Any]]:
+    pair.refuse_changed()
     left, right = read_image(pair.left), read_image(pair.right)
     if left.shape != right.shape or left.dtype != right.dtype:
         raise InputError(

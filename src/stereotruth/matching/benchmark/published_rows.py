@@ -11,7 +11,7 @@ from typing import Any
 
 from ..kinds import KINDS
 from .published_scores import TABLE5
-from .tables import Table
+from .tables import Table, nothing, plain_table
 
 Row = Mapping[str, Any]
 PAPER = "Li et al., IEEE TGRS 2023, table 5"
@@ -60,7 +60,7 @@ def beside_published(methods: Sequence[Row]) -> Table:
     name = methods[0]["protocol"]["name"] if methods else ""
     if name not in PUBLISHED:
         text = f"Nothing is published by a protocol like this one; some is by {_and(PUBLISHED)}."
-        return Table("published", title, [], [(text, ["Method"], [])])
+        return nothing("published", title, text)
     rows = [
         {
             "method": of["label"],
@@ -85,7 +85,7 @@ def beside_published(methods: Sequence[Row]) -> Table:
     ]
     heading = ["Method", "EPE (px)", "D1, 3 px (%)", "Source", "Not known of its protocol"]
     caption = f"Only those scored here are known to be by protocol {methods[0]['protocol']['id']}."
-    return Table("published", title, rows, [(caption, heading, lines)])
+    return Table("published", title, rows, [(caption, plain_table(heading, lines))])
 
 
 def _and(names: Sequence[str]) -> str:

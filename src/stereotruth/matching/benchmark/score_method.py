@@ -16,27 +16,133 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
-from ...error_statistics import ErrorSum
 from ...errors import InputError
 from ...job import progress
-from ...products.files import whole_folder, write_table
+from ...numerics.error_sums import ErrorSum
+from ...products.files import atomic_folder, write_table
 from ...products.rasters import read_image
 from .confidence import SHARES, Confidence
 from .cumulative import Cumulative
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction, read_record, read_uncertainty
-from .protocols import pair_sha256, protocol_of
+from .protocols import Protocol, pair_sha256, protocol_of
 from .scores import ALL, Collector, Scorer, Scores
 from .strata import Products, exact_truth, height_m_per_px, label_strata
 from .submission import SUBMITTED, hold_against
 
 log = logging.getLogger("stereotruth")
+
+
+@dataclass(frozen=True)
+class ScoringPlan:
+    """How predictions are scored.
+
+    ``thresholds_px``: errors above these count for D1; ``bootstrap``: samples of the tiles for the
+    intervals, drawn by ``seed``; ``panels``: most tiles that are drawn; ``protocol``: see
+    :mod:`.protocols`, it precedes the thresholds.
+    """
+
+    thresholds_px: Sequence[float]
+    bootstrap: int
+    seed: int
+    panels: int
+    protocol: str | None = None
+
+    @property
+    def sampling(self) -> dict[str, int]:
+        """Of the intervals."""
+        return {"times": self.bootstrap, "seed": self.seed}
+
+
+@dataclass
+class _Sums:
+    """Sums over the pairs that are scored, by ``scorer`` and ``protocol``."""
+
+    scorer: Scorer
+    protocol: Protocol
+    products: Products
+    collector: Collector
+    cumulative: Cumulative
+    confidences: dict[str, Confidence] = field(default_factory=dict)
+    errors: dict[str, ErrorSum] = field(default_factory=dict)
+    scored: list[tuple[str, str]] = field(default_factory=list)  # pairs, digests of their truth
+
+    @classmethod
+    def of(cls, dataset: StereoDataset, protocol: Protocol, products: Products) -> _Sums:
+        """Of no pair yet."""
+        thresholds = protocol.thresholds_px
+        scorer = Scorer(dataset.disparity_range, thresholds, dataset.grows_with_height)
+        return cls(scorer, protocol, products, Collector(thresholds), Cumulative(thresholds))
+
+    def add(
+        self, pair: Pair, labels: np.ndarray, found: np.ndarray, sigma: np.ndarray | None
+    ) -> np.ndarray:
+        """Add a pair with disparities ``found`` and their uncertainty; the truth it is held to."""
+        scorer, truth = self.scorer, labels
+        strata_of_labels = label_strata(pair, labels, self.products)
+        exact_of_pair = exact_truth(pair, self.products)
+        truths = [labels]
+        if self.protocol.truth == "exact":
+            truth = _visible(pair, exact_of_pair)
+            truths = [truth, *exact_of_pair.values()]
+        self.scored.append((pair.name, pair_sha256(pair, truths)))
+        here = scorer.counted(truth)
+        self.cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
+        sums = scorer.sums(found, truth, strata_of_labels)
+        for stratum, exact in exact_of_pair.items():
+            sums[stratum] = scorer.sums(found, exact)[ALL]
+        error = (found - truth)[here]
+        for place in (pair.city, ALL):
+            self.errors.setdefault(place, ErrorSum()).add(error[np.isfinite(error)])
+        if sigma is not None:
+            by_stratum = {
+                ALL: truth,
+                **{name: np.where(of, truth, np.nan) for name, of in strata_of_labels.items()},
+                **exact_of_pair,
+            }
+            for stratum, exact in by_stratum.items():
+                counted = np.where(scorer.counted(exact), exact, np.nan)
+                self.confidences.setdefault(stratum, Confidence()).add(found, sigma, counted)
+        self.collector.add(pair.name, pair.city, sums)
+        return truth
+
+    def rows(self, sampling: Mapping[str, int]) -> dict[str, Any]:
+        """Rows ``all``, ``cities``, ``strata`` with intervals by samples of the tiles."""
+        scores = self.collector.scores()
+        medians = {place: of.figures()["median_absolute"] for place, of in self.errors.items()}
+        cities = [
+            _row(scores, {"city": city}, sampling, scores.in_city(city))
+            | {"median_px": medians[city]}
+            for city in _cities(scores)
+        ]
+        strata = [
+            _row(scores, {"stratum": name}, sampling, stratum=name)
+            for name in scores.strata
+            if scores.row(stratum=name)["labelled"]
+        ]
+        total = _row(scores, {"city": ALL}, sampling) | {"median_px": medians[ALL]}
+        return {"all": total, "cities": cities, "strata": strata}
+
+    def write_tables(self, folder: Path, rows: Mapping[str, Any], pairs: Sequence[Pair]) -> None:
+        """All CSV files."""
+        scores = self.collector.scores()
+        tiles = [
+            {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
+            for n, pair in enumerate(pairs)
+        ]
+        write_table(folder / "scores.csv", tiles)
+        write_table(folder / "cities.csv", [*rows["cities"], rows["all"]])
+        write_table(folder / "strata.csv", rows["strata"])
+        write_table(folder / "cumulative.csv", self.cumulative.rows())
+        if self.confidences:
+            write_table(folder / "sparsification.csv", _sparsification(self.confidences))
 
 
 def score(
@@ -45,111 +151,53 @@ def score(
     label: str,
     predictions: str | Path,
     out: str | Path,
+    plan: ScoringPlan,
     *,
-    thresholds_px: Sequence[float],
-    bootstrap: int,
-    seed: int,
-    panels: int,
     fine_tuned_of: str | None = None,
     products: Products | None = None,
-    protocol: str | None = None,
 ) -> dict[str, Any]:
     """Score the predictions of rule match; returns what scores.json holds.
 
     ``label``: how the method is called in pictures and tables; ``fine_tuned_of``: the method whose
-    training it carried on; ``panels``: most tiles that are drawn; ``products``: where the strata of
-    the workflow's own dataset come from; ``protocol``: see :mod:`.protocols`, it precedes the other
-    settings.
+    training it carried on; ``products``: where the strata of the workflow's own dataset come from.
 
     Raises InputError if there are no labelled pairs, files are missing, the protocol is not one for
     the dataset, or a submission's scores are others.
     """
-    of_protocol = protocol_of(protocol, dataset, split, thresholds_px)
-    thresholds_px = of_protocol.thresholds_px
+    protocol = protocol_of(plan.protocol, dataset, split, plan.thresholds_px)
     pairs = dataset.pairs(split, labelled=True)
     products = products or Products()
     record = read_record(predictions)
-    scorer = Scorer(dataset.disparity_range, thresholds_px, dataset.grows_with_height)
-    collector = Collector(thresholds_px)
-    confidences: dict[str, Confidence] = {}
-    cumulative = Cumulative(thresholds_px)
-    errors: dict[str, ErrorSum] = {}
-    scored: list[tuple[str, str]] = []
-    drawn = {pair.name for pair in choose(pairs, panels)}
-    with whole_folder(out) as scratch:
+    sums = _Sums.of(dataset, protocol, products)
+    drawn = {pair.name for pair in choose(pairs, plan.panels)}
+    with atomic_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
-            found, truth = read_prediction(predictions, pair), dataset.labels(pair)
-            strata_of_labels = label_strata(pair, truth, products)
-            exact_of_pair = exact_truth(pair, products)
-            if of_protocol.truth == "exact":
-                truth = _visible(pair, exact_of_pair)
-            truths = [truth, *exact_of_pair.values()] if of_protocol.truth == "exact" else [truth]
-            scored.append((pair.name, pair_sha256(pair, truths)))
-            here = scorer.counted(truth)
-            cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
-            sums = scorer.sums(found, truth, strata_of_labels)
-            for stratum, exact in exact_of_pair.items():
-                sums[stratum] = scorer.sums(found, exact)[ALL]
-            error = (found - truth)[here]
-            for place in (pair.city, ALL):
-                errors.setdefault(place, ErrorSum()).add(error[np.isfinite(error)])
-            sigma = read_uncertainty(predictions, pair)
-            if sigma is not None:
-                by_stratum = {
-                    ALL: truth,
-                    **{name: np.where(of, truth, np.nan) for name, of in strata_of_labels.items()},
-                    **exact_of_pair,
-                }
-                for stratum, exact in by_stratum.items():
-                    counted = np.where(scorer.counted(exact), exact, np.nan)
-                    confidences.setdefault(stratum, Confidence()).add(found, sigma, counted)
-            collector.add(pair.name, pair.city, sums)
+            pair.refuse_changed()
+            found, labels = read_prediction(predictions, pair), dataset.labels(pair)
+            truth = sums.add(pair, labels, found, read_uncertainty(predictions, pair))
             if pair.name in drawn:
-                shown = np.where(scorer.counted(truth), truth, np.float32(np.nan))
+                shown = np.where(sums.scorer.counted(truth), truth, np.float32(np.nan))
                 column = Column(
                     pair.name, read_image(pair.left), read_image(pair.right), shown, {label: found}
                 )
                 draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
-        scores = collector.scores()
-        sampling = {"times": bootstrap, "seed": seed}
-        medians = {place: of.figures()["median_absolute"] for place, of in errors.items()}
-        cities = [
-            _row(scores, {"city": city}, sampling, scores.in_city(city))
-            | {"median_px": medians[city]}
-            for city in _cities(scores)
-        ]
-        total = _row(scores, {"city": ALL}, sampling) | {"median_px": medians[ALL]}
-        strata = [
-            _row(scores, {"stratum": name}, sampling, stratum=name)
-            for name in scores.strata
-            if scores.row(stratum=name)["labelled"]
-        ]
+        rows = sums.rows(plan.sampling)
+        confidences = sums.confidences.items()
         summary = {
             "label": label,
             "fine_tuned_of": fine_tuned_of,
             **{key: record[key] for key in record if key not in ("pairs", SUBMITTED)},
-            "protocol": of_protocol.identified(scored),
+            "protocol": protocol.identified(sums.scored),
             "tiles": len(pairs),
-            "thresholds_px": list(scores.thresholds_px),
-            "bootstrap": bootstrap,
+            "thresholds_px": list(protocol.thresholds_px),
+            "bootstrap": plan.bootstrap,
             "height_m_per_px": height_m_per_px(pairs, products),
-            "all": total,
-            "cities": cities,
-            "strata": strata,
-            "confidence": [{"stratum": s, **of.figures()} for s, of in confidences.items()],
+            **rows,
+            "confidence": [{"stratum": name, **of.figures()} for name, of in confidences],
         }
         if SUBMITTED in record:
             hold_against(record[SUBMITTED], summary)
-        tiles = [
-            {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
-            for n, pair in enumerate(pairs)
-        ]
-        write_table(scratch / "scores.csv", tiles)
-        write_table(scratch / "cities.csv", [*cities, total])
-        write_table(scratch / "strata.csv", strata)
-        write_table(scratch / "cumulative.csv", cumulative.rows())
-        if confidences:
-            write_table(scratch / "sparsification.csv", _sparsification(confidences))
+        sums.write_tables(scratch, rows, pairs)
         text = json.dumps(summary, indent=2) + "\n"
         (scratch / "scores.json").write_text(text, encoding="utf-8")
     log.info("%s: %s", label, describe(summary))

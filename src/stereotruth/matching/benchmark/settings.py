@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
 from ...dataset.stereo_dataset_settings import Settings as Dataset
-from ...settings import Number, Text, Unit, Whole, each_once, name_of, settings
+from ...settings import Number, Text, Unit, Whole, each_once, name_of, over, settings
 from ..kinds import KINDS
 from ..networks.training_settings import Training
 
 Name = name_of("A-Za-z0-9_-")
+
+
+def _part_of_training(given: dict[str, Any]) -> dict[str, Any]:
+    """Some keys of the section training, as they were given; InputError if they cannot be."""
+    Training(**given)
+    return given
 
 
 @settings(more=True)
@@ -44,8 +50,17 @@ class Method:
     version: Text = ""
     """of the method, for `scores.json`"""
 
-    training: Training = field(default_factory=Training)
+    training: Annotated[dict[str, Any], AfterValidator(_part_of_training)] = field(
+        default_factory=dict
+    )
     """what its training has other than the section training"""
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """The entry with what it has other than the defaults, further settings included."""
+        own = type(self)(self.kind)
+        given = vars(self).items()
+        return {n: value for n, value in given if n == "kind" or value != vars(own).get(n)}
 
 
 @settings
@@ -67,26 +82,32 @@ class Scoring:
     """that are drawn for each method, of all cities; figure 10 shows up to six"""
 
 
-def _own_dataset() -> dict[str, Dataset | None]:
-    own = Dataset("dataset", "stereotruth", (-64, 128), methods=("sgm",))
-    return {"synthetic": own}
-
-
-def _methods() -> dict[str, Method | None]:
-    return {kind: Method(kind) for kind in ("sgm", "stereonet", "psmnet", "hmsmnet")}
+# Entries that there are without being written; their keys hold where an own entry lacks them.
+DATASETS = {
+    "synthetic": {  # what rule dataset makes
+        "root": "dataset",
+        "layout": "stereotruth",
+        "disparity_range": [-64, 128],
+        "methods": ["sgm"],
+    }
+}
+METHODS = {kind: {"kind": kind} for kind in ("sgm", "stereonet", "psmnet", "hmsmnet")}
 
 
 @settings
 class Settings(Scoring):
     """The configuration's section benchmark."""
 
-    datasets: Annotated[dict[Name, Dataset | None], Unit("by name")] = field(
-        default_factory=_own_dataset
+    datasets: Annotated[dict[Name, Dataset | None], over(DATASETS), Unit("by name")] = field(
+        default_factory=lambda: {name: Dataset(**entry) for name, entry in DATASETS.items()}
     )
     """datasets on which stereo methods are compared (`benchmark/<dataset>/<method>`), see
-    [below](#stereo-methods); `synthetic` is what rule `dataset` makes; null takes a dataset away"""
+    [below](#stereo-methods); `synthetic` is what rule `dataset` makes, and is
+    there if no dataset is named, or it is; null takes a dataset away"""
 
-    methods: Annotated[dict[Name, Method | None], Unit("by name")] = field(default_factory=_methods)
+    methods: Annotated[dict[Name, Method | None], over(METHODS), Unit("by name")] = field(
+        default_factory=lambda: {name: Method(**entry) for name, entry in METHODS.items()}
+    )
     """methods, see [below](#stereo-methods); null takes a method away"""
 
     split: Literal["train", "val", "test"] | None = "test"

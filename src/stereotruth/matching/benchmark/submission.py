@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...products.files import whole_folder
+from ...products.files import atomic_folder
 from ...products.names import plain_name
 from ...products.provenance import file_sha256
 from .prediction_files import UNCERTAINTY, read_record
@@ -37,7 +37,7 @@ def pack(predictions: str | Path, scores: str | Path, out: str | Path) -> dict[s
     predictions = Path(predictions)
     summary = json.loads((Path(scores) / "scores.json").read_text(encoding="utf-8"))
     pairs = read_record(predictions)["pairs"]
-    with whole_folder(out) as scratch:
+    with atomic_folder(out) as scratch:
         for pair in pairs:
             for name, file in (
                 (f"{pair}.tif", predictions / f"{pair}.tiff"),

@@ -3,19 +3,25 @@
 Made from the ``scores.json`` of each method. Figures are those of all labelled pixels, holes
 filled, so that methods with and without holes compare; those of the valid pixels alone stand beside
 them. CSV files hold all, with confidence intervals and the paper's figures (columns ``paper_…``: on
-the real WHU-Stereo, by methods trained on it), Markdown files what fits a page.
+the real WHU-Stereo, by methods trained on it). Markdown files and the page hold what fits a page,
+the best of its kind in bold: the least error, time and memory, and the largest share of valid
+pixels, among the methods and where there are at least two. It stands with its 95 % interval where
+there is one.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...products.files import replacing, write_table
+from ...products.files import atomic_file, write_table
+from ...products.html_tables import Cell, Column, metres, minus
+from ...products.html_tables import Table as Shown
 from ..kinds import KINDS
 from . import published_scores
 
@@ -24,16 +30,20 @@ Row = dict[str, Any]
 
 PAPERS = "The paper's, on the real WHU-Stereo"
 FILLED = "all labelled pixels, holes filled"
+NOTHING = Cell("–", "")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows for a CSV file, and one or more tables (caption, heading, lines) to read."""
+    """Rows for a CSV file, and one or more tables with captions to read, in Markdown or on a page.
+
+    Captions may have Markdown's marks of code.
+    """
 
     name: str
     title: str
     rows: Sequence[Row]
-    shown: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]]
+    shown: Sequence[tuple[str, Shown]]
 
     @property
     def columns(self) -> list[str]:
@@ -48,11 +58,73 @@ class Table:
     def markdown(self) -> str:
         """What is to be read."""
         parts = [f"# {self.title}"]
-        for caption, heading, lines in self.shown:
-            table = [heading, ["---", *["---:"] * (len(heading) - 1)], *lines]
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in table))
-            parts[-1] = f"{caption}\n\n{parts[-1]}"
+        for caption, shown in self.shown:
+            lines = [
+                [column.title for column in shown.columns],
+                ["---:" if column.numeric else "---" for column in shown.columns],
+            ]
+            for heading, rows in shown.groups:
+                if heading:
+                    lines.append([f"**{heading}**", *[""] * (len(shown.columns) - 1)])
+                lines += [[f"**{c.text}**" if c.best else c.text for c in row] for row in rows]
+            parts.append(caption)
+            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
         return "\n\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How a figure of the scores is shown: title, key, factor, format, whether more is better."""
+
+    title: str
+    key: str
+    factor: float = 1
+    form: str = ".3f"
+    more: bool = False
+
+    def cell(self, row: Row, best: float | None, *, interval: bool = False) -> Cell:
+        """The figure of a row; ``best`` of all rows, which stands with its interval."""
+        value = row.get(self.key)
+        if value is None:
+            return NOTHING
+        is_best = best is not None and value == best
+        text = with_interval(row, self.key, self.factor, self.form, shown=interval or is_best)
+        return Cell(minus(text), f"{value:.9g}", best=is_best)
+
+    def best(self, rows: Sequence[Row]) -> float | None:
+        """The best of at least two values."""
+        values = [row[self.key] for row in rows if row.get(self.key) is not None]
+        if len(values) < 2:
+            return None
+        return max(values) if self.more else min(values)
+
+
+def plain_table(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> Shown:
+    """A table of texts, sorted by the numbers that they begin with; words stand in the first."""
+    numeric = [
+        column > 0 and all(_leading(line[column]) is not None for line in lines)
+        for column in range(len(heading))
+    ]
+
+    def cell(column: int, text: str) -> Cell:
+        number = _leading(text)
+        return Cell(minus(text) if column else text, text if number is None else number)
+
+    rows = tuple(tuple(cell(k, text) for k, text in enumerate(line)) for line in lines)
+    return Shown(tuple(map(Column, heading, numeric)), (("", rows),) if rows else ())
+
+
+def nothing(name: str, title: str, why: str) -> Table:
+    """A table without rows; ``why`` there are none."""
+    return Table(name, title, [], [(why, plain_table(["Method"], []))])
+
+
+def _leading(text: str) -> str | None:
+    """The number that a text begins with; empty of a dash, None of words."""
+    if text == "–":
+        return ""
+    begins = re.match(r"[+-]?\d+(\.\d+)?(?=$|\s)", text)
+    return begins[0].lstrip("+") if begins else None
 
 
 def read_scores(folders: Iterable[str | Path]) -> list[Row]:
@@ -87,15 +159,14 @@ def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
     """``<name>.csv`` and ``<name>.md`` of each."""
     for table in tables:
         write_table(Path(folder) / f"{table.name}.csv", table.rows, table.columns)
-        with replacing(Path(folder) / f"{table.name}.md") as scratch:
+        with atomic_file(Path(folder) / f"{table.name}.md") as scratch:
             scratch.write_text(table.markdown(), encoding="utf-8")
 
 
 def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
     """Accuracy, completeness, time and memory of the methods over all tiles."""
-    rows, lines = [], []
+    rows = []
     for of in methods:
-        d1 = _d1(of)
         row = {
             "method": of["label"],
             "kind": of["settings"]["kind"],
@@ -110,43 +181,8 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             keys = ("paper_epe_px", "paper_d1_percent", "paper_ms")
             row |= dict(zip(keys, published))
         rows.append(row)
-        lines.append(
-            [
-                of["label"],
-                _px(of["all"], "filled_epe_px"),
-                _percent(of["all"], f"filled_{d1}"),
-                *(
-                    _percent(of["all"], f"filled_d1_{limit:g}_px_share", interval=False)
-                    for limit in of["thresholds_px"][1:]
-                ),
-                _number(of["all"].get("median_px"), 1, ".3f"),
-                _px(of["all"], "epe_px", interval=False),
-                _percent(of["all"], d1, interval=False),
-                _percent(of["all"], "valid_share", interval=False),
-                _number(of["median_seconds"], 1000, ".0f"),
-                _number(of["peak_memory_mb"], 1, ".0f"),
-            ]
-        )
-    limits = methods[0]["thresholds_px"] if methods else [3.0]
-    heading = [
-        "Method",
-        "EPE (px)",
-        f"D1, {limits[0]:g} px (%)",
-        *(f"D1, {limit:g} px (%)" for limit in limits[1:]),
-        "valid only: median (px)",
-        "EPE (px)",
-        "D1 (%)",
-        "valid (%)",
-        "Time (ms)",
-        "Memory (MB)",
-    ]
-    shown = [
-        (
-            f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {_what(methods)}",
-            heading,
-            lines,
-        )
-    ]
+    caption = f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {_what(methods)}"
+    shown = [(caption, _accuracy(rows, methods))]
     if beside_paper:
         kinds = dict.fromkeys(_kind(of) for of in _plain(methods))
         shown += _published(
@@ -162,6 +198,71 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             ],
         )
     return Table("table5", "Table 5: accuracy, time and memory", rows, shown)
+
+
+def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
+    """A row per method."""
+    limits = methods[0]["thresholds_px"] if methods else [3.0]
+    first = limits[0]
+    figures = [
+        Figure("EPE, px", "filled_epe_px"),
+        *(
+            Figure(f"D1, {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f")
+            for limit in limits
+        ),
+        Figure("valid only: median, px", "median_px"),
+        Figure("valid only: EPE, px", "epe_px"),
+        Figure(f"valid only: D1, {first:g} px, %", f"d1_{first:g}_px_share", 100, ".2f"),
+        Figure("valid, %", "valid_share", 100, ".2f", more=True),
+        Figure("time, ms a pair", "median_seconds", 1000, ".0f"),
+        Figure("memory, MB", "peak_memory_mb", 1, ".0f"),
+    ]
+    best = [figure.best(rows) for figure in figures]
+    heights = [of.get("height_m_per_px") for of in methods]
+    lines = []
+    for row, height in zip(rows, heights):
+        cells = [
+            figure.cell(row, b, interval=k < 2) for k, (figure, b) in enumerate(zip(figures, best))
+        ]
+        epe = row.get("filled_epe_px")
+        if any(heights):
+            known = epe is not None and height is not None
+            text = metres(epe, height).removesuffix(" m of height") if known else "–"
+            cells.insert(1, Cell(text, f"{epe * height:.9g}" if known else "", best=cells[0].best))
+        lines.append((Cell(row["method"], row["method"]), *cells))
+    titles = [figure.title for figure in figures]
+    if any(heights):
+        titles.insert(1, "EPE, m of height")
+    columns = (Column("method", False), *(Column(title, True) for title in titles))
+    return Shown(columns, (("", tuple(lines)),))
+
+
+def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
+    """A row per city or stratum, columns for each method; a group's own row stands last in it."""
+    labels = [of["label"] for of in methods]
+    figures = [Figure("EPE, px", "filled_epe_px")]
+    if methods:
+        figures.append(Figure("D1, %", f"filled_{_d1(methods[0])}", 100, ".2f"))
+    groups = list(dict.fromkeys(row.get("group", "") for row in rows))
+    found = []
+    for group in groups:
+        here = [row for row in rows if row.get("group", "") == group]
+        lines = []
+        for value in dict.fromkeys(row[name] for row in here):
+            by_method = {row["method"]: row for row in here if row[name] == value}
+            best = [figure.best(list(by_method.values())) for figure in figures]
+            cells = [
+                figure.cell(by_method.get(method, {}), b)
+                for method in labels
+                for figure, b in zip(figures, best)
+            ]
+            text = value.replace("_", " ")
+            lines.append((Cell(text, text), *cells))
+        found.append((group, tuple(lines)))
+    titles = [f"{method}: {figure.title}" for method in labels for figure in figures]
+    first = "pixels" if name == "stratum" else name
+    columns = (Column(first, False), *(Column(title, True) for title in titles))
+    return Shown(columns, tuple(found))
 
 
 def table6(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
@@ -183,7 +284,7 @@ def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> 
             columns.append(of)
     if not columns:
         text = "No method of the configuration has `fine_tuned_of`."
-        return Table("table7", title, [], [(text, ["Method"], [])])
+        return nothing("table7", title, text)
     return _by_city("table7", title, columns, trained, beside_paper=beside_paper)
 
 
@@ -197,14 +298,9 @@ def by_strata(methods: Sequence[Row]) -> Table:
         for of in methods
         if name in found[of["method"]]
     ]
-    heading, lines = _heading("Pixels", methods), []
-    for name in names:
-        line = [name.replace("_", " ")]
-        for of in methods:
-            line += _epe_d1(of, found[of["method"]].get(name))
-        lines.append(line)
     caption = f"EPE and D1 ({FILLED}) by what the pixels show"
-    return Table("strata", "Scores by what the pixels show", rows, [(caption, heading, lines)])
+    shown = [(caption, _by_method(rows, "stratum", methods))]
+    return Table("strata", "Scores by what the pixels show", rows, shown)
 
 
 def _by_city(
@@ -220,7 +316,7 @@ def _by_city(
         ("cities with training tiles", [city for city in cities if city in trained]),
         ("cities without", [city for city in cities if city not in trained]),
     ]
-    rows, lines = [], []
+    rows = []
     for group, members in groups:
         for city in members:
             for of in methods:
@@ -228,16 +324,14 @@ def _by_city(
                 if beside_paper and (values := _published_of(of, city)):
                     row |= dict(zip(("paper_epe_px", "paper_d1_percent"), values))
                 rows.append(row)
-            lines.append([city, *(cell for of in methods for cell in _epe_d1(of, _city(of, city)))])
         if len(members) > 1:
             pooled = [_pooled(of, members) for of in methods]
             rows += [
                 {"city": "all of group", "group": group, "method": of["label"], **row}
                 for of, row in zip(methods, pooled)
             ]
-            cells = [cell for of, row in zip(methods, pooled) for cell in _epe_d1(of, row)]
-            lines.append([f"**{group}**", *(f"**{cell}**" for cell in cells)])
-    shown = [(f"Ours: EPE and D1 of {FILLED}. {_what(methods)}", _heading("City", methods), lines)]
+    caption = f"Ours: EPE and D1 of {FILLED}. {_what(methods)}"
+    shown = [(caption, _by_method(rows, "city", methods))]
     if beside_paper:
         there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
         for of in methods:
@@ -257,10 +351,8 @@ def _published_of(of: Row, city: str) -> tuple[float, float] | None:
     return table.get(city, {}).get(_kind(of))
 
 
-def _published(
-    heading: Sequence[str], lines: Sequence[Sequence[str]]
-) -> list[tuple[str, Sequence[str], Sequence[Sequence[str]]]]:
-    return [(f"{PAPERS}.", heading, lines)] if lines else []
+def _published(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> list[tuple[str, Shown]]:
+    return [(f"{PAPERS}.", plain_table(heading, lines))] if lines else []
 
 
 def _paper(values: Sequence[float] | None) -> tuple[str, str]:
@@ -302,22 +394,6 @@ def _pooled(of: Row, cities: Sequence[str]) -> Row:
         total = sum(row["labelled"] * row[key] for row in rows if row["labelled"])
         found[key] = round(total / labelled, 6) if labelled else None
     return found
-
-
-def _epe_d1(of: Row, row: Row | None) -> list[str]:
-    row = row or {}
-    return [
-        _number(row.get("filled_epe_px"), 1, ".3f"),
-        _number(row.get(f"filled_{_d1(of)}"), 100, ".2f"),
-    ]
-
-
-def _px(row: Row, key: str, *, interval: bool = True) -> str:
-    return with_interval(row, key, 1, ".3f", shown=interval)
-
-
-def _percent(row: Row, key: str, *, interval: bool = True) -> str:
-    return with_interval(row, key, 100, ".2f", shown=interval)
 
 
 def with_interval(row: Row, key: str, factor: float, form: str, *, shown: bool = True) -> str:

@@ -90,6 +90,7 @@ class LabelledPairs(Dataset):
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
         pair = self.pairs[index % len(self.pairs)]
+        pair.refuse_changed()
         left, right = read_image(pair.left), read_image(pair.right)
         disparity = self.dataset.labels(pair)
         if not left.shape[:2] == right.shape[:2] == disparity.shape:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ...errors import InputError
-from ...products.files import replacing, write_table
+from ...products.files import atomic_file, write_table
 from .training_state import TrainingJob, read_state
 from .weights import load_weights, save_weights
 
@@ -42,7 +42,7 @@ def publish_training(job: TrainingJob, provenance: dict[str, Any]) -> dict[str, 
     job.out.mkdir(parents=True, exist_ok=True)
     save_weights(job.out / "best.pt", model, network, {**provenance, **best})
     write_table(job.out / "curves.csv", state["curve"], CURVE, line_end="\r\n")
-    with replacing(job.out / "training.json") as scratch:
+    with atomic_file(job.out / "training.json") as scratch:
         scratch.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     _draw(state["curve"], job.out / "curves.png", f"{model.kind}: {job.out.name}")
     return summary

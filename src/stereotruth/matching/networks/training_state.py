@@ -16,7 +16,7 @@ from torch import nn
 
 from ...dataset.stereo_dataset import StereoDataset
 from ...errors import InputError
-from ...products.files import replacing
+from ...products.files import atomic_file
 from ...products.inputs import Marks, marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
@@ -164,7 +164,7 @@ class TrainingJob:
 
 def save_state(path: Path, record: Mapping[str, Any]) -> None:
     """Write a training's record, whole or not at all, on the disk itself."""
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         torch.save(dict(record), scratch)
         with scratch.open("rb") as stream:
             os.fsync(stream.fileno())

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from ...errors import InputError
-from ...products.files import replacing
+from ...products.files import atomic_file
 from ..kinds import KINDS
 
 
@@ -59,7 +59,7 @@ def save_weights(
         "weights": {name: value.cpu() for name, value in network.state_dict().items()},
         "provenance": dict(provenance),
     }
-    with replacing(path) as scratch:
+    with atomic_file(path) as scratch:
         torch.save(record, scratch)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ from typing import Any
 import dask
 import numpy as np
 import zarr
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...job import block_progress
 from ...products.grids import Layer, require_complete
 from ...products.provenance import describe, digest, file_sha256
-from ...products.resumable_grids import BlockStore, making
+from ...products.resumable_grids import BlockStore, resumable_grid
 from ..kinds import kind_of, names_of
 from ..matcher import Matcher
 from ..methods import make_method
@@ -195,82 +196,38 @@ def predict_scene(
     """
     left_store, right_store, out = (Path(p).absolute() for p in (left_store, right_store, out))
     kind = kind_of(method, entry)
-    files = [file for file in kind.files(entry) if file.is_file()]
-    low, high = settings.disparity_range
-    block_px, overlap_px = settings.block_px, settings.overlap_px
-    offset, margin_px = settings.offset, settings.margin_px
     left_attrs, right_attrs = (
         dict(require_complete(path).attrs) for path in (left_store, right_store)
     )
     shape = require_complete(left_store)["image"].shape
-    tiling = Tiling(shape, block_px, overlap_px)
-    given = {
-        "left_store": left_store,
-        "right_store": right_store,
-        "method": method,
-        "entry": dict(entry),
-        "threads": 1 if kind.tiles_at_once else workers,
-        "disparity_range": (low, high),
-        "tiling": tiling,
-        "margin": margin_px,
-    }
-    start = _ImagePair(**given)
-    left, right = start.images
-    if offset == "auto":
-        moved = find_offsets(left, right, tiling, (low, high), _search(left_attrs))
-    else:
-        moved = _fixed(offset, tiling)
-    job = _ImagePair(**given, scaling=start.matcher.scaling(*_lazy(left, right)))
-
-    parameters = {
-        "method": method,
-        "method_settings": dict(entry),
-        "disparity_range": [low, high],
-        "block_px": block_px,
-        "overlap_px": overlap_px,
-        "offset": offset,
-        "margin_px": job.matcher.margin_px if margin_px is None else margin_px,
-    }
+    start = _ImagePair(
+        left_store,
+        right_store,
+        method,
+        dict(entry),
+        threads=1 if kind.tiles_at_once else workers,
+        disparity_range=tuple(settings.disparity_range),
+        tiling=Tiling(shape, settings.block_px, settings.overlap_px),
+        margin=settings.margin_px,
+    )
+    moved = _offsets(start, settings, left_attrs)
+    job = replace(start, scaling=start.matcher.scaling(*_lazy(*start.images)))
+    parameters = _parameters(job, settings)
+    files = [file for file in kind.files(entry) if file.is_file()]
     content = digest(
         {
             "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
             "method": identity(entry, files),
-            "range": [low, high],
+            "range": parameters["disparity_range"],
             "margin": parameters["margin_px"],
-            "tiling": [block_px, overlap_px],
+            "tiling": [settings.block_px, settings.overlap_px],
             "code": code,
         }
     )
-    places = list(tiling.places())
-    tile_keys = {p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places}
-    keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
-    every = [tiling.block_window(place) for place in places]
-    width = workers if kind.tiles_at_once else 1
-    tile_shape = tuple(n * tiling.side for n in tiling.count)
-    tile_store = out.with_name(f"{out.name}.tiles")
-    sizes = {"chunk": tiling.side, "shard": tiling.side}
-    with making(out, shape, LAYERS, chunk=CHUNK, shard=block_px) as unfinished:
-        missing = unfinished.missing(every, keys, workers)
-        with making(tile_store, tile_shape, LAYERS, **sizes) as tiles:
-            wanted = sorted({p for k in missing for p in tiling.around(places[k])})
-            wanted_keys = [tile_keys[p] for p in wanted]
-            stored = [job._stored(p) for p in wanted]
-            todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
-            _run(
-                job.tile,
-                [(tiles, tile_keys[p], p, int(moved.offsets[p])) for p in todo],
-                f"tiles by {method}",
-                scheduler,
-                width,
-            )
-            _run(
-                job.block,
-                [(tiles, unfinished, keys[k], places[k]) for k in missing],
-                "blending",
-                scheduler,
-                workers,
-            )
-        summary = _summary(unfinished.results(every), shape, moved)
+    plan = _Plan.of(job.tiling, content, moved)
+    with resumable_grid(out, shape, LAYERS, chunk=CHUNK, shard=settings.block_px) as unfinished:
+        tiles = _make_blocks(job, plan, unfinished, out, (scheduler, workers))
+        summary = _summary(unfinished.results(plan.windows), shape, moved)
         inputs = {
             name: digest(dict(attrs.get("provenance", {})))
             for name, attrs in (("left", left_attrs), ("right", right_attrs))
@@ -286,7 +243,7 @@ def predict_scene(
             "summary": summary,
             "provenance": describe(inputs, parameters, code),
         }
-        unfinished.publish(out, every, attrs)
+        unfinished.write_atomically(out, plan.windows, attrs)
         shutil.rmtree(tiles.folder, ignore_errors=True)
     log.info(
         "%s: %.1f %% of the grid has a disparity, %.0f to %.0f px",
@@ -296,6 +253,87 @@ def predict_scene(
         summary["disparity_max_px"],
     )
     return summary
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Blocks of a scene and the tiles that they are blended from, with the keys of both.
+
+    ``offsets``: of the right image, px, by place; ``keys`` and ``windows`` go with ``places``.
+    """
+
+    tiling: Tiling
+    offsets: NDArray[np.int64]
+    places: list[Place]
+    windows: list[Window]
+    keys: list[str]
+    tile_keys: dict[Place, str]
+
+    @classmethod
+    def of(cls, tiling: Tiling, content: str, moved: Offsets) -> _Plan:
+        """By a digest of all that the disparities follow from but the offsets."""
+        places = list(tiling.places())
+        tile_keys = {
+            p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places
+        }
+        keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
+        windows = [tiling.block_window(place) for place in places]
+        return cls(tiling, moved.offsets, places, windows, keys, tile_keys)
+
+
+def _offsets(pair: _ImagePair, settings: Settings, attrs: Mapping[str, Any]) -> Offsets:
+    """By how much the right image is moved for each block."""
+    if settings.offset != "auto":
+        return _fixed(settings.offset, pair.tiling)
+    return find_offsets(*pair.images, pair.tiling, pair.disparity_range, _search(attrs))
+
+
+def _parameters(job: _ImagePair, settings: Settings) -> dict[str, Any]:
+    """What a prediction follows from besides its files, for its record."""
+    return {
+        "method": job.method,
+        "method_settings": dict(job.entry),
+        "disparity_range": list(job.disparity_range),
+        "block_px": settings.block_px,
+        "overlap_px": settings.overlap_px,
+        "offset": settings.offset,
+        "margin_px": job.matcher.margin_px if job.margin is None else job.margin,
+    }
+
+
+def _make_blocks(
+    job: _ImagePair, plan: _Plan, blocks: BlockStore, out: Path, by: tuple[Any, int]
+) -> BlockStore:
+    """Make the blocks that are missing, and the tiles that these need; the store of the tiles.
+
+    ``by``: Dask's scheduler and its workers, which make one tile at a time if the method itself has
+    several threads.
+    """
+    scheduler, workers = by
+    tiling, places = plan.tiling, plan.places
+    shape = tuple(n * tiling.side for n in tiling.count)
+    sizes = {"chunk": tiling.side, "shard": tiling.side}
+    missing = blocks.missing(plan.windows, plan.keys, workers)
+    with resumable_grid(out.with_name(f"{out.name}.tiles"), shape, LAYERS, **sizes) as tiles:
+        wanted = sorted({p for k in missing for p in tiling.around(places[k])})
+        wanted_keys = [plan.tile_keys[p] for p in wanted]
+        stored = [job._stored(p) for p in wanted]
+        todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
+        _run(
+            job.tile,
+            [(tiles, plan.tile_keys[p], p, int(plan.offsets[p])) for p in todo],
+            f"tiles by {job.method}",
+            scheduler,
+            workers if job.threads == 1 else 1,
+        )
+        _run(
+            job.block,
+            [(tiles, blocks, plan.keys[k], places[k]) for k in missing],
+            "blending",
+            scheduler,
+            workers,
+        )
+    return tiles
 
 
 def _lazy(*images: zarr.Array) -> list[Any]:

@@ -1,4 +1,18 @@
-"""Disparities of one block of a scene, and the blending of neighbouring blocks."""
+"""Disparities of one block of a scene, and the blending of neighbouring blocks.
+
+The left grid is cut into square blocks. A *tile* is what the method says of a block and of
+``overlap`` px around it; for that it sees the images with the margins that it needs: ``margin_px``
+to all sides and, along the row, the disparity range. The right part is moved by a whole number of
+pixels, the tile's *offset*, so that a scene may have more relief than the method has range:
+``d = offset + d_method``.
+
+Where tiles overlap, their disparities are averaged with weights that fall smoothly from one to the
+other. By what two tiles differ on the whole, median by squares of ``CELL_PX`` (networks are off by
+pixels, and by others for another offset), is shared out in full; of what is left, differences up
+to ``SAME_PX``, and none from ``OTHER_PX`` on: then the tiles say different things (roof and
+ground), nothing in between is true, and the block's own tile has the word, as it has on whether a
+pixel is valid. Pixels that one of the images does not show are invalid.
+"""
 
 from __future__ import annotations
 

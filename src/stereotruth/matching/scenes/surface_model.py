@@ -39,10 +39,11 @@ from ...epipolar.rpc import SensorModel
 from ...errors import InputError
 from ...job import block_progress
 from ...kernels import inner, kernel
-from ...products.files import replacing
+from ...numerics.triangles import Three, plane_slopes, row_span
+from ...products.files import atomic_file
 from ...products.grids import Layer, blocks, require_complete
 from ...products.provenance import digest
-from ...products.resumable_grids import BlockStore, making
+from ...products.resumable_grids import BlockStore, resumable_grid
 from .settings import SurfaceModel as Settings
 
 log = logging.getLogger("stereotruth")
@@ -59,30 +60,28 @@ LAYERS = {"height": Layer("float32", math.nan, {"units": "m", "long_name": "surf
 
 
 @inner
-def _triangle(
-    a: tuple[float, float, float],
-    b: tuple[float, float, float],
-    c: tuple[float, float, float],
-    out: NDArray[np.float32],
-) -> None:
+def _triangle(a: Three, b: Three, c: Three, out: NDArray[np.float32]) -> None:
     """Raise ``out`` to the triangle at the cell centres in it; corners (column, row, height)."""
-    i0 = max(math.ceil(min(a[1], b[1], c[1]) - 1e-9), 0)
-    i1 = min(math.floor(max(a[1], b[1], c[1]) + 1e-9), out.shape[0] - 1)
-    j0 = max(math.ceil(min(a[0], b[0], c[0]) - 1e-9), 0)
-    j1 = min(math.floor(max(a[0], b[0], c[0]) + 1e-9), out.shape[1] - 1)
-    if i0 > i1 or j0 > j1:
+    x, y, z = (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
+    top = max(math.ceil(min(y[0], y[1], y[2])), 0)
+    bottom = min(math.floor(max(y[0], y[1], y[2])), out.shape[0] - 1)
+    left = max(math.ceil(min(x[0], x[1], x[2])), 0)
+    right = min(math.floor(max(x[0], x[1], x[2])), out.shape[1] - 1)
+    if top > bottom or left > right:
         return
-    area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
-    if abs(area) < 1e-12:
+    along, down = plane_slopes(x, y, z)
+    if not np.isfinite(along + down):
         return
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            u = ((j - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (i - a[1])) / area
-            v = ((b[0] - a[0]) * (i - a[1]) - (j - a[0]) * (b[1] - a[1])) / area
-            if u >= -1e-9 and v >= -1e-9 and u + v <= 1.0 + 1e-9:
-                z = np.float32(a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2]))
-                if not out[i, j] >= z:
-                    out[i, j] = z
+    for i in range(top, bottom + 1):
+        low, high = row_span(x, y, float(i))
+        if not low <= high:
+            continue
+        left = max(math.ceil(low), 0)
+        right = min(math.floor(high), out.shape[1] - 1)
+        for j in range(left, right + 1):
+            height = np.float32(z[0] + along * (j - x[0]) + down * (i - y[0]))
+            if not out[i, j] >= height:
+                out[i, j] = height
 
 
 @kernel
@@ -348,7 +347,7 @@ def write_dsm(
         }
     )
     every = blocks(raster.shape, SHARD)
-    with making(out, raster.shape, LAYERS, chunk=CHUNK, shard=SHARD) as unfinished:
+    with resumable_grid(out, raster.shape, LAYERS, chunk=CHUNK, shard=SHARD) as unfinished:
         missing = unfinished.missing(every, [key] * len(every), workers)
         tasks = [
             dask.delayed(job.block, pure=False)(
@@ -416,7 +415,7 @@ def _write_tiff(out: Path, made: BlockStore, raster: Raster, tags: dict[str, str
     heights.attrs = {"long_name": "surface height, m above the WGS 84 ellipsoid"}
     north_west = from_origin(raster.west, raster.north, raster.resolution, raster.resolution)
     heights = heights.rio.write_crs(raster.epsg).rio.write_transform(north_west)
-    with replacing(out) as scratch:
+    with atomic_file(out) as scratch:
         heights.rio.write_nodata(NODATA, encoded=True).rio.to_raster(
             scratch,
             windowed=True,

@@ -137,8 +137,8 @@ def test_a_tilt_is_told_and_stays(judge):
 
 def test_holes_and_spikes_are_counted(judge):
     heights, rng = TOWN.heights(), np.random.default_rng(0)
-    heights[100:220, 200:400] = np.nan
-    share = 120 * 200 / heights.size
+    heights[100:220, 150:300] = np.nan
+    share = 120 * 150 / heights.size
     spikes = rng.random(heights.shape) < 0.002
     found = judge(np.where(spikes, heights + 25.0, heights))
     assert 1 - found["errors"][SOLID]["known_share"] == pytest.approx(share, abs=0.01)

@@ -11,7 +11,7 @@ from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.matching.benchmark.score_method import score
 
 from ....synthetic.images import write
-from ....synthetic.toy_benchmark import SHAPE, settings
+from ....synthetic.toy_benchmark import PLAN, SHAPE
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +41,7 @@ def compared(tmp_path_factory):
         out = folder / "match" / name
         predict(dataset, "test", name, of, out, work=folder / ".work")
         more = {"fine_tuned_of": "two"} if name == "half" else {}
-        score(dataset, "test", name.title(), out, folder / "benchmark" / name, **settings(**more))
+        score(dataset, "test", name.title(), out, folder / "benchmark" / name, PLAN, **more)
     compare(
         dataset,
         "test",

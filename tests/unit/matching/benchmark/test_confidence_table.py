@@ -15,6 +15,8 @@ from stereotruth.matching.benchmark.confidence_table import (
 )
 from stereotruth.products.files import write_table
 
+from ....synthetic.toy_benchmark import texts
+
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
@@ -39,8 +41,9 @@ def test_the_table_has_methods_by_stratum():
         ("Calibrated", "all"),
         ("Too sure", "all"),
     ]
-    ((_, heading, lines),) = table.shown
-    assert len(heading) == len(lines[0]) and lines[1][0] == "Too sure, all"
+    ((_, shown),) = table.shown
+    lines = texts(shown)
+    assert len(shown.columns) == len(lines[0]) and lines[1][0] == "Too sure, all"
     assert float(lines[0][5]) == pytest.approx(68.27, abs=1)
     assert float(lines[0][-1]) == pytest.approx(1, abs=0.03)
     assert float(lines[1][-1]) == pytest.approx(3, abs=0.1)

@@ -11,7 +11,7 @@ import pytest
 from stereotruth.matching.benchmark.page import headlines
 from stereotruth.matching.benchmark.page_charts import cumulative_chart, strata_chart
 from stereotruth.matching.benchmark.page_tables import sections
-from stereotruth.matching.benchmark.tables import Table, read_scores
+from stereotruth.matching.benchmark.tables import Table, plain_table, read_scores
 from stereotruth.products.charts import HEIGHT
 
 from ....browser import look, needs_chromium
@@ -132,18 +132,16 @@ def test_charts_have_a_line_and_a_point_where_the_files_say(compared):
 
 
 def test_another_table_is_shown_as_it_is_written():
-    lines = [["A", "1.5 [1.0, 2.0]", "–"], ["**B**", "**-0.5**", "7"]]
-    table = Table(
-        "more", "More: of it", [{"x": 1}], [("A `caption`", ["Name", "One", "Two"], lines)]
-    )
-    (section,) = sections([table], [], [3.0])
+    lines = [["A", "1.5 [1.0, 2.0]", "–"], ["B", "-0.5", "7"]]
+    shown = plain_table(["Name", "One", "Two"], lines)
+    (section,) = sections([Table("more", "More: of it", [{"x": 1}], [("A `caption`", shown)])])
     assert (section.heading, section.also) == ("More: of it", "")
     ((caption, shown),) = section.shown
     assert caption == "A caption"
     assert [column.numeric for column in shown.columns] == [False, True, True]
     (_, ((_, one, dash), (name, other, _))) = shown.groups[0]
     assert (one.text, one.key, dash.key) == ("1.5 [1.0, 2.0]", "1.5", "")
-    assert (name.best, other.text, other.key) == (True, "−0.5", "-0.5")
+    assert (name.key, other.text, other.key) == ("B", "−0.5", "-0.5")
 
 
 SORT = """

@@ -22,7 +22,7 @@ from stereotruth.matching.benchmark.protocols import (
 from stereotruth.matching.benchmark.published_rows import PUBLISHED, beside_published
 from stereotruth.matching.benchmark.score_method import score
 
-from ....synthetic.toy_benchmark import rows, settings
+from ....synthetic.toy_benchmark import PLAN, rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 PAIRS = [("a", "1" * 64), ("b", "2" * 64)]
@@ -101,8 +101,8 @@ def test_tables_show_one_id_and_refuse_two(compared, tmp_path):
         assert f"({protocol})" in (compared / f"compared/{name}.md").read_text().splitlines()[0]
     assert protocol in (compared / "compared/index.html").read_text()
     dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
-    other = {**settings(), "thresholds_px": [3, 2]}
-    score(dataset, "test", "Half", compared / "match/half", tmp_path / "half", **other)
+    other = replace(PLAN, thresholds_px=[3, 2])
+    score(dataset, "test", "Half", compared / "match/half", tmp_path / "half", other)
     folders = [compared / "benchmark/two", tmp_path / "half"]
     predictions = [compared / "match/two", compared / "match/half"]
     with pytest.raises(InputError, match=rf"several protocols .*Two: {protocol}; Half: own-"):
@@ -114,9 +114,13 @@ def test_the_exact_truth_is_asked_for(compared, tmp_path):
     dataset = StereoDataset("toy", compared / "data", "whu", (-64, 128))
     with pytest.raises(InputError, match=r"KM_1 has no exact truth"):
         score(
-            dataset, "test", "Two", compared / "match/two", tmp_path / "out",
-            **settings(protocol="exact-2026"),
-        )  # fmt: skip
+            dataset,
+            "test",
+            "Two",
+            compared / "match/two",
+            tmp_path / "out",
+            replace(PLAN, protocol="exact-2026"),
+        )
 
 
 def test_published_rows_say_where_they_stand_and_what_is_not_known():

@@ -13,7 +13,7 @@ from stereotruth.matching.benchmark.predictions import predict
 from stereotruth.matching.benchmark.score_method import choose, describe, score
 
 from ....synthetic.images import write
-from ....synthetic.toy_benchmark import CITIES, SHAPE, rows, settings
+from ....synthetic.toy_benchmark import CITIES, PLAN, SHAPE, rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -43,8 +43,8 @@ def test_a_folder_of_scores_holds_tiles_cities_strata_and_pictures(compared):
 
 def test_scoring_again_gives_the_same_bytes(compared, tmp_path):
     dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
-    again = settings(fine_tuned_of="two")
-    score(dataset, "test", "Half", compared / "match/half", tmp_path / "again", **again)
+    half = compared / "match/half"
+    score(dataset, "test", "Half", half, tmp_path / "again", PLAN, fine_tuned_of="two")
     files = [p for p in (compared / "benchmark/half").rglob("*") if p.is_file()]
     assert len(files) == 7
     for file in files:
@@ -61,7 +61,7 @@ def test_stated_uncertainties_are_held_against_the_errors(compared, tmp_path):
         write(tmp_path / f"theirs/{pair.name}_uncertainty.tif", np.abs(error))
     entry = {"kind": "folder", "folder": str(tmp_path / "theirs")}
     predict(dataset, "test", "sure", entry, tmp_path / "match", work=tmp_path / "work")
-    summary = score(dataset, "test", "Sure", tmp_path / "match", tmp_path / "out", **settings())
+    summary = score(dataset, "test", "Sure", tmp_path / "match", tmp_path / "out", PLAN)
     found = {row["stratum"]: row for row in summary["confidence"]}
     assert list(found) == ["all", "near_step", "match_inside", "match_outside"]
     assert found["all"]["pixels"] == summary["all"]["labelled"]

@@ -19,6 +19,7 @@ from stereotruth.matching.benchmark.strata import (
     match_in_tile,
     near_step,
 )
+from stereotruth.products.grids import seal
 
 from ....synthetic.flat_orientation import GSD, RATIO, orientation
 
@@ -74,6 +75,7 @@ def own(tmp_path):
         group.attrs["complete"] = True
         for name, dtype in names.items():
             stores[name] = group.create_array(name, data=np.zeros((60, 70), dtype))
+        seal(tmp_path / kind / "Town/T-1.zarr")
     return pair, Products(*(tmp_path / name for name in ("tiles", "project", "truth"))), stores
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from stereotruth.matching.benchmark.score_method import score
 from stereotruth.matching.benchmark.submission import FILE, pack
 from stereotruth.products.rasters import write_disparity
 
-from ....synthetic.toy_benchmark import settings
+from ....synthetic.toy_benchmark import PLAN
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -35,8 +36,8 @@ def scored(compared, tmp_path, packed, **more):
     dataset = StereoDataset("theirs", root, "whu", (-8, 8))
     entry = {"kind": "folder", "folder": str(packed)}
     predict(dataset, "test", "sent", entry, tmp_path / "match", work=tmp_path / "work")
-    given = {**settings(), "seed": 9, **more}
-    return score(dataset, "test", "Sent", tmp_path / "match", tmp_path / "out", **given)
+    plan = replace(PLAN, seed=9, **more)
+    return score(dataset, "test", "Sent", tmp_path / "match", tmp_path / "out", plan)
 
 
 def test_another_machine_has_the_same_numbers(compared, tmp_path, packed):

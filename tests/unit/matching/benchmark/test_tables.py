@@ -8,7 +8,7 @@ from stereotruth.errors import InputError
 from stereotruth.matching.benchmark import published_scores
 from stereotruth.matching.benchmark.tables import make_tables, read_scores, write_tables
 
-from ....synthetic.toy_benchmark import rows
+from ....synthetic.toy_benchmark import rows, texts, titles
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -27,7 +27,7 @@ def test_tables_have_the_paper_s_form(compared):
     seven = rows(compared / "compared/table7.csv")
     assert [row["method"] for row in seven] == ["Two", "Half"] * 2
     text = (compared / "compared/table5.md").read_text()
-    assert "| Two | 2.000 [2.000, 2.000] | 0.00 [0.00, 0.00] | 100.00 |" in text
+    assert "| Two | 2.000 [2.000, 2.000] | **0.00 [0.00, 0.00]** | 100.00 |" in text
     assert "6 pairs, disparities [-8, 8) px" in text
     assert "| near step |" in (compared / "compared/strata.md").read_text()
 
@@ -63,26 +63,32 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     methods = [summary("sgm", "sgm", cities), summary("net", "stereonet", cities)]
     methods.append(summary("tuned", "stereonet", cities, fine_tuned_of="net"))
     five, six, seven, _ = make_tables(methods, ["Kunming", "Qichun"], beside_paper=True)
-    caption, _, lines = five.shown[1]
+    caption, shown = five.shown[1]
     assert caption == "The paper's, on the real WHU-Stereo."
-    assert lines == [["SGM", "4.889", "50.79", "506"], ["StereoNet", "2.453", "25.12", "238"]]
-    assert five.shown[0][2][0][-2:] == ["506", "700"]
+    assert texts(shown) == [
+        ["SGM", "4.889", "50.79", "506"],
+        ["StereoNet", "2.453", "25.12", "238"],
+    ]
+    assert texts(five.shown[0][1])[0][-2:] == ["506", "700"]
     assert "paper_epe_px" not in five.rows[2]  # the paper's StereoNet was not fine-tuned
-    (_, heading, lines), (_, _, published) = six.shown
-    assert heading == ["City", "Sgm: EPE (px)", "D1 (%)", "Net: EPE (px)", "D1 (%)"]
-    assert lines[2] == ["**cities with training tiles**", *["**2.500**", "**40.00**"] * 2]
-    assert [line[0] for line in lines] == ["Kunming", "Qichun", lines[2][0], "Wuhan"]
-    assert published[0] == ["Kunming", "3.065", "37.50", "1.225", "6.09"]
+    (_, ours), (_, published) = six.shown
+    assert titles(ours) == ["city", "Sgm: EPE, px", "Sgm: D1, %", "Net: EPE, px", "Net: D1, %"]
+    assert [heading for heading, _ in ours.groups] == [
+        "cities with training tiles",
+        "cities without",
+    ]
+    lines = texts(ours)
+    assert [line[0] for line in lines] == ["Kunming", "Qichun", "all of group", "Wuhan"]
+    assert lines[2][1:] == ["2.500", "40.00"] * 2
+    assert "| **cities without** |  |  |  |  |" in six.markdown()
+    assert texts(published)[0] == ["Kunming", "3.065", "37.50", "1.225", "6.09"]
     pooled = next(row for row in six.rows if row["city"] == "all of group")
     assert pooled["filled_epe_px"] == 2.5 and pooled["labelled"] == 400
-    assert [name for name in seven.shown[0][1] if "EPE" in name] == [
-        "Net: EPE (px)",
-        "Tuned: EPE (px)",
-    ]
+    assert titles(seven.shown[0][1])[1::2] == ["Net: EPE, px", "Tuned: EPE, px"]
     assert seven.rows[1]["paper_epe_px"] == published_scores.TABLE7["Kunming"]["stereonet"][0]
     methods.append(summary("again", "stereonet", cities, fine_tuned_of="net"))
     _, _, both, _ = make_tables(methods, [], beside_paper=False)
-    names = [name.partition(":")[0] for name in both.shown[0][1] if "EPE" in name]
+    names = [name.partition(":")[0] for name in titles(both.shown[0][1])[1::2]]
     assert names == ["Net", "Tuned", "Again"]
     five, six, seven, _ = make_tables(methods[:2], [], beside_paper=False)
     assert len(five.shown) == len(six.shown) == 1
@@ -94,7 +100,7 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
 def test_a_city_that_the_paper_lacks_has_no_line_among_its_figures():
     methods = [summary("sgm", "sgm", {"Utopia": (1, 1.0, 0.1), "Yingde": (1, 1.0, 0.1)})]
     _, six, *_ = make_tables(methods, [], beside_paper=True)
-    assert [line[0] for line in six.shown[1][2]] == ["Yingde"]
+    assert [line[0] for line in texts(six.shown[1][1])] == ["Yingde"]
 
 
 def test_missing_scores_are_told(tmp_path):

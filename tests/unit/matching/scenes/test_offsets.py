@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from whole_images import match
 
 from stereotruth.errors import InputError
 from stereotruth.matching.scenes.offsets import best_offset, find_offsets, reduced
 from stereotruth.matching.scenes.tiling import Tiling
-from stereotruth.matching.scenes.whole_images import match
 from stereotruth.matching.sgm import SemiGlobalMatcher
 
 from ....synthetic.exact_method import SHAPE, Exact, coded

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from whole_images import match
 
 from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
@@ -15,8 +16,7 @@ from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes import predict_scene as whole
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
-from stereotruth.matching.scenes.whole_images import match
-from stereotruth.products.grids import Layer, building, create_grid, open_grid
+from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
 
 from ....synthetic.images import textured
 from ....synthetic.stores import Killed, tree
@@ -45,7 +45,7 @@ def truth() -> np.ndarray:
 
 def write(path: Path, image: np.ndarray) -> Path:
     layer = Layer("uint16", 0, {"units": "1", "long_name": "image"})
-    with building(path) as scratch:
+    with atomic_store(path) as scratch:
         attrs = {"content": f"of {path.stem} {int(image.sum())}", "epipolar": None}
         arrays = create_grid(
             scratch, image.shape, {"image": layer}, chunk=128, shard=256, attrs=attrs

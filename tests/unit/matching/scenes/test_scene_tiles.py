@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from whole_images import match
 
 from stereotruth.matching.scenes.scene_tiles import blend
 from stereotruth.matching.scenes.tiling import Tiling
-from stereotruth.matching.scenes.whole_images import match
 
 from ....synthetic.exact_method import SHAPE, Exact, coded
 

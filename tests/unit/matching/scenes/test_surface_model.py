@@ -21,7 +21,7 @@ from stereotruth.matching.scenes.surface_model import (
     utm_epsg,
     write_dsm,
 )
-from stereotruth.products.grids import Layer, building, create_grid
+from stereotruth.products.grids import Layer, atomic_store, create_grid
 
 from ....synthetic.cameras import HEIGHT
 from ....synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
@@ -42,7 +42,7 @@ def of_plane(model) -> np.ndarray:
 def write_grid(path: Path, model: EpipolarModel | None, disparity: np.ndarray) -> Path:
     layer = Layer("float32", np.nan, {"units": "px", "long_name": "disparity"})
     attrs = {"epipolar": model and model.to_dict(), "content": str(float(np.nansum(disparity)))}
-    with building(path) as scratch:
+    with atomic_store(path) as scratch:
         grids = {"disparity": layer}
         arrays = create_grid(scratch, disparity.shape, grids, chunk=64, shard=128, attrs=attrs)
         arrays["disparity"][:] = disparity

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from whole_images import match
 
 from stereotruth.matching.scenes.tiling import view_of
-from stereotruth.matching.scenes.whole_images import match
 
 from ....synthetic.exact_method import Exact, coded, plane_with_step
 

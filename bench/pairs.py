@@ -1,0 +1,141 @@
+"""What the predicted quality of a pair rests on: SGM on all pairs of simulated sites.
+
+Each pair of a drawn site is rectified by exact sensor models, matched by SGM as the benchmark runs
+it, and held against the exact truth: the share of the pixels that both images show whose disparity
+SGM misses by more than 1 px, or has not at all. ``--fit`` prints the coefficients of
+epipolar/pair_quality.py from sites of even numbers; without it, the rank correlation of what is
+predicted with what is found over sites of odd numbers, which no fit has seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.image_reader import open_pair
+from stereotruth.epipolar.pair_quality import quality_of
+from stereotruth.epipolar.rectify import rectify
+from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.epipolar.site_pairs import SiteImage, SitePair, pairs_of_site
+from stereotruth.matching.sgm import SemiGlobalMatcher
+from stereotruth.products.grids import open_grid
+from stereotruth.simulate.rpcs import draw_bias
+from stereotruth.simulate.site_images import pair_truth, simulate_site_image
+from stereotruth.simulate.sites import SiteSpec, drawn_site
+
+SEED = 2026
+FOLDER = Path("results/pairs")
+
+
+def exact_image(site: SiteSpec, name: str, folder: Path) -> SiteImage:
+    """An image of a site, made in the folder, with its RPCs corrected by their own bias."""
+    image = site.image(name)
+    file = folder / f"{name}.tif"
+    simulate_site_image(site, image, file, seed=SEED)
+    bias = np.vstack([draw_bias(image.cols, image.rows, image.pose_seed, "left"), [0, 0, 1]])
+    sensor = SensorModel(read_rpc(file), np.linalg.inv(bias)[:2])
+    return SiteImage(name, sensor, (image.cols, image.rows), image.acquired, image.sun_deg)
+
+
+def match(site: SiteSpec, images: dict[str, SiteImage], pair: SitePair, folder: Path) -> dict:
+    """Shares of pixels that SGM has wrong: by 1 px, by 1 m and by 2 m, or has not."""
+    left, right = images[pair.left], images[pair.right]
+    height = left.sensor.rpc.height_off
+    model = fit_epipolar(left.sensor, right.sensor, left.size, right.size, height)
+    stores = [folder / f"{view}.zarr" for view in ("left", "right")]
+    with open_pair(*(folder / f"{name}.tif" for name in (pair.left, pair.right))) as opened:
+        rectify(*opened, model, None, *stores)
+    pictures = [np.asarray(open_grid(store)["image"]) for store in stores]
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    at = model.epipolar_to_left(x, y)
+    truth = pair_truth(site, site.image(pair.left), site.image(pair.right), *at)
+    exact = x - model.right_to_epipolar(truth["right_col"], truth["right_row"])[0]
+    counted = (truth["visible_right"] > 0) & (pictures[0] > 0) & (truth["surface"] != 5)
+    low, high = np.nanpercentile(exact[counted], (0, 100))
+    bounds = int(np.floor(low)) - 8, int(np.ceil(high)) + 8
+    found = SemiGlobalMatcher()(*pictures, bounds)
+    miss = np.abs(found - exact)[counted]
+    miss[np.isnan(miss)] = np.inf
+    per_m = model.report["disparity_px_per_m"]["mean"]
+    shares = {f"over_{m}_m": float((miss > m * per_m).mean()) for m in (1, 2, 3)}
+    return shares | {"over_1_px": float((miss > 1).mean()), "pixels": int(counted.sum())}
+
+
+def rows_of(number: int, images: int, side_px: int) -> list[dict]:
+    """All pairs of a drawn site: what is known before, and what SGM does."""
+    kept = FOLDER / f"{SEED}-{number}-{images}-{side_px}.json"
+    if kept.is_file():
+        return json.loads(kept.read_text())
+    site = drawn_site(number, SEED, images=images, side_px=side_px)
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        opened = {image.name: exact_image(site, image.name, folder) for image in site.images}
+        for pair in pairs_of_site(list(opened.values())):
+            if pair.convergence < 1.5:
+                continue
+            measured = match(site, opened, pair, folder)
+            states = {site.image(name).state for name in (pair.left, pair.right)}
+            rows.append({"site": number, **asdict(pair), **measured, "seasons": len(states)})
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_text(json.dumps(rows))
+    return rows
+
+
+TERMS = ("base over height", "way of the shadows")
+
+
+def fit(rows: list[dict]) -> np.ndarray:
+    """Log odds of a wrong match [3]: at nothing, then per term; each site has its own level."""
+    sites = np.array([row["site"] for row in rows])
+    levels = (sites[:, None] == np.unique(sites)).astype(float)
+    terms = np.array([(2 * np.tan(np.radians(r["convergence"]) / 2), r["shadow"]) for r in rows])
+    wrong = np.clip([row["over_1_px"] for row in rows], 0.01, 0.99)
+    found = np.linalg.lstsq(np.hstack([terms, levels]), np.log(wrong / (1 - wrong)), rcond=None)[0]
+    return np.append(found[len(TERMS) :].mean(), found[: len(TERMS)])
+
+
+def predicted(row: dict) -> float:
+    """Share of right matches, as ``stereotruth pairs`` predicts it."""
+    return quality_of(SitePair(**{f.name: row[f.name] for f in fields(SitePair)})).matched
+
+
+def compare(every: list[list[dict]]) -> None:
+    """Print the rank correlation of the prediction with the truth, of each site and of all."""
+    print("| site | pairs | matched within 1 px | rank correlation |\n|---|---|---|---|")
+    together = [row for of_site in every for row in of_site]
+    for rows in [*every, together]:
+        found = np.array([1 - row["over_1_px"] for row in rows])
+        rank = spearmanr([predicted(row) for row in rows], found)[0]
+        name = "all" if rows is together else rows[0]["site"]
+        low, high = np.quantile(found, (0, 1))
+        print(f"| {name} | {len(rows)} | {100 * low:.0f} to {100 * high:.0f} % | {rank:.2f} |")
+
+
+def main() -> None:
+    """Make the sites, match their pairs, and fit or compare."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--sites", type=int, default=5)
+    arguments.add_argument("--images", type=int, default=7)
+    arguments.add_argument("--side", type=int, default=440, help="px of each image")
+    arguments.add_argument("--fit", action="store_true")
+    given = arguments.parse_args()
+    numbers = [2 * k + (not given.fit) for k in range(given.sites)]
+    every = [rows_of(number, given.images, given.side) for number in numbers]
+    if not given.fit:
+        compare(every)
+        return
+    for name, value in zip(("at nothing", *TERMS), fit([row for rows in every for row in rows])):
+        print(f"{name}: {value:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""All pairs of a site with what is known of them before matching, and rows for the chosen ones."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import sheets
+from ..configuration import Configuration
+from ..epipolar.pair_quality import Quality, quality_of
+from ..epipolar.site_pairs import SitePair, pairs_of_site
+from ..errors import InputError
+from ..project import configured, names_in_pair, read_images, read_scenes, sheet
+from .add_scene import append_row
+from .site import images_of
+
+DIACHRONIC_DAYS = 30.0  # more than these, as in DiachronicStereo (2026)
+CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
+LEAST_SHARED = 0.05  # of the smaller image's ground
+OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which pairs are written: the best ``most`` of those within limits.
+
+    ``convergence`` (degrees) and ``days``: least and greatest, None: any; pairs without dates have
+    any number of days if no ``days`` are given. ``diachronic``: pairs of more than DIACHRONIC_DAYS.
+    ``each``: pairs that one image may be in.
+    """
+
+    most: int | None = None
+    convergence: tuple[float, float] | None = CONVERGENCE_DEG
+    days: tuple[float, float] | None = None
+    diachronic: bool = False
+    each: int | None = None
+
+    def allows(self, pair: SitePair) -> bool:
+        """Whether a pair is within the limits."""
+        low, high = self.convergence or (0.0, 180.0)
+        if not low <= pair.convergence <= high or pair.shared < LEAST_SHARED:
+            return False
+        if self.days is None and not self.diachronic:
+            return True
+        if pair.days is None:
+            return False
+        first, last = self.days or (0.0, math.inf)
+        return first <= pair.days <= last and (not self.diachronic or pair.days > DIACHRONIC_DAYS)
+
+    def of(self, pairs: Sequence[RatedPair]) -> list[RatedPair]:
+        """The chosen of pairs that are listed best first."""
+        chosen: list[RatedPair] = []
+        used: Counter[str] = Counter()
+        for rated in pairs:
+            names = rated.pair.left, rated.pair.right
+            if self.most is not None and len(chosen) >= self.most:
+                break
+            if not self.allows(rated.pair):
+                continue
+            if self.each is not None and max(used[name] for name in names) >= self.each:
+                continue
+            chosen.append(rated)
+            used.update(names)
+        return chosen
+
+
+@dataclass(frozen=True)
+class RatedPair:
+    """A pair and its predicted quality."""
+
+    pair: SitePair
+    quality: Quality
+
+
+def rated_pairs(city: str, settings: Configuration) -> list[RatedPair]:
+    """All pairs of a site, best first; the order of the sheet's rows plays no part."""
+    cities = sheets.read_cities(sheet(settings, "cities"))
+    opened = images_of(city, read_images(settings, cities), settings)
+    pairs = pairs_of_site([one.image for one in opened])
+    if not pairs:
+        raise InputError(
+            f"no two images of city {city!r} share ground",
+            file=settings.images,
+            remedy="correct the cities and files of the images",
+        )
+    rated = [RatedPair(pair, quality_of(pair)) for pair in pairs]
+    return sorted(rated, key=lambda r: (-r.quality.matched, r.pair.left, r.pair.right))
+
+
+def write_pairs(
+    city: str,
+    choice: Choice,
+    rated: Sequence[RatedPair],
+    settings: Configuration,
+    given: dict[str, str],
+) -> list[str]:
+    """Append a row for each chosen pair that no scene is made of yet; returns what was done.
+
+    ``given``: cells of OF_CITY; those that are empty are taken from the city's first row. Raises
+    InputError if there is no LiDAR to be named.
+    """
+    rows = Path(sheet(settings, "scenes"))
+    cities, scenes = read_scenes(settings)
+    images = read_images(settings, cities)
+    of_city = [scene for scene in scenes.values() if scene.city == city]
+    here = {
+        column: given.get(column) or (getattr(of_city[0], column) if of_city else "")
+        for column in OF_CITY
+    }
+    if not here["lidar"]:
+        raise InputError(
+            f"no LiDAR is known of city {city!r}",
+            file=rows,
+            remedy="name it: --lidar FOLDER (and --gcps, --geoid, --lidar-crs)",
+        )
+    made = {frozenset(names_in_pair(scene, images)): name for name, scene in scenes.items()}
+    lines, written = [], 0
+    chosen = choice.of(rated)
+    for pair in (one.pair for one in chosen):
+        if before := made.get(frozenset((pair.left, pair.right))):
+            lines.append(f"{rows}: {pair.left} and {pair.right} are scene {before} already")
+            continue
+        name = _free_name(pair, scenes)
+        cells = {"scene": name, "city": city, "left_image": pair.left, "right_image": pair.right}
+        sheets.check(cells | here, sheets.Scene, f"scene {name}")
+        append_row(rows, sheets.Scene, cells | here)
+        written += 1
+    lines.append(f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}")
+    return lines
+
+
+def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
+    """LEFT-RIGHT, which no scene has; short enough for a name."""
+    name = re.sub(r"[^A-Za-z0-9-]", "-", f"{pair.left}-{pair.right}")[: sheets.LONGEST_NAME - 4]
+    names = (name, *(f"{name}-{k}" for k in range(2, 1000)))
+    return next(one for one in names if one not in scenes)
+
+
+COLUMNS = (
+    "left", "right", "matched", "m/px", "convergence", "bisector", "asymmetry", "sun", "days",
+    "shared", "pixels", "reason",
+)  # fmt: skip
+
+
+def table(rated: Sequence[RatedPair]) -> list[tuple[str, ...]]:
+    """The listed pairs as text: COLUMNS, one row a pair; degrees, days, shares."""
+    return [
+        (
+            one.pair.left,
+            one.pair.right,
+            f"{100 * one.quality.matched:.0f} %",
+            f"{one.pair.metres_per_px:.1f}",
+            f"{one.pair.convergence:.1f}°",
+            f"{one.pair.bisector:.0f}°",
+            f"{one.pair.asymmetry:.0f}°",
+            "?" if one.pair.sun is None else f"{one.pair.sun:.0f}°",
+            "?" if one.pair.days is None else _days(one.pair.days),
+            f"{100 * one.pair.shared:.0f} %, {one.pair.shared_km2:.3g} km²",
+            f"{one.pair.pixel_ratio:.2f}",
+            one.quality.reason,
+        )
+        for one in rated
+    ]
+
+
+def _days(days: float) -> str:
+    return f"{days:.0f}" if days >= 1 else "same pass" if days < 0.02 else "same day"
+
+
+def list_pairs(
+    city: str,
+    choice: Choice | None,
+    given: dict[str, str],
+    configfiles: Sequence[Path] | None = None,
+) -> tuple[list[RatedPair], list[str]]:
+    """All pairs of a site, best first, and what was written; nothing if ``choice`` is None."""
+    settings, _ = configured(configfiles)
+    rated = rated_pairs(city, settings)
+    return rated, [] if choice is None else write_pairs(city, choice, rated, settings, given)

@@ -1,0 +1,79 @@
+"""What the workflow can make: a line for each target, and which one a typo may mean."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..errors import InputError
+from ..project import FILES, configured, read_scenes
+
+TARGETS = {
+    "tiles/<City>": "the benchmark tiles of a city (without a target: of all cities)",
+    "dataset": "the tiles of all cities, in the layout of the published dataset",
+    "originals": "crops of the original images with corrected RPCs (dataset.originals)",
+    "verify": "all tiles, held against the checksums of their manifests",
+    "report": "the pages of all cities; results/report/<City>/index.html that of one",
+    "evaluate": "figures from the images, and against the exact truth of synthetic cities",
+    "results/project/<City>/<scene>.zarr": "disparity, status and uncertainty of a whole scene",
+    "results/predict/<City>/<scene>_<method>_dsm.tif": "surface model of a scene by a method",
+    "score_dsm/<City>/<scene>/<method>": "that surface model, held against the LiDAR",
+    "benchmark": "the methods that each dataset names, scored and compared",
+    "benchmark/<dataset>/<method>": "the scores of one method on one dataset",
+    "submission/<dataset>/<method>": "the results of a method, as others submit them",
+    "results/train/<dataset>/<method>/training.json": "a network, trained",
+    "audit/<dataset>": "what is wrong with a stereo dataset",
+    "training_cities": "synthetic cities to train on",
+}
+
+
+def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
+    """A line for each target, and the cities, scenes, datasets and methods to put into them."""
+    settings, _ = configured(configfiles)
+    cities, scenes = read_scenes(settings)
+    with_scenes = [city for city in cities if any(s.city == city for s in scenes.values())]
+    width = max(map(len, TARGETS))
+    known = {
+        "<City>": with_scenes,
+        "<scene>": list(scenes),
+        "<dataset>": [name for name, entry in settings.benchmark.datasets.items() if entry],
+        "<method>": [name for name, entry in settings.benchmark.methods.items() if entry],
+    }
+    return [f"{name:{width}}  {meaning}" for name, meaning in TARGETS.items()] + [
+        f"{name}: {', '.join(values[:12])}{' …' if len(values) > 12 else ''}"
+        for name, values in known.items()
+        if values
+    ]
+
+
+def rules() -> list[str]:
+    """Names of the workflow's rules."""
+    return [
+        name
+        for file in sorted((FILES / "workflow" / "rules").glob("*.smk"))
+        for name in re.findall(r"^rule (\w+):", file.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+
+
+def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> None:
+    """Raise InputError for a target that is a typo, with what it may mean.
+
+    ``given``: arguments of a run; targets are the words before the first option. Paths other than
+    ``tiles/<City>`` are left to Snakemake.
+    """
+    words = list(given)
+    first_option = next((k for k, word in enumerate(words) if word.startswith("-")), len(words))
+    for word in words[:first_option]:
+        if re.fullmatch(r"tiles/[^/]+/?", word):
+            settings, _ = configured(configfiles)
+            names = [f"tiles/{city}" for city in read_scenes(settings)[0]]
+        elif "/" not in word and not Path(word).exists():
+            names = [*rules(), "all"]
+        else:
+            continue
+        if word.rstrip("/") not in names:
+            close = difflib.get_close_matches(word, names, n=1)
+            remedy = f"did you mean {close[0]}?" if close else "stereotruth targets lists them"
+            raise InputError(f"{word}: no such target", remedy=remedy)

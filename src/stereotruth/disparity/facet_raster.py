@@ -1,0 +1,256 @@
+"""Triangles rasterised into both views: z-buffer of the left one, visibility from the right one.
+
+Positions ``xy`` [4, vertices] are x_left, y_left, x_right, y_right in px of the epipolar grid; a
+disparity is x_left - x_right. Rows and columns of pixels count from the (row, col) ``first`` of a
+window.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
+from ..numerics.triangles import plane_slopes, row_span
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+# What lies in front of a surface by less is the surface itself.
+OCCLUSION_TOLERANCE_PX = 0.25
+# Faces of a prism, of its vertices 0, 1, 2 at the top and 3, 4, 5 below these.
+_FACES = ((0, 1, 2), (0, 1, 3), (1, 3, 4), (1, 2, 4), (2, 4, 5), (2, 0, 5), (0, 5, 3))
+
+
+class RightPixels(NamedTuple):
+    """Pixels [n] of a window in the order of their row and whole column in the right image.
+
+    ``first``: (row, col) of the first pixel there, ``width``: number of columns; those of column
+    ``first[1] + k`` in row ``first[0] + j`` from ``start[j * width + k]`` on. ``column`` of each,
+    px; ``limit``: a greater disparity hides it, px.
+    """
+
+    first: tuple[int, int]
+    width: int
+    start: Steps
+    column: Floats
+    limit: Floats
+
+
+class FacetValues(NamedTuple):
+    """Triangles ``corner`` [m, 3] of vertices [n] at ``xy`` [4, n], and what is interpolated in
+    them.
+
+    ``h`` (lattice steps), ``surface_class``, ``count`` of each vertex; ``variance`` (lattice
+    steps²) and ``bulge`` (lattice steps) of each triangle.
+    """
+
+    xy: Floats
+    corner: Steps
+    h: Ints
+    surface_class: NDArray[np.uint8]
+    count: Steps
+    variance: Floats
+    bulge: Floats
+
+
+class PixelValues(NamedTuple):
+    """What triangles have at the centres of pixels [h, w]: ``slope`` [2, h, w] of the disparity;
+    ``variance`` (lattice steps²), ``height`` and ``rise`` of the surface above its triangle
+    (lattice steps); ``surface_class`` of the nearest vertex."""
+
+    slope: Floats
+    variance: Floats
+    height: Floats
+    rise: Floats
+    surface_class: NDArray[np.uint8]
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> PixelValues:
+        """Of pixels without a triangle."""
+        height, classes = np.full(shape, np.nan), np.zeros(shape, np.uint8)
+        return cls(np.zeros((2, *shape)), np.zeros(shape), height, np.zeros(shape), classes)
+
+
+@inner
+def _triple(values: Floats, t: Steps) -> tuple[float, float, float]:
+    return values[t[0]], values[t[1]], values[t[2]]
+
+
+@inner
+def _raster_left(
+    x: tuple,
+    y: tuple,
+    d: tuple,
+    first: tuple[int, int],
+    number: int,
+    z_buffer: Floats,
+    index: Steps,
+) -> None:
+    """Raises ``z_buffer`` [rows, cols] to a triangle's disparity, and sets ``index`` to its
+    ``number`` there.
+
+    Of triangles of equal disparity the first one stays.
+    """
+    rows, cols = z_buffer.shape
+    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
+    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
+    left = max(int(np.ceil(min(x[0], x[1], x[2]))), first[1])
+    right = min(int(np.floor(max(x[0], x[1], x[2]))), first[1] + cols - 1)
+    if top > bottom or left > right:  # most triangles lie between the centres of pixels
+        return
+    gx, gy = plane_slopes(x, y, d)
+    if not np.isfinite(gx + gy):
+        return
+    lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
+    for row in range(top, bottom + 1):
+        low, high = row_span(x, y, float(row))
+        if not low <= high:
+            continue
+        left = max(int(np.ceil(low)), first[1])
+        right = min(int(np.floor(high)), first[1] + cols - 1)
+        for col in range(left, right + 1):
+            value = d[0] + gx * (col - x[0]) + gy * (row - y[0])
+            value = min(max(value, lowest), highest)
+            j, i = row - first[0], col - first[1]
+            if value > z_buffer[j, i]:
+                z_buffer[j, i] = value
+                index[j, i] = number
+
+
+@kernel
+def raster_facets(
+    xy: Floats, corner: Steps, first: tuple[int, int], z_buffer: Floats, index: Steps
+) -> None:
+    """The triangle of the greatest disparity at each pixel's centre, and that disparity (eq. 7 of
+    docs/explanation/surface.md).
+
+    Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
+    number.
+    """
+    for t in range(len(corner)):
+        x, y = _triple(xy[0], corner[t]), _triple(xy[1], corner[t])
+        xr = _triple(xy[2], corner[t])
+        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+        _raster_left(x, y, d, first, t, z_buffer, index)
+
+
+@inner
+def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools) -> None:
+    """Marks the pixels that a triangle covers in the right view, and whose ``limit`` it exceeds."""
+    first, width, start = pixels.first, pixels.width, pixels.start
+    column, limit = pixels.column, pixels.limit
+    rows = (start.size - 1) // width
+    top = max(int(np.ceil(min(y[0], y[1], y[2]))), first[0])
+    bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
+    if top > bottom:
+        return
+    gx, gy = plane_slopes(x, y, d)
+    if not np.isfinite(gx + gy):
+        return
+    lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
+    for row in range(top, bottom + 1):
+        low, high = row_span(x, y, float(row))
+        if not low <= high:
+            continue
+        left = max(int(np.floor(low)) - first[1], 0)
+        right = min(int(np.floor(high)) - first[1], width - 1)
+        if left > right:
+            continue
+        base = (row - first[0]) * width
+        for k in range(start[base + left], start[base + right + 1]):
+            if hidden[k] or not low <= column[k] <= high or highest <= limit[k]:
+                continue
+            value = d[0] + gx * (column[k] - x[0]) + gy * (row - y[0])
+            hidden[k] = min(max(value, lowest), highest) > limit[k]
+
+
+@kernel
+def hide_by_facets(xy: Floats, corner: Steps, pixels: RightPixels, hidden: Bools) -> None:
+    """Marks the pixels that triangles hide from the right camera (eq. 8 of
+    docs/explanation/surface.md)."""
+    for t in range(len(corner)):
+        x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
+        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+        y = _triple(xy[3], corner[t])
+        _hide_right(xr, y, d, pixels, hidden)
+
+
+@kernel
+def raster_prisms(xy: Floats, first: tuple[int, int], z_buffer: Floats) -> None:
+    """Raises ``z_buffer`` to the greatest disparity that prisms may have (eq. 7 of
+    docs/explanation/surface.md); ``xy`` [4, prisms, 6]."""
+    any_prism = np.empty(z_buffer.shape, np.int32)
+    for t in range(xy.shape[1]):
+        x, y, xr = xy[0, t], xy[1, t], xy[2, t]
+        for a, b, c in _FACES:
+            d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
+            _raster_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, t, z_buffer, any_prism)
+
+
+@kernel
+def hide_by_prisms(xy: Floats, pixels: RightPixels, hidden: Bools) -> None:
+    """Marks the pixels that prisms may hide from the right camera (eq. 8 of
+    docs/explanation/surface.md); ``xy`` [4, prisms, 6]."""
+    for t in range(xy.shape[1]):
+        x, xr, y = xy[0, t], xy[2, t], xy[3, t]
+        for a, b, c in _FACES:
+            d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
+            _hide_right((xr[a], xr[b], xr[c]), (y[a], y[b], y[c]), d, pixels, hidden)
+
+
+@kernel
+def interpolate(
+    facets: FacetValues, index: Steps, first: tuple[int, int], out: PixelValues
+) -> None:
+    """What the triangle ``index`` [h, w] of each pixel has at its centre (eq. 10 and 11 of
+    docs/explanation/surface.md), to ``out``."""
+    xy, corner, h, count = facets.xy, facets.corner, facets.h, facets.count
+    classes, noise, bulge = facets.surface_class, facets.variance, facets.bulge
+    slope, variance, height, rise = out.slope, out.variance, out.height, out.rise
+    surface_class = out.surface_class
+    rows, cols = index.shape
+    for j in range(rows):
+        for i in range(cols):
+            t = index[j, i]
+            if t < 0:
+                continue
+            v = corner[t]
+            x, y, xr = _triple(xy[0], v), _triple(xy[1], v), _triple(xy[2], v)
+            slope[0, j, i], slope[1, j, i] = plane_slopes(
+                x, y, (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+            )
+            u, w = first[1] + i - x[0], first[0] + j - y[0]
+            bx, by = plane_slopes(x, y, (0.0, 1.0, 0.0))
+            cx, cy = plane_slopes(x, y, (0.0, 0.0, 1.0))
+            b = min(max(bx * u + by * w, 0.0), 1.0)
+            c = min(max(cx * u + cy * w, 0.0), 1.0 - b)
+            a = 1.0 - b - c
+            variance[j, i] = noise[t] * (
+                a * a / count[v[0]] + b * b / count[v[1]] + c * c / count[v[2]]
+            )
+            rise[j, i] = bulge[t] * (a * b + b * c + c * a)
+            height[j, i] = h[v[0]] + b * float(h[v[1]] - h[v[0]]) + c * float(h[v[2]] - h[v[0]])
+            surface_class[j, i] = classes[v[0] if a >= b and a >= c else v[1] if b >= c else v[2]]
+
+
+def right_pixels(
+    row: Ints, col: Ints, disparity: Floats, first: tuple[int, int]
+) -> tuple[Ints, RightPixels]:
+    """Pixels [n] of a window, one at least, in their order in the right image, and where they are
+    there."""
+    column = col + first[1] - disparity
+    whole = np.floor(column).astype(np.int64)
+    low = int(whole.min())
+    width = int(whole.max()) - low + 1
+    rows = int(row.max()) + 1
+    key = row.astype(np.int64) * width + whole - low
+    order = np.argsort(key, kind="stable")
+    start = np.zeros(rows * width + 1, np.int32)
+    np.cumsum(np.bincount(key, minlength=rows * width), out=start[1:])
+    limit = disparity[order] + OCCLUSION_TOLERANCE_PX
+    return order, RightPixels((first[0], low), width, start, column[order], limit)

@@ -1,0 +1,332 @@
+"""Heights in the geometry of an original image: what each of its pixels shows, by the LiDAR.
+
+One image is enough: of the facets that lie on a pixel's ray, the image shows the highest. The
+surface is that of :mod:`stereotruth.surface.surface`, as for the labels of a pair; where an
+undecided triangle may be higher on the ray, the pixel has no height. Multi-view stereo, radiance
+fields and splatting work on the originals, which no rectification has touched.
+
+The facets' vertices are projected as (col, row, col - height, row), so that the disparity that
+:mod:`.facet_raster` compares and interpolates is the height, m above the reference.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..alignment.aligned_pair import ViewFit
+from ..epipolar.rpc import SensorModel
+from ..errors import InputError
+from ..job import progress
+from ..lidar.density import points_per_m2
+from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from ..lidar.point_store import PointStore
+from ..numerics.degrees import DEGREE_M
+from ..products.grids import Layer, atomic_store, blocks, create_grid
+from ..products.provenance import digest
+from ..surface.surface import GroundSurface, ground_surface
+from ..surface.vertices import VertexBuilder, Vertices
+from .facet_raster import (
+    OCCLUSION_TOLERANCE_PX,
+    FacetValues,
+    PixelValues,
+    interpolate,
+    raster_facets,
+    raster_prisms,
+)
+from .pixel_scale import PixelScale
+from .rays import GROUND_CELL_PX, Rays
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+
+IMAGE_CHUNK, IMAGE_SHARD = 256, 1024
+BASE_OVER_HEIGHT = 0.6  # of the pair whose tolerances the surface has: GF-7's and the like
+NO_POINTS, MEASURED, UNDECIDED = range(3)
+STATUSES = "no_points measured undecided"
+_PRISMS = 1 << 15  # prisms that are projected at once
+LAYERS = {
+    "height": Layer("float32", np.nan, {
+        "units": "m", "long_name": "height above the WGS 84 ellipsoid of what the pixel's centre "
+        "shows", "nodata": "NaN",
+    }),
+    "lon": Layer("float64", np.nan, {
+        "units": "degrees_east", "long_name": "WGS 84 longitude of it", "nodata": "NaN",
+    }),
+    "lat": Layer("float64", np.nan, {
+        "units": "degrees_north", "long_name": "WGS 84 latitude of it", "nodata": "NaN",
+    }),
+    "sigma": Layer("float32", np.nan, {
+        "units": "m", "long_name": "standard uncertainty of the height at the pixel", "nodata":
+        "NaN", "formula": "sqrt(v + g' C g): v variance of the points' heights in the facet; g "
+        "slope of the height over the image, m per px; C covariance of the image's correction, px²",
+    }),
+    "status": Layer("uint8", 0, {
+        "units": "1", "long_name": "why a pixel has a height or none", "flag_values": [0, 1, 2],
+        "flag_meanings": STATUSES, "undecided": "a height step may be higher on the pixel's ray",
+    }),
+    "surface_class": Layer("uint8", 0, {
+        "units": "1", "long_name": "LAS class (ASPRS) of the nearest vertex; 0: never classified",
+    }),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ImageInputs:
+    """An image and the points of its site.
+
+    ``sensor`` is corrected; ``fit``: the correction and its covariance, None if it counts as exact.
+    ``size``: (cols, rows) px.
+    """
+
+    sensor: SensorModel
+    size: tuple[int, int]
+    stores: tuple[PointStore, ...]
+    fit: ViewFit | None = None
+
+    @cached_property
+    def reference_m(self) -> float:
+        """Height in the middle of the RPC's range."""
+        return float(self.sensor.rpc.height_off)
+
+    @property
+    def made_of(self) -> dict[str, str]:
+        """Digests of the points, for the provenance."""
+        return {
+            f"points/{store.path.name}": digest(dict(store.attrs.get("provenance", {})))
+            for store in self.stores
+        }
+
+    @cached_property
+    def scale(self) -> PixelScale:
+        """What a pixel is on the ground, and the tolerances of the surface."""
+        col, row = self.size[0] / 2, self.size[1] / 2
+        lon, lat = self.sensor.localize([col, col + 1, col], [row, row, row + 1], self.reference_m)
+        if not np.isfinite(lon).all():
+            raise InputError(
+                "the RPC reaches no ground in the middle of the image",
+                remedy="check that the RPC belongs to the image",
+            )
+        shrink = float(np.cos(np.radians(lat[0])))
+        east, north = (lon[1:] - lon[0]) * shrink, lat[1:] - lat[0]
+        pixel = float(np.sqrt(abs(east[0] * north[1] - east[1] * north[0])))  # degrees of latitude
+        side = GROUND_CELL_PX * pixel / LATTICE_DEG
+        cell = max(round(side / shrink), 1), max(round(side), 1)
+        px_per_m = BASE_OVER_HEIGHT / (pixel * DEGREE_M)
+        rays = Rays(np.zeros((2, 2, 3)), cell, px_per_m)
+        return PixelScale.of(points_per_m2(self.stores), rays)
+
+    @property
+    def pixel_m(self) -> float:
+        """Side of a pixel on the ground."""
+        return BASE_OVER_HEIGHT / self.scale.px_per_m
+
+    def box(self, rows: slice, cols: slice) -> tuple[float, float, float, float] | None:
+        """(west, south, east, north) of all ground that the pixels may show, with its halo.
+
+        Degrees; None if there are no points.
+        """
+        heights = (
+            min(store.bounds[4] for store in self.stores),
+            max(store.bounds[5] for store in self.stores),
+        )
+        box = None
+        for _ in range(2):  # again with the heights of the points that are there
+            box = self._box(rows, cols, heights)
+            there = [h for store in self.stores if (h := store.height_range(*box)) is not None]
+            if not there:
+                return None
+            heights = min(low for low, _ in there), max(high for _, high in there)
+        return box
+
+    def _box(
+        self, rows: slice, cols: slice, heights: tuple[float, float]
+    ) -> tuple[float, float, float, float]:
+        col, row, height = (
+            grid.reshape(-1)
+            for grid in np.meshgrid(
+                np.linspace(cols.start - 1.0, cols.stop, 5),
+                np.linspace(rows.start - 1.0, rows.stop, 5),
+                heights,
+            )
+        )
+        lon, lat = self.sensor.localize(col, row, height)
+        halo = self.scale.surface.halo_cells + 4
+        east, north = (halo * side * LATTICE_DEG for side in self.scale.surface.cell)
+        return (
+            float(np.nanmin(lon)) - east, float(np.nanmin(lat)) - north,
+            float(np.nanmax(lon)) + east, float(np.nanmax(lat)) + north,
+        )  # fmt: skip
+
+    def project(self, lon_q: NDArray, lat_q: NDArray, h_q: NDArray) -> Floats:
+        """[4, n] (col, row, col - height, row) of lattice points, see the module."""
+        height = h_q * LATTICE_M
+        col, row = self.sensor.project(lon_q * LATTICE_DEG, lat_q * LATTICE_DEG, height)
+        return np.stack([col, row, col - (height - self.reference_m), row])
+
+    def covariance(self, rows: slice, cols: slice) -> Floats:
+        """[2, 2] px² of the correction in the middle of a block."""
+        if self.fit is None:
+            return np.zeros((2, 2))
+        design = self.fit.design((cols.start + cols.stop) / 2, (rows.start + rows.stop) / 2)
+        return design @ self.fit.covariance @ design.T
+
+
+def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str, NDArray] | None:
+    """The layers of LAYERS at the pixels of a block; None if no point is near."""
+    box = inputs.box(rows, cols)
+    vertices = None if box is None else _vertices(inputs, box)
+    if vertices is None or not len(vertices.x):
+        return None
+    surface = ground_surface(vertices, inputs.scale.surface)
+    shape, first = (rows.stop - rows.start, cols.stop - cols.start), (rows.start, cols.start)
+    every = surface.vertices
+    xy = inputs.project(every.lon_q, every.lat_q, every.h_q)
+    above, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
+    raster_facets(xy, surface.facet, first, above, index)
+    undecided = np.full(shape, -np.inf)
+    for start in range(0, len(surface.undecided), _PRISMS):
+        prisms = _prisms(inputs, surface, slice(start, start + _PRISMS))
+        raster_prisms(prisms, first, undecided)
+    values = PixelValues.none(shape)
+    facets = FacetValues(
+        xy, surface.facet, every.h_q, every.surface_class, every.count, surface.variance,
+        surface.bulge,
+    )  # fmt: skip
+    interpolate(facets, index, first, values)
+    higher = undecided > above + OCCLUSION_TOLERANCE_PX * inputs.pixel_m
+    return _layers(inputs, (rows, cols), index, higher, values)
+
+
+def _vertices(inputs: ImageInputs, box: tuple[float, float, float, float]) -> Vertices | None:
+    low = [int(np.floor(edge / LATTICE_DEG)) for edge in box[:2]]
+    high = [int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]]
+    builder = VertexBuilder(inputs.scale.surface, (low[0], low[1]), (high[0], high[1]))
+    some = False
+    for store in inputs.stores:
+        points = store.query(*box)
+        if len(points):
+            some = True
+            builder.add(
+                points.lon_q, points.lat_q, points.h_q, points.classification,
+                points.return_number,
+            )  # fmt: skip
+    return builder.built() if some else None
+
+
+def _prisms(inputs: ImageInputs, surface: GroundSurface, chosen: slice) -> Floats:
+    """Positions [4, prisms, 6] of undecided triangles at their greatest and least height."""
+    corner = surface.undecided[chosen]
+    heights = np.repeat(surface.height_range[chosen, ::-1], 3, axis=1)
+    vertices = surface.vertices
+    lon, lat = (np.tile(q[corner], 2) for q in (vertices.lon_q, vertices.lat_q))
+    corners = (values.reshape(-1) for values in (lon, lat, heights))
+    return inputs.project(*corners).reshape(4, -1, 6)
+
+
+def _layers(
+    inputs: ImageInputs,
+    window: tuple[slice, slice],
+    index: NDArray[np.int32],
+    higher: NDArray[np.bool_],
+    values: PixelValues,
+) -> dict[str, NDArray]:
+    """Layers of a block; ``higher``: where an undecided triangle may be higher than the facet."""
+    rows, cols = window
+    status = np.where(index >= 0, np.uint8(MEASURED), np.uint8(NO_POINTS))
+    status[higher] = UNDECIDED
+    good = status == MEASURED
+    height = np.where(good, (values.height + values.rise) * LATTICE_M, np.nan)
+    covariance = inputs.covariance(rows, cols)
+    moved = np.einsum("ihw,ij,jhw->hw", values.slope, covariance, values.slope)
+    sigma = np.sqrt(values.variance * LATTICE_M**2 + moved)
+    col, row = np.meshgrid(np.arange(cols.start, cols.stop), np.arange(rows.start, rows.stop))
+    lon, lat = np.full(height.shape, np.nan), np.full(height.shape, np.nan)
+    lon[good], lat[good] = inputs.sensor.localize(col[good], row[good], height[good])
+    return {
+        "height": height.astype(np.float32),
+        "lon": lon,
+        "lat": lat,
+        "sigma": np.where(good, sigma, np.nan).astype(np.float32),
+        "status": status,
+        "surface_class": np.where(good, values.surface_class, 0).astype(np.uint8),
+    }
+
+
+def write_image_heights(
+    inputs: ImageInputs,
+    out_zarr: str | Path,
+    *,
+    image: str = "",
+    workers: int = 1,
+    provenance: Mapping[str, Any] | None = None,
+) -> dict[str, float]:
+    """Write the layers of LAYERS on an image's own grid [row, col]; shares of pixels by status.
+
+    Blocks are independent of each other: the bytes are the same for any number of workers and any
+    order of the stores. Raises InputError if no pixel of the image has a height.
+    """
+    shape = inputs.size[1], inputs.size[0]
+    attrs = {
+        "kind": "image heights",
+        "image": image,
+        "conventions": "arrays are [row, col] of the original image; pixel (0, 0) is the centre of "
+        "the upper-left pixel",
+        "sensor": inputs.sensor.to_dict(),
+        "provenance": dict(provenance or {}),
+    }
+    counts = np.zeros(3, np.int64)
+    with atomic_store(out_zarr) as scratch, ThreadPoolExecutor(workers) as pool:
+        arrays = create_grid(
+            scratch,
+            shape,
+            LAYERS,
+            chunk=IMAGE_CHUNK,
+            shard=IMAGE_SHARD,
+            attrs=attrs,
+            of="original image",
+        )
+
+        def make(window: tuple[slice, slice]) -> NDArray[np.int64]:
+            layers = heights_of_block(inputs, *window)
+            if layers is None:
+                size = (window[0].stop - window[0].start) * (window[1].stop - window[1].start)
+                return np.array([size, 0, 0])
+            for name, values in layers.items():
+                arrays[name][window] = values
+            return np.bincount(layers["status"].reshape(-1), minlength=3)
+
+        windows = blocks(shape, IMAGE_SHARD)
+        for part in progress(pool.map(make, windows), len(windows), f"{image}: heights"):
+            counts += part
+        if not counts[MEASURED]:
+            raise InputError(
+                f"no pixel of image {image} has a height: no LiDAR lies where it looks",
+                file=out_zarr,
+                remedy="check the LiDAR's and the image's coordinates",
+            )
+    shares = counts / counts.sum()
+    named = dict(zip(STATUSES.split(), map(float, shares)))
+    log.info(
+        "%s: %s", image, ", ".join(f"{100 * share:.1f} % {name}" for name, share in named.items())
+    )
+    return named
+
+
+def open_inputs(
+    sensor: SensorModel,
+    size: tuple[int, int],
+    point_stores: Sequence[str | Path],
+    fit: ViewFit | None = None,
+) -> ImageInputs:
+    """Inputs with the point stores opened, in the order of their names."""
+    stores = tuple(PointStore(path) for path in sorted(map(str, point_stores)))
+    return ImageInputs(sensor, size, stores, fit)

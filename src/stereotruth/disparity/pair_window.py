@@ -1,0 +1,102 @@
+"""A window of a pair's left grid: what both images show in it, and its labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .image_patches import MASKED, USABLE, Patch
+from .pixel_labels import Labels
+from .status import Status
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class PairWindow:
+    """Pixels ``rows``, ``cols`` of the left epipolar grid, and what both images show there.
+
+    The outer ``margin`` pixels have no labels of their own, but take part in those of others.
+    ``left``, ``right``: patches; the right one holds all that the window's points can be seen in.
+    """
+
+    rows: slice
+    cols: slice
+    margin: int
+    left: Patch
+    right: Patch
+
+    @property
+    def first(self) -> tuple[int, int]:
+        """(row, col) of the first pixel."""
+        return self.rows.start, self.cols.start
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols)."""
+        return self.rows.stop - self.rows.start, self.cols.stop - self.cols.start
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """The window without its margin."""
+        inner = slice(self.margin, -self.margin)
+        return inner, inner
+
+    def usable(self, row: Ints, col: Ints, disparity: Floats) -> tuple[Bools, Bools]:
+        """Which pixels [n] (from the window's first) of a disparity lie in both frames, and of
+        which a mask hides either place."""
+        y, x = row + self.first[0], col + self.first[1]
+        match = np.floor(x - disparity).astype(np.int64)
+        in_left, in_right = usable_at(self.left, y, x), usable_at(self.right, y, match)
+        return in_left & in_right == USABLE, (in_left | in_right) & MASKED != 0
+
+
+def usable_at(patch: Patch, row: Ints, col: Ints) -> Bytes:
+    """Of :class:`.image_patches.Patch`, at pixels [n]; 0 outside the patch."""
+    r, c = row - patch.row, col - patch.col
+    inside = (r >= 0) & (c >= 0) & (r < patch.usable.shape[0]) & (c < patch.usable.shape[1])
+    out = np.zeros(r.size, np.uint8)
+    out[inside] = patch.usable[r[inside], c[inside]]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class WindowLabels:
+    """Labels of a window and why its other pixels have none; arrays [h, w], margin included.
+
+    ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
+    ``surface_class`` (ASPRS) of what a pixel shows; ``point_count``: points used; ``correlation``:
+    coefficient of both images.
+    """
+
+    status: Bytes
+    labels: Labels
+    height: Floats
+    surface_class: Bytes
+    point_count: Ints
+    correlation: NDArray[np.floating]
+
+    def within(self, part: tuple[slice, slice]) -> WindowLabels:
+        """A part of the window."""
+        labels = Labels(
+            self.labels.disparity[part], self.labels.slope[:, *part], self.labels.variance[part]
+        )
+        return WindowLabels(
+            status=self.status[part],
+            labels=labels,
+            height=self.height[part],
+            surface_class=self.surface_class[part],
+            point_count=self.point_count[part],
+            correlation=self.correlation[part],
+        )
+
+    def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:
+        """Points of a window: all, in both frames, used; from those of its pixels."""
+        labelled = np.isin(self.status, (Status.LABELLED, Status.BELOW_MINIMUM_COUNT))
+        framed = in_frames.sum()
+        return np.array([framed + outside.sum(), framed, self.point_count[labelled].sum()])

@@ -1,0 +1,107 @@
+"""The labels of one window of the left epipolar grid, and why its other pixels have none.
+
+The recipe surface, step by step; equations and a figure: docs/explanation/surface.md.
+
+1. *Points.* The LiDAR's points are projected into both images and sorted by pixel
+   (:mod:`.pixel_points`); those around become vertices over the ground, one for each half pixel at
+   most (:mod:`stereotruth.surface.vertices`).
+2. *Facets.* Delaunay triangles of the vertices that lie on one surface are facets. Triangles across
+   a height step are cut at the breakline that the points on both sides determine; what is left is
+   undecided (:mod:`stereotruth.surface.surface`).
+3. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
+   and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
+   has the label of its nearest facet if nothing may hide it in either view; if its own points are
+   the surer ones, theirs (:mod:`.facet_labels`).
+4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
+   (:mod:`.image_agreement`). Rough surfaces, of which no triangle is a facet, get labels of their
+   own, which the images confirm (:mod:`.crowns`).
+5. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
+
+The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_recipe`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..surface.surface import ground_surface
+from .crowns import crowns, with_crowns, without_contours
+from .facet_labels import facet_labels
+from .ground_in_view import ground_in_view
+from .image_agreement import Comparison, without_changes
+from .layers import layers_of
+from .pair_window import PairWindow, WindowLabels
+from .paper_recipe import paper_labels
+from .pixel_labels import own_labels
+from .scene_inputs import SceneInputs
+from .seen_surface import MAX_COVER_PX
+from .visibility import ProjectedSurface, visible_surface
+from .window_points import WindowPoints, read_window
+
+
+def label_window(
+    scene: SceneInputs, rows: slice, cols: slice
+) -> tuple[dict[str, NDArray], NDArray[np.int64]] | None:
+    """All layers of a window and its point counts; None if it has no points.
+
+    Counts: points in the window, in both frames, used.
+    """
+    inputs = read_window(scene, rows, cols)
+    if inputs is None:
+        return None
+    window, points = inputs
+    recipe = surface_recipe if scene.settings.on_surface else paper_recipe
+    labels = recipe(scene, window, points).within(window.inner)
+    layers = layers_of(labels, scene.pair, window)
+    in_frames = points.by_pixel.count[window.inner]
+    outside = points.by_pixel.outside.reshape(window.shape)[window.inner]
+    return layers, labels.counts(in_frames, outside)
+
+
+def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
+    """The labels of a window by the surface of the points around it."""
+    settings, scale = scene.settings, scene.scale
+    shape, first, projection = window.shape, window.first, points.projection
+    comparison = Comparison(
+        settings.window,
+        settings.correlation_threshold,
+        scale.points_per_px,
+        scale.detection_weight,
+    )
+
+    # points: what each pixel's own ones say
+    own = own_labels(
+        points.by_pixel,
+        projection,
+        scale.px_per_m,
+        edge_margin_px=settings.edge_margin_px,
+        min_points=settings.min_points,
+    )
+
+    # facets: over the ground that the window may see
+    reach, cell = scale.surface.height_reach, scale.surface.cell
+    region = ground_in_view(points.vertices, reach, cell, projection, first, shape)
+    surface = ground_surface(points.vertices, scale.surface, region)
+
+    # visibility in both views; less than two spacings around a hidden point are searched for what
+    # covers it, so that sparse points are seen through
+    projected = ProjectedSurface.of(surface, projection, first)
+    visible = visible_surface(projected, shape, scale.px_per_m)
+    see_through = scale.spacing_px > MAX_COVER_PX / 2.0
+    labels = facet_labels(visible, own, window, see_through)
+
+    # agreement of the images
+    rough = crowns(visible, scale)
+    labels = without_contours(labels, rough, visible, scale)
+    labels = without_changes(labels, window, comparison)
+    rough = replace(rough, visible=rough.visible & ~own.on_edge)
+    return with_crowns(labels, rough, window, comparison)
+
+
+def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
+    """The labels of a window by each pixel's own points."""
+    model, px_per_m = scene.pair.model, scene.rays.px_per_m
+    return paper_labels(scene.settings, model, points.by_pixel, window, px_per_m)

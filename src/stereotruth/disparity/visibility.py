@@ -1,0 +1,169 @@
+"""What the surface shows at the centres of pixels, and whether both cameras see it.
+
+1. A pixel's centre sees the facet that is nearest to the left camera. Its disparity is linear in
+   it, or quadratic where the facet bulges: the value is the LiDAR's, never that of a match.
+2. An undecided triangle may hold any height between its lowest and highest vertex: the prism over
+   it is rasterised into both views. A pixel whose ray may meet a prism before its facet has no
+   label, from either camera. Without this, 6 to 10 % of the hidden pixels had labels at 0.25 to 4
+   points/m², with it 0.05 to 0.2 %, for 0.5 to 3 % of the visible ones.
+3. The ray to the right camera starts at the pixel's own position in the right image: each triangle
+   is tested at the pixels that it covers there, so that no grid of the right view rounds edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lidar.lattice import LATTICE_M
+from ..surface.surface import GroundSurface
+from .facet_raster import (
+    OCCLUSION_TOLERANCE_PX,
+    FacetValues,
+    PixelValues,
+    RightPixels,
+    hide_by_facets,
+    hide_by_prisms,
+    interpolate,
+    raster_facets,
+    raster_prisms,
+    right_pixels,
+)
+from .local_projection import LocalProjection
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+# A facet that turns away from the right camera is hidden. So obliquely that a pixel shrinks to this
+# width there, points and their noise do not say (forests, 6 points/m²: with 0.2 1 % more of the
+# visible pixels and 0.2 of the hidden ones had labels, with 0.4 1.3 and 0.1 fewer).
+LEAST_FACET_WIDTH = 0.3
+NO_FACET, VISIBLE, PRISM_IN_LEFT, PRISM_IN_RIGHT, FACET_IN_RIGHT = range(5)
+_CHUNK = 1 << 15  # prisms that are projected at once
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedSurface:
+    """A surface in both images: ``xy`` [4, n] of its vertices (px), in a window of the left grid
+    whose first pixel is (row, col) ``first``."""
+
+    surface: GroundSurface
+    projection: LocalProjection
+    xy: Floats
+    first: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, surface: GroundSurface, projection: LocalProjection, first: tuple[int, int]
+    ) -> ProjectedSurface:
+        """``projection`` holds all that lies in the box of the vertices."""
+        vertices = surface.vertices
+        xy = projection.at_points(vertices.lon_q, vertices.lat_q, vertices.h_q)
+        return cls(surface, projection, xy, first)
+
+    def raster_prisms(self, undecided: slice, z_buffer: Floats) -> None:
+        """Raises ``z_buffer`` [rows, cols] to the greatest disparity of some prisms in the left
+        view."""
+        for prisms in self._prisms(undecided):
+            raster_prisms(prisms, self.first, z_buffer)
+
+    def hidden_by_prisms(self, undecided: slice, pixels: RightPixels) -> Bools:
+        """Which pixels [n] some prisms may hide from the right camera."""
+        hidden = np.zeros(pixels.limit.size, np.bool_)
+        for prisms in self._prisms(undecided):
+            hide_by_prisms(prisms, pixels, hidden)
+        return hidden
+
+    def hidden_by_facets(self, pixels: RightPixels) -> Bools:
+        """Which pixels [n] lie behind a facet in the right view."""
+        return hidden_by(self.xy, self.surface.facet, pixels)
+
+    def _prisms(self, undecided: slice) -> Iterator[Floats]:
+        """Positions [4, prisms, 6] (px) of the corners of prisms at their greatest and least
+        height."""
+        vertices = self.surface.vertices
+        for start in range(undecided.start, undecided.stop, _CHUNK):
+            chunk = slice(start, min(start + _CHUNK, undecided.stop))
+            corner = self.surface.undecided[chunk]
+            heights = np.repeat(self.surface.height_range[chunk, ::-1], 3, axis=1)
+            lon, lat = (np.tile(q[corner], 2) for q in (vertices.lon_q, vertices.lat_q))
+            corners = (values.reshape(-1) for values in (lon, lat, heights))
+            yield self.projection.at_points(*corners).reshape(4, -1, 6)
+
+
+def hidden_by(xy: Floats, corner: Steps, pixels: RightPixels) -> Bools:
+    """Which pixels [n] lie behind triangles ``corner`` [m, 3] at ``xy`` [4, vertices] in the right
+    view."""
+    hidden = np.zeros(pixels.limit.size, np.bool_)
+    hide_by_facets(xy, corner, pixels, hidden)
+    return hidden
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleSurface:
+    """What the facets show at the centres of pixels; arrays [h, w].
+
+    ``visibility``: NO_FACET, VISIBLE (from both cameras), PRISM_IN_LEFT (an undecided triangle may
+    be nearer to the left camera), PRISM_IN_RIGHT (to the right one), FACET_IN_RIGHT (a facet hides
+    it from there). ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px² (of the points
+    alone), ``height`` m and ``surface_class`` (ASPRS, of the nearest vertex) of the nearest facet,
+    NaN (0) where there is none. ``bulging``: whether the surface bulges out of its facet.
+    ``projected``: all of it in both images.
+    """
+
+    visibility: NDArray[np.uint8]
+    disparity: Floats
+    slope: Floats
+    variance: Floats
+    height: Floats
+    surface_class: NDArray[np.uint8]
+    bulging: Bools
+    projected: ProjectedSurface
+
+
+def visible_surface(
+    projected: ProjectedSurface, shape: tuple[int, int], px_per_m: float
+) -> VisibleSurface:
+    """What the pixels of a window of ``shape`` see of a surface; ``px_per_m``: disparity of a metre
+    of height."""
+    surface, first = projected.surface, projected.first
+    every = slice(0, len(surface.undecided))
+    z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
+    raster_facets(projected.xy, surface.facet, first, z_buffer, index)
+    prisms = np.full(shape, -np.inf)
+    projected.raster_prisms(every, prisms)
+    visibility = np.where(index >= 0, np.uint8(VISIBLE), np.uint8(NO_FACET))
+    visibility[prisms > z_buffer + OCCLUSION_TOLERANCE_PX] = PRISM_IN_LEFT
+
+    row, col = np.nonzero(visibility == VISIBLE)
+    if row.size:
+        order, pixels = right_pixels(row, col, z_buffer[row, col], first)
+        by_facet = projected.hidden_by_facets(pixels)
+        by_prism = projected.hidden_by_prisms(every, pixels)
+        in_right = np.where(by_prism, PRISM_IN_RIGHT, VISIBLE)
+        visibility[row[order], col[order]] = np.where(by_facet, FACET_IN_RIGHT, in_right)
+
+    values = PixelValues.none(shape)
+    vertices = surface.vertices
+    classes, count = vertices.surface_class, vertices.count
+    facets = FacetValues(
+        projected.xy, surface.facet, vertices.h_q, classes, count, surface.variance, surface.bulge
+    )
+    interpolate(facets, index, first, values)
+    turned = (visibility == VISIBLE) & (1.0 - values.slope[0] < LEAST_FACET_WIDTH)
+    visibility[turned] = FACET_IN_RIGHT
+    step_px = LATTICE_M * px_per_m
+    return VisibleSurface(
+        visibility=visibility,
+        disparity=np.where(index >= 0, z_buffer + values.rise * LATTICE_M * px_per_m, np.nan),
+        slope=values.slope,
+        variance=values.variance * step_px**2,
+        height=(values.height + values.rise) * LATTICE_M,
+        surface_class=values.surface_class,
+        bulging=values.rise > 0.0,
+        projected=projected,
+    )

@@ -1,0 +1,53 @@
+"""How well a pair of a site will match, predicted from its geometry and its suns.
+
+``matched`` is the share of the pixels that both images show whose disparity semi-global matching
+finds within 1 px. Its log odds fall with the base over the height (what stands up looks different
+from its sides, and steps along the rows grow) and with the way of the shadows between the images.
+Both coefficients are fitted, and the prediction is tested on other sites, by ``bench/pairs.py``;
+the ratio of the pixel sizes, the days between the images, their season, the asymmetry and the
+obliqueness of the pair explained nothing beside them there. What the simulated sites lack, clouds,
+snow, haze and what people change, lowers the share of real pairs of dates far apart.
+
+How well heights follow from a match is geometry alone: ``SitePair.metres_per_px``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .site_pairs import SitePair
+
+# log odds of a wrong match: at no base and no way of the shadows; then by each of them
+WRONG_AT_NOTHING = -2.5
+BY_BASE = 1.9  # per base over height
+BY_SHADOW = 1.45  # per height of what casts the shadow
+UNKNOWN_SHADOW = 0.4  # of a pair of unknown dates: the median of the simulated ones
+LEAST_CONVERGENCE_DEG = 5.0  # below it heights follow badly (asp_plot: 5 to 15 for cities)
+WORTH_SAYING = 0.5  # log odds
+
+
+@dataclass(frozen=True)
+class Quality:
+    """``matched``: predicted share of right matches; ``reason``: what lowers it most."""
+
+    matched: float
+    reason: str
+
+
+def quality_of(pair: SitePair) -> Quality:
+    """The predicted quality of a pair, from what is known before it is matched."""
+    shadow = UNKNOWN_SHADOW if pair.shadow is None else pair.shadow
+    terms = {
+        f"{pair.convergence:.0f}° apart: much is hidden or seen askew": BY_BASE * pair.base,
+        f"shadows move by {shadow:.1f} of what casts them": BY_SHADOW * shadow,
+    }
+    wrong = 1.0 / (1.0 + math.exp(-WRONG_AT_NOTHING - sum(terms.values())))
+    reason, worst = max(terms.items(), key=lambda item: item[1])
+    if worst < WORTH_SAYING:
+        reason = "alike in angle and light"
+    if pair.shadow is None:
+        reason = "no date of one image: its sun is not known"
+    if pair.convergence < LEAST_CONVERGENCE_DEG:
+        reason = f"heights follow badly: 1 px is {pair.metres_per_px:.0f} m"
+    return Quality(1.0 - wrong, reason)

@@ -1,0 +1,1 @@
+"""Interpolation, robust least squares, error sums, summed areas: each once, of arrays alone."""

@@ -1,0 +1,26 @@
+"""Degrees of longitude and latitude in metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+DEGREE_M = 111_320.0
+"""A degree of longitude at the equator; of latitude, to 0.7 % anywhere. For distances that are
+judged, not measured."""
+SEMI_MAJOR_M = 6_378_137.0  # WGS 84
+ECCENTRICITY_SQUARED = 6.69437999014e-3
+
+
+def metres_per_degree(lat: ArrayLike) -> NDArray[np.float64]:
+    """Metres [2, ...] of a degree to the east and to the north at latitudes ``lat``; to 0.7 %."""
+    return DEGREE_M * np.stack([np.cos(np.radians(lat)), np.ones(np.shape(lat))])
+
+
+def exact_metres_per_degree(lat: float, height_m: float) -> NDArray[np.float64]:
+    """Metres [2] of a degree to the east and to the north at a height over WGS 84, exactly."""
+    phi = np.radians(lat)
+    w = 1.0 - ECCENTRICITY_SQUARED * np.sin(phi) ** 2
+    prime_vertical = SEMI_MAJOR_M / np.sqrt(w) + height_m
+    meridian = SEMI_MAJOR_M * (1.0 - ECCENTRICITY_SQUARED) / w**1.5 + height_m
+    return np.radians([np.cos(phi) * prime_vertical, meridian])

@@ -1,0 +1,1 @@
+"""Surface: points of LiDAR to facets and breaklines over the ground; knows no image."""

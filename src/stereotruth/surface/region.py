@@ -1,0 +1,96 @@
+"""The part of the ground whose facets are wanted.
+
+Facets follow from the points around them, so that a window has the points of a halo around all that
+it needs, and the box of these holds more. A :class:`Region` of squares says what is needed, so that
+triangles are made of the points in its halo alone, and only those that touch it are cut at
+breaklines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
+from .scale import PART_BITS
+from .vertices import Vertices
+
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+SQUARE_BITS = PART_BITS + 4  # of parts of a cell: squares of 16 cells
+
+
+@inner
+def _greatest_of_rows(values: Ints, reach: int, out: Ints) -> None:
+    """Greatest value of up to ``reach`` rows around each."""
+    rows, cols = values.shape
+    for j in range(rows):
+        for i in range(cols):
+            out[j, i] = values[j, i]
+        for b in range(max(j - reach, 0), min(j + reach + 1, rows)):
+            for i in range(cols):
+                out[j, i] = max(out[j, i], values[b, i])
+
+
+@kernel
+def greatest_around(values: Ints, reach: int) -> Ints:
+    """Greatest value of up to ``reach`` squares around each, along both axes."""
+    out, turned = np.empty_like(values), np.empty((values.shape[1], values.shape[0]), np.int64)
+    _greatest_of_rows(values, reach, out)
+    back = np.empty_like(turned)
+    for j in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            back[i, j] = out[j, i]
+    _greatest_of_rows(back, reach, turned)
+    for j in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            out[j, i] = turned[i, j]
+    return out
+
+
+@kernel
+def _touching(x: Ints, y: Ints, corner: Steps, squares: Bools) -> Bools:
+    """Which triangles' bounding boxes touch one of the ``squares``."""
+    out = np.zeros(len(corner), np.bool_)
+    for t in range(len(corner)):
+        a, b, c = corner[t]
+        west, east = min(x[a], x[b], x[c]) >> SQUARE_BITS, max(x[a], x[b], x[c]) >> SQUARE_BITS
+        south, north = min(y[a], y[b], y[c]) >> SQUARE_BITS, max(y[a], y[b], y[c]) >> SQUARE_BITS
+        for j in range(south, north + 1):
+            for i in range(west, east + 1):
+                out[t] |= squares[j, i]
+    return out
+
+
+@kernel
+def _inside(x: Ints, y: Ints, squares: Bools) -> Bools:
+    """Which vertices lie in one of the ``squares``."""
+    out = np.empty(x.size, np.bool_)
+    for k in range(x.size):
+        out[k] = squares[y[k] >> SQUARE_BITS, x[k] >> SQUARE_BITS]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """``squares`` bool [rows, cols] of the ground, from the vertices' origin, that are wanted."""
+
+    squares: Bools
+
+    def touching(self, vertices: Vertices, corner: Steps) -> Bools:
+        """Which triangles [m, 3] lie in the region at least in part."""
+        return _touching(vertices.x, vertices.y, corner, self.squares)
+
+    def near(self, vertices: Vertices, cells: int) -> Bools:
+        """Which vertices lie up to so many ``cells`` around the region."""
+        around = (cells >> (SQUARE_BITS - PART_BITS)) + 1
+        wide = greatest_around(self.squares.astype(np.int64), around) > 0
+        return _inside(vertices.x, vertices.y, wide)
+
+    def with_halo(self, vertices: Vertices, cells: int) -> Vertices:
+        """The vertices up to so many ``cells`` around the region."""
+        return vertices.taken(self.near(vertices, cells))

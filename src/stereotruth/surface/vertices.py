@@ -1,0 +1,269 @@
+"""The points of a window as vertices over the ground, at integer positions on a lattice.
+
+- a ground cell (half a pixel) has one vertex at most: the mean of its top surface; a square of even
+  ground has one (:mod:`.even_ground`). This bounds memory at any density, averages noise where
+  points are dense, and no two vertices coincide;
+- plan positions are integers (``PART`` parts of a cell) counted on the global lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import inner, kernel
+from .even_ground import CellVertices, EvenGround, SquareGrid, even_ground
+from .scale import PART_BITS, SQUARE_CELLS, SurfaceScale, height_steps
+
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
+
+_LOWEST = np.iinfo(np.int32).min
+
+
+class Vertices(NamedTuple):
+    """Vertices [n] of a window, in the order of their cells: south to north, then west to east.
+
+    ``lon_q``, ``lat_q``, ``h_q`` int64: global lattice steps; ``x``, ``y`` int64: plan position in
+    parts of a cell from the window's first cell; ``surface_class`` uint8: ASPRS class of the
+    highest point of the cell; ``count`` int32: number of points that the vertex is the mean of.
+    """
+
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+    x: Ints
+    y: Ints
+    surface_class: Bytes
+    count: Steps
+
+    def taken(self, chosen: NDArray) -> Vertices:
+        """The vertices of an index or a mask."""
+        return Vertices(*(values[chosen] for values in self))
+
+
+class _Points(NamedTuple):
+    """Points [n]: lattice coordinates, ASPRS class, number of the return in its pulse."""
+
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+    surface_class: Bytes
+    return_number: Bytes
+
+
+class _CellTops(NamedTuple):
+    """Greatest height of each cell [rows, cols] and its class; ``first`` cell of the window and
+    size of a ``cell`` (lon, lat, lattice steps)."""
+
+    height: Steps
+    surface_class: Bytes
+    first: tuple[int, int]
+    cell: tuple[int, int]
+
+
+@inner
+def _whole(number: int, inverse: float) -> int:
+    """``number`` // d, ``inverse`` = 1 / d; a division takes ten times as long.
+
+    Exact from 0 to 2**50: there all roundings together are less than half a step.
+    """
+    return np.int64((number + 0.5) * inverse)
+
+
+@kernel
+def _raise_tops(points: _Points, tops: _CellTops, index: Steps, position: Steps) -> int:
+    """Raise the greatest height of each cell by first returns; of equals the greater class stays.
+
+    Fills ``index`` (cell) and ``position`` [n, 3] (steps from the cell's corner, height); returns
+    how many points are first returns.
+    """
+    lon_q, lat_q, h_q = points.lon_q, points.lat_q, points.h_q
+    classes, returns = points.surface_class, points.return_number
+    top, top_class, first, cell = tops.height, tops.surface_class, tops.first, tops.cell
+    n = 0
+    cols = top.shape[1]
+    west, south = first[0] * cell[0], first[1] * cell[1]
+    wide, tall = 1.0 / cell[0], 1.0 / cell[1]
+    for k in range(lon_q.size):
+        if returns[k] > 1:
+            continue
+        east, north = lon_q[k] - west, lat_q[k] - south
+        i, j = _whole(east, wide), _whole(north, tall)
+        index[n] = j * cols + i
+        position[n, 0] = east - i * cell[0]
+        position[n, 1] = north - j * cell[1]
+        position[n, 2] = h = np.int32(h_q[k])
+        n += 1
+        if h > top[j, i]:
+            top[j, i] = h
+            top_class[j, i] = classes[k]
+        elif h == top[j, i]:
+            top_class[j, i] = max(top_class[j, i], classes[k])
+    return n
+
+
+@kernel
+def _numbered(top: Steps, number: Steps) -> int:
+    """Numbers the cells with points in their order, -1 for others; returns how many there are."""
+    n = 0
+    for k in range(top.size):
+        number[k] = -1
+        if top[k] > _LOWEST:
+            number[k] = n
+            n += 1
+    return n
+
+
+@kernel
+def _sum_tops(
+    index: Steps, position: Steps, top: Steps, number: Steps, tolerance: int, sums: Steps
+) -> None:
+    """Per vertex, of the points at most ``tolerance`` below the cell's top: count, sums of
+    positions and of depths, to ``sums`` [n, 4]."""
+    for k in range(index.size):
+        depth = top[index[k]] - position[k, 2]
+        if depth <= tolerance:
+            n = number[index[k]]
+            sums[n, 0] += 1
+            sums[n, 1] += position[k, 0]
+            sums[n, 2] += position[k, 1]
+            sums[n, 3] += depth
+
+
+@kernel
+def _means(
+    number: Steps, tops: _CellTops, sums: Steps, grid: SquareGrid, out: CellVertices
+) -> None:
+    """Position, height, class and square of each vertex, to ``out``; the sums of positions become
+    means."""
+    x, y, h, classes, square = out.x, out.y, out.h, out.surface_class, out.square
+    top, top_class, cell, before = tops.height, tops.surface_class, tops.cell, grid.before
+    rows, cols = top.shape
+    wide, tall = 1.0 / cell[0], 1.0 / cell[1]
+    for j in range(rows):
+        for i in range(cols):
+            k = number[j, i]
+            if k < 0:
+                continue
+            n, h[k] = sums[k, 0], top[j, i]
+            if n > 1:
+                sums[k, 1], sums[k, 2] = sums[k, 1] // n, sums[k, 2] // n
+                h[k] = (n * np.int64(top[j, i]) - sums[k, 3]) // n
+            x[k] = (i << PART_BITS) + _whole(sums[k, 1] << PART_BITS, wide)
+            y[k] = (j << PART_BITS) + _whole(sums[k, 2] << PART_BITS, tall)
+            classes[k] = top_class[j, i]
+            row, col = (j + before[1]) // SQUARE_CELLS, (i + before[0]) // SQUARE_CELLS
+            square[k] = row * grid.shape[1] + col
+
+
+@kernel
+def _thinned(
+    number: Steps,
+    sums: Steps,
+    cells: CellVertices,
+    tops: _CellTops,
+    grid: SquareGrid,
+    even: EvenGround,
+    points: Steps,
+    out: Vertices,
+) -> int:
+    """Vertices in the order of their cells, one in the middle of each even square, to ``out``.
+
+    ``sums``: counts and mean positions; ``points``: number of points of each square. Returns the
+    number of vertices.
+    """
+    first, cell, before = tops.first, tops.cell, grid.before
+    x, y, h, classes = cells.x, cells.y, cells.h, cells.surface_class
+    is_even, height, one = even.is_even, even.height, even.one
+    rows, cols = number.shape
+    squares = grid.shape[1]
+    m = 0
+    for j in range(rows):
+        row, down = divmod(j + before[1], SQUARE_CELLS)
+        for p in range(squares):
+            s = row * squares + p
+            west = p * SQUARE_CELLS - before[0]  # the square's first cell
+            if is_even[s]:
+                i = west + SQUARE_CELLS // 2
+                if down != SQUARE_CELLS // 2:
+                    continue
+                # the middle lies at a corner of cells
+                out.lon_q[m], out.lat_q[m] = (i + first[0]) * cell[0], (j + first[1]) * cell[1]
+                out.h_q[m] = height[s]
+                out.x[m], out.y[m] = i << PART_BITS, j << PART_BITS
+                out.surface_class[m], out.count[m] = classes[one[s]], points[s]
+                m += 1
+                continue
+            for i in range(max(west, 0), min(west + SQUARE_CELLS, cols)):
+                k = number[j, i]
+                if k < 0:
+                    continue
+                out.lon_q[m] = (i + first[0]) * cell[0] + sums[k, 1]
+                out.lat_q[m] = (j + first[1]) * cell[1] + sums[k, 2]
+                out.h_q[m], out.x[m], out.y[m] = h[k], x[k], y[k]
+                out.surface_class[m], out.count[m] = classes[k], sums[k, 0]
+                m += 1
+    return m
+
+
+@dataclass(eq=False)
+class VertexBuilder:
+    """Takes points, block by block, into the vertices of a box of the ground.
+
+    ``low``, ``high``: corners (lattice lon, lat), both included; no point lies beyond.
+    """
+
+    scale: SurfaceScale
+    low: tuple[int, int]
+    high: tuple[int, int]
+    blocks: list[tuple[Steps, Steps]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        cell = self.scale.cell
+        first = tuple(int(q // side) for q, side in zip(self.low, cell))
+        last = [q // side for q, side in zip(self.high, cell)]
+        shape = last[1] - first[1] + 1, last[0] - first[0] + 1
+        height = np.full(shape, _LOWEST, dtype=np.int32)
+        self.tops = _CellTops(height, np.zeros(shape, dtype=np.uint8), first, tuple(cell))
+
+    def add(
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: Bytes, return_number: Bytes
+    ) -> None:
+        """Points by lattice coordinates and class; later returns of a pulse lie below what the
+        cameras see."""
+        index, position = np.empty(lon_q.size, np.int32), np.empty((lon_q.size, 3), np.int32)
+        points = _Points(lon_q, lat_q, h_q, surface_class, return_number)
+        kept = _raise_tops(points, self.tops, index, position)
+        self.blocks.append((index[:kept], position[:kept]))
+
+    def built(self) -> Vertices:
+        """The vertices of all points, one for each square of even ground."""
+        top = self.tops.height
+        number = np.empty(top.shape, np.int32)
+        n = _numbered(top.reshape(-1), number.reshape(-1))
+        sums = np.zeros((n, 4), np.int32)
+        tolerance = int(height_steps(self.scale.top_m))
+        for index, position in self.blocks:
+            _sum_tops(index, position, top.reshape(-1), number.reshape(-1), tolerance, sums)
+        self.blocks = []
+        grid = SquareGrid.around(self.tops.first, top.shape)
+        cells = CellVertices(
+            *(np.empty(n, np.int32) for _ in range(3)), np.empty(n, np.uint8), np.empty(n, np.int32)
+        )
+        _means(number, self.tops, sums, grid, cells)
+        even = even_ground(cells, grid, height_steps(self.scale.even_m))
+        points = np.zeros(even.is_even.size, np.int32)
+        np.add.at(points, cells.square, sums[:, 0])
+        size = n - int(even.is_even[cells.square].sum()) + int(even.is_even.sum())
+        out = Vertices(
+            *(np.empty(size, np.int64) for _ in range(5)),
+            np.empty(size, np.uint8),
+            np.empty(size, np.int32),
+        )
+        _thinned(number, sums, cells, self.tops, grid, even, points, out)
+        return out

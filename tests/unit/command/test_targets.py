@@ -1,0 +1,46 @@
+"""What a run can make, and typos of it."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from stereotruth.command.targets import TARGETS, list_targets, refuse_unknown, rules
+from stereotruth.configuration import Configuration
+from stereotruth.errors import InputError
+
+
+def test_targets_are_listed_with_the_names_of_the_project(folder):
+    lines = list_targets()
+    assert [line.split()[0] for line in lines[: len(TARGETS)]] == list(TARGETS)
+    assert "<City>: Good" in lines and "<scene>: Good-1" in lines
+
+
+def test_each_plain_target_is_a_rule():
+    plain = {target for target in TARGETS if re.fullmatch(r"\w+", target)}
+    assert plain <= set(rules())
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("reprot", "report"), ("tiles/Goood", "tiles/Good"), ("datasets", "dataset")],
+)
+def test_a_typo_is_told_with_what_it_may_mean(folder, word, meant):
+    with pytest.raises(InputError, match=f"{word}: no such target.*did you mean {meant}"):
+        refuse_unknown([word, "--cores", "2"])
+
+
+def test_what_snakemake_knows_is_left_to_it(folder):
+    refuse_unknown(["report", "tiles/Good", "results/x.json", "--forcerun", "anything"])
+
+
+def test_built_in_datasets_are_there_unless_others_are_named():
+    def named(datasets):
+        settings = Configuration.of({"benchmark": {"datasets": datasets}})
+        return [name for name, entry in settings.benchmark.datasets.items() if entry]
+
+    mine = {"root": "d", "layout": "whu", "disparity_range": [-64, 64]}
+    assert named({}) == ["synthetic"]
+    assert named({"mine": mine}) == ["mine"]
+    assert sorted(named({"mine": mine, "synthetic": {}})) == ["mine", "synthetic"]

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from stereotruth.epipolar.pair_quality import quality_of
+from stereotruth.epipolar.site_pairs import SitePair
+
+GOOD = SitePair(
+    "A", "B", 1.0, 1.0, convergence=12.0, bisector=85.0, asymmetry=3.0, off_nadir=12.0,
+    pixel_ratio=1.0, pixel_m=0.5, sun=0.1, shadow=0.0, days=0.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"convergence": 40.0}, "much is hidden"),
+        ({"shadow": 1.2}, "shadows move by 1.2"),
+    ],
+)
+def test_what_parts_two_images_lowers_the_prediction_and_is_named(change, words):
+    worse = quality_of(replace(GOOD, **change))
+    assert worse.matched < quality_of(GOOD).matched - 0.05
+    assert words in worse.reason
+
+
+def test_the_reason_of_a_good_pair_and_of_flat_ones():
+    assert quality_of(GOOD).reason.startswith(("alike", "12°"))
+    flat = quality_of(replace(GOOD, convergence=2.0))
+    assert flat.reason == "heights follow badly: 1 px is 14 m"
+    assert "sun is not known" in quality_of(replace(GOOD, shadow=None, sun=None)).reason

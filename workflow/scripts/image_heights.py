@@ -1,0 +1,25 @@
+"""Heights, positions and classes of what an original image shows."""
+
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.disparity.image_heights import open_inputs, write_image_heights
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.provenance import checksums, describe
+
+if __name__ == "__main__":
+    image, view = snakemake.wildcards.image, snakemake.params.view
+    with (
+        job(snakemake.log[0], f"heights {image}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        alignment = Alignment.load(snakemake.input.alignment)
+        fit = getattr(alignment, f"{view}_fit")
+        inputs = open_inputs(getattr(alignment, view), fit.size, snakemake.input.points, fit)
+        made_of = inputs.made_of | checksums([snakemake.input.alignment])
+        write_image_heights(
+            inputs,
+            snakemake.output.heights,
+            image=image,
+            workers=snakemake.threads,
+            provenance=describe(made_of, {"view": view}, snakemake.params.code),
+        )
