@@ -1,26 +1,10 @@
 """Heights in the geometry of original images, of those that scenes name."""
 
 
-def named_by(image):
-    """(scene, view) that an image's correction is taken of: the first scene by name."""
-    for scene, names in sorted(IMAGE_NAMES.items()):
-        if image in names:
-            return SCENES[scene], ("left", "right")[names.index(image)]
-    raise WorkflowError(
-        f"{SETTINGS.scenes}: no scene names image {image!r}, so that it has no correction. "
-        "Remedy: stereotruth pairs CITY writes rows of pairs"
-    )
-
-
-def of_named_by(wildcards, file):
-    scene, _ = named_by(wildcards.image)
-    return file(SimpleNamespace(city=scene.city, scene=scene.scene))
-
-
 rule image_heights:
     input:
-        alignment=lambda w: of_named_by(w, alignment_of),
-        points=lambda w: of_named_by(w, point_stores),
+        alignment=lambda w: by_scene_of_image(w, alignment_of),
+        points=lambda w: by_scene_of_image(w, point_stores),
     output:
         heights=directory("results/heights/{city}/{image}.zarr"),
     log:
@@ -37,7 +21,7 @@ rule image_heights:
         runtime=240,
     params:
         script=content_of("../scripts/image_heights.py"),
-        view=lambda w: named_by(w.image)[1],
+        view=lambda w: scene_of_image(w.image)[1],
         code=source_digest("disparity.image_heights"),
     message:
         "Heights of what image {wildcards.image} shows"

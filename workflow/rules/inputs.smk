@@ -75,6 +75,23 @@ def point_stores(wildcards):
     ]
 
 
+def scene_of_image(image):
+    """(scene, view) that an image's correction is taken of: the first scene by name."""
+    for scene, names in sorted(IMAGE_NAMES.items()):
+        if image in names:
+            return SCENES[scene], ("left", "right")[names.index(image)]
+    raise WorkflowError(
+        f"{SETTINGS.scenes}: no scene names image {image!r}, so that it has no correction. "
+        "Remedy: stereotruth pairs CITY writes rows of pairs"
+    )
+
+
+def by_scene_of_image(wildcards, file):
+    """What an input function gives for the scene that an image's correction is taken of."""
+    scene, _ = scene_of_image(wildcards.image)
+    return file(SimpleNamespace(city=scene.city, scene=scene.scene))
+
+
 def cities_of_report():
     """All of a configuration that somebody named; of the examples, those that have tiles.
 
