@@ -26,6 +26,7 @@ REACH = {
     "refine": {"alignment", "epipolar", "lidar", "products"},
     "adjust": {"alignment", "epipolar", "lidar", "products"},
     "adjusted_alignment": {"alignment", "epipolar", "lidar", "products"},
+    "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
     "project": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},

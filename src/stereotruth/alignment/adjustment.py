@@ -67,6 +67,10 @@ class Equations:
         """Those that are ``chosen`` [n]."""
         return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
+    def about(self, parameters: Floats) -> Equations:
+        """The same of parameters that are counted from given ones [12]."""
+        return replace(self, observed=self.observed - self.design @ parameters)
+
 
 @dataclass(frozen=True, eq=False)
 class PairEquations:

@@ -14,7 +14,7 @@ depend on the order of images or pairs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -183,8 +183,7 @@ class _Pair:
             prior[own, own] = rpc_prior(images[name].start)
         equations = ties.equations
         # Blunders are looked for where the tie points were matched.
-        about = equations.observed - equations.design @ ties.linearised_at
-        found = estimate(replace(equations, observed=about), prior, ties.common_px)
+        found = estimate(equations.about(ties.linearised_at), prior, ties.common_px)
         sums = Sums.of(equations.design, equations.observed, found.information)
         index = np.concatenate([_six(names.index(name)) for name in (pair.left, pair.right)])
         return cls(pair.scene, index, equations, found, sums, sums.spread(found.shared))

@@ -18,6 +18,8 @@ TARGETS = {
     "report": "the pages of all cities; results/report/<City>/index.html that of one",
     "evaluate": "figures from the images, and against the exact truth of synthetic cities",
     "results/project/<City>/<scene>.zarr": "disparity, status and uncertainty of a whole scene",
+    "results/adjust/<City>.json": "corrections and residuals of images that pairs share",
+    "closure": "what the labels of three pairs of images say of each other",
     "results/predict/<City>/<scene>_<method>_dsm.tif": "surface model of a scene by a method",
     "score_dsm/<City>/<scene>/<method>": "that surface model, held against the LiDAR",
     "benchmark": "the methods that each dataset names, scored and compared",

@@ -1,0 +1,116 @@
+"""Closure of triplets on exact labels of a hill that three cameras see."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from stereotruth.epipolar.fit import fit_epipolar
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.errors import InputError
+from stereotruth.evaluation.closure import (
+    PairFiles,
+    closure,
+    closure_of_labels,
+    figures,
+    triplets_of,
+)
+from stereotruth.products.grids import Layer, atomic_store, create_grid
+
+from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
+
+SIZE = (300, 280)
+CAMERAS = {
+    "A": camera(BACKWARD, angle=90.0, size=SIZE),
+    "B": camera((-0.05, -0.25), angle=91.0, gsd=0.75, size=SIZE),
+    "C": camera(FORWARD, angle=92.0, gsd=0.8, size=SIZE),
+}
+SIGMA = 0.05
+META = {"units": "px", "long_name": "test"}
+
+
+def hill(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    """Heights (m) of smooth ground."""
+    east, north = (lon - LON) * METRES[0], (lat - LAT) * METRES[1]
+    return HEIGHT + 6.0 * np.sin(east / 35.0) * np.cos(north / 40.0)
+
+
+def labels(model: EpipolarModel) -> np.ndarray:
+    """Exact disparities of the hill."""
+    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
+    col, row = model.epipolar_to_left(x, y)
+    height = np.full(col.shape, HEIGHT)
+    for _ in range(25):
+        lon, lat = model.left.localize(col, row, height)
+        height = hill(lon, lat)
+    return x - model.right_to_epipolar(*model.right.project(lon, lat, height))[0]
+
+
+def pair(folder: Path, left: str, right: str, shift: float = 0.0) -> PairFiles:
+    """A pair with labels that are off by ``shift`` px."""
+    model = fit_epipolar(
+        CAMERAS[left], CAMERAS[right], SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 20, HEIGHT + 20)
+    )
+    path = folder / f"{left}-{right}.zarr"
+    layers = {name: Layer("float32", np.nan, META) for name in ("disparity", "uncertainty")}
+    attrs = {"epipolar": model.to_dict()}
+    with atomic_store(path) as scratch:
+        arrays = create_grid(scratch, model.shape, layers, chunk=64, shard=128, attrs=attrs)
+        arrays["disparity"][:] = labels(model) + shift
+        arrays["uncertainty"][:] = SIGMA
+    return PairFiles(f"{left}-{right}", left, right, path, folder, folder)
+
+
+def triplet_of(folder: Path, shift: float = 0.0):
+    """The triplet, the labels of B-C being off."""
+    pairs = [pair(folder, "A", "B"), pair(folder, "B", "C", shift), pair(folder, "A", "C")]
+    (found,) = triplets_of(pairs[::-1])
+    assert found.images == ("A", "B", "C")
+    return found
+
+
+def test_exact_labels_close(tmp_path):
+    closures, sigma = closure_of_labels(triplet_of(tmp_path))
+    assert len(closures) > 20_000
+    assert np.sqrt(np.mean(closures**2)) < 0.003
+    # more than of A-C alone; less than as if both others counted twice
+    assert np.all((sigma > SIGMA * 1.2) & (sigma < SIGMA * 2.5))
+
+
+def test_an_error_of_one_pair_is_the_closure(tmp_path):
+    closures, _ = closure_of_labels(triplet_of(tmp_path, 0.4))
+    scale = 0.8 / 0.75  # the grids' pixels differ by no more than the images'
+    assert 0.4 / scale**2 < np.median(np.abs(closures)) < 0.4 * scale**2
+    assert np.ptp(np.percentile(closures, (2, 98))) < 0.02
+
+
+def test_labels_beside_a_height_step_are_not_compared(tmp_path):
+    """Between two labels of different surfaces there is no label."""
+    triplet = triplet_of(tmp_path)
+    whole = len(closure_of_labels(triplet)[0])
+    array = zarr.open_group(triplet.bc.disparity, mode="r+")["disparity"]
+    values = array[:]
+    values[:, ::4] += 3.0
+    array[:] = values
+    closures, _ = closure_of_labels(triplet)
+    assert len(closures) < 0.6 * whole
+    assert np.median(np.abs(closures)) < 0.003
+
+
+def test_figures_tell_the_shares_within_the_stated_uncertainty():
+    rng = np.random.default_rng(1)
+    found = figures(rng.normal(0, 0.02, 20_000), np.full(20_000, 0.02))
+    assert found["rms"] == pytest.approx(0.02, rel=0.02)
+    assert found["within_1_sigma"] == pytest.approx(0.683, abs=0.01)
+    assert found["within_2_sigma"] == pytest.approx(0.954, abs=0.01)
+    assert figures(np.zeros(0), np.zeros(0)) == {"count": 0}
+
+
+def test_pairs_without_a_triplet_are_refused_by_the_remedy():
+    nowhere = Path("nowhere")
+    pairs = [PairFiles(f"{a}-{b}", a, b, nowhere, nowhere, nowhere) for a, b in ("AB", "BC")]
+    with pytest.raises(InputError, match="A-B, B-C and A-C"):
+        closure("Town", pairs)

@@ -1,0 +1,29 @@
+"""What the labels of three pairs of a site's images say of each other."""
+
+from pathlib import Path
+
+from stereotruth.evaluation.closure import PairFiles, closure, write_closure
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.grids import require_complete
+from stereotruth.products.provenance import describe, digest, file_sha256
+
+if __name__ == "__main__":
+    city, given = snakemake.wildcards.city, snakemake.input
+    with (
+        job(snakemake.log[0], f"closure {city}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        pairs, inputs = [], {}
+        files = zip(given.disparity, given.alignments, given.equations)
+        for (scene, images), paths in zip(snakemake.params.pairs.items(), files):
+            pair = PairFiles(scene, *images, *map(Path, paths))
+            record = require_complete(pair.disparity).attrs.get("provenance", {})
+            inputs |= {
+                f"{scene}.zarr": digest(record),
+                f"{scene}/alignment.json": file_sha256(pair.alignment),
+                f"{scene}/equations.json": file_sha256(pair.equations),
+            }
+            pairs.append(pair)
+        values = closure(city, pairs, describe(inputs, {}, snakemake.params.code))
+        write_closure(values, snakemake.output[0])
