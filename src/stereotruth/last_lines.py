@@ -72,6 +72,31 @@ def _against_truth(product: str, of: str) -> Iterator[str]:
         )
 
 
+def _adjusted(product: str, city: str) -> Iterator[str]:
+    images = _read(product)["images"]
+    hurting = {name: image["doubts"] for name, image in images.items() if image["doubts"]}
+    sigma = [image["sigma"] for image in images.values() if not image["refused"]]
+    known = f"known to {max(sigma):.3f} px at worst" if sigma else "none of them placed"
+    yield (
+        f"{city}: {len(images)} images adjusted together, {known}"
+        + ("" if hurting else "; none is doubtful")
+    )
+    for name, doubts in hurting.items():
+        yield f"{city}: image {name}: {'; '.join(doubts)}"
+    yield f"Look at {product}"
+
+
+def _closure(product: str, city: str) -> Iterator[str]:
+    values = _read(product)
+    labels = values["site"]["labels"]
+    if labels["count"]:
+        yield (
+            f"{city}: {len(values['triplets'])} triplets of images, whose labels close to "
+            f"{labels['rms']:.3f} px rms, {100 * labels['within_1_sigma']:.0f} % within 1 and "
+            f"{100 * labels['within_2_sigma']:.0f} % within 2 σ; look at {product}"
+        )
+
+
 def _look(product: str, *_: str) -> Iterator[str]:
     yield f"Look at {product}"
 
@@ -102,7 +127,9 @@ def _surface_model(product: str, scene: str, method: str) -> Iterator[str]:
 
 
 SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
+    r"results/adjust/([^/]+)\.json": _adjusted,
     r"tiles/([^/]+)": _tiles,
+    r"results/closure/([^/]+)\.json": _closure,
     r"results/evaluate/(?:[^/]+/)?([^/]+)/truth\.json": _against_truth,
     r"results/evaluate/([^/]+)/table4\.csv": _look,
     r"results/report/([^/]+)/index\.html": _look,

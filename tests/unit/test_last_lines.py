@@ -31,6 +31,18 @@ FILES = {
     "results/export/A/summary.json": {"lines": ["A: 16 pairs", "Look at tiles/A"]},
     "results/evaluate/A/truth.json": truth([0.01] * 98 + [-0.02, -1.1]),
     "results/evaluate/A/A-1/truth.json": truth([]),
+    "results/adjust/A.json": {
+        "images": {
+            "one": {"doubts": [], "refused": "", "sigma": 0.0312},
+            "two": {"doubts": ["clouds", "x"], "refused": "", "sigma": 0.02},
+        }
+    },
+    "results/closure/A.json": {
+        "triplets": [{}, {}],
+        "site": {
+            "labels": {"count": 3, "rms": 0.0071, "within_1_sigma": 0.7, "within_2_sigma": 0.95}
+        },
+    },
     "results/train/own/net/training.json": {"best": {"val_epe_px": 1.25, "val_d1": 0.5}},
     "benchmark/own/sgm/scores.json": SCORES,
     "audit/own/summary.json": {"statements": ["4 pairs: 3 good.", "Labels fit."]},
@@ -75,6 +87,16 @@ def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
         "Labels fit.",
         "Look at audit/own/index.html",
         "Look at results/predict/A/A-1/sgm_dsm.tif",
+    ]
+
+
+def test_images_adjusted_together_and_closed_triplets_are_told():
+    assert last_lines(["results/closure/A.json", "results/adjust/A.json"]) == [
+        "A: 2 images adjusted together, known to 0.031 px at worst",
+        "A: image two: clouds; x",
+        "Look at results/adjust/A.json",
+        "A: 2 triplets of images, whose labels close to 0.007 px rms, 70 % within 1 and 95 % "
+        "within 2 σ; look at results/closure/A.json",
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.project import (
     FILES,
+    adjusted_scenes,
+    check_fixed,
     configured,
     read_mapping,
     read_scenes,
@@ -137,3 +140,52 @@ def test_a_lidar_file_is_read_once_for_the_scenes_that_take_it_alike():
     assert found["A-1"] == [("A-2", "one"), ("A-1", "three")]
     for name in ("A-3", "A-4", "B-1"):
         assert found[name] == [(name, "one"), (name, "two")]
+
+
+def scenes_of_town(*pairs: str) -> dict[str, Scene]:
+    """Scenes of one city by their images' letters."""
+    return {
+        pair: Scene(pair, "Town", f"{pair[0]}.tif", f"{pair[1]}.tif", "lidar", "", "", "")
+        for pair in pairs
+    }
+
+
+def test_scenes_that_share_an_image_are_adjusted_together():
+    scenes = scenes_of_town("AB", "BC", "DE")
+    scenes["FB"] = replace(scenes_of_town("FB")["FB"], city="Other")
+    nameless = dict.fromkeys(scenes, ("", ""))
+    found = adjusted_scenes(Configuration(), scenes, nameless)
+    assert found == {"AB": ("A.tif", "B.tif"), "BC": ("B.tif", "C.tif")}
+    named = nameless | {"AB": ("one", "two"), "BC": ("two", "")}
+    found = adjusted_scenes(Configuration(), scenes, named)
+    assert found == {"AB": ("one", "two"), "BC": ("two", "C.tif")}
+
+
+def test_fixed_alignments_and_images_decide_what_is_adjusted():
+    scenes = scenes_of_town("AB", "BC", "DE")
+    names = {pair: (pair[0], pair[1]) for pair in scenes}
+
+    def adjusted(**alignment) -> set[str]:
+        return set(adjusted_scenes(Configuration.of({"alignment": alignment}), scenes, names))
+
+    assert adjusted() == {"AB", "BC"}
+    assert adjusted(fixed={"AB": "a.json"}) == set()
+    assert adjusted(fixed={"D": "site.json"}) == {"AB", "BC", "DE"}
+    assert adjusted(refine=False) == set()
+
+
+def test_what_is_fixed_is_a_scene_or_an_image_with_a_file(tmp_path):
+    file = tmp_path / "kept.json"
+    file.write_text("{}")
+    scenes = scenes_of_town("AB")
+
+    def check(name: str, path: str) -> None:
+        settings = Configuration.of({"alignment": {"fixed": {name: path}}})
+        check_fixed(settings, scenes, {"A": None})
+
+    check("A", str(file))
+    check("AB", str(file))
+    with pytest.raises(InputError, match="no such scene or image"):
+        check("Z", str(file))
+    with pytest.raises(InputError, match="no such file"):
+        check("A", "nowhere.json")

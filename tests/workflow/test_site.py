@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,25 @@ def test_the_tiles_of_both_pairs_are_made_and_each_lidar_file_is_read_once(site)
 @pytest.mark.slow
 def test_heights_are_the_truth_and_their_uncertainty_explains_their_errors(site):
     check_heights(site)
+
+
+@pytest.mark.slow
+def test_an_image_has_one_correction_in_both_of_its_pairs(site):
+    check_corrections(site)
+
+
+def check_corrections(site: Path) -> None:
+    adjusted = json.loads((site / "results/adjust/Stack.json").read_text())["images"]
+    assert len(adjusted) == 3 and not any(image["doubts"] for image in adjusted.values())
+    affines: dict[str, list] = {}
+    for pair in (site / "results/adjust/Stack").iterdir():
+        alignment = json.loads((pair / "alignment.json").read_text())
+        for view in ("left", "right"):
+            name = Path(alignment[view]["image"]).stem
+            affines.setdefault(name, []).append(alignment[view]["affine"])
+    assert sorted(map(len, affines.values())) == [1, 1, 2]
+    for name, found in affines.items():
+        assert all(affine == adjusted[name]["affine"] for affine in found)
 
 
 def check_tiles(site: Path) -> None:
