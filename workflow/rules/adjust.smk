@@ -33,7 +33,7 @@ rule adjust:
 
 rule adjusted_alignment:
     input:
-        site="results/adjust/{city}.json",
+        site=adjustment_of,
         alignment="results/refine/{city}/{scene}/alignment.json",
         equations="results/refine/{city}/{scene}/equations.json",
     output:

@@ -115,6 +115,14 @@ def point_stores(wildcards):
     ]
 
 
+def adjustment_of(wildcards):
+    """The adjustment that a scene's images have their corrections of: the fixed one of both."""
+    fixed = {SETTINGS.alignment.fixed.get(image) for image in ADJUSTED[wildcards.scene]}
+    if len(fixed) == 1 and None not in fixed:
+        return given(fixed.pop())
+    return f"results/adjust/{wildcards.city}.json"
+
+
 def scene_of_image(image):
     """(scene, view) that an image's correction is taken of: the first scene by name."""
     for scene, names in sorted(IMAGE_NAMES.items()):

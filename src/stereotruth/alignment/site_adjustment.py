@@ -350,6 +350,7 @@ def _doubts(
 def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
     """alignment.json of a pair by its images' adjusted corrections, JSON-ready.
 
+    ``site``: what :func:`adjust_site` found, or an earlier one that has both images.
     Of a pair whose image is refused it has the sentence ``refused`` alone, which
     :meth:`.Alignment.load` raises.
     """
@@ -419,18 +420,12 @@ def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any
 
 def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
     """The record of the refinement: the pair's tie points before and after the adjustment."""
-    pair = site["pairs"][scene.scene]
-    record = {
-        "applied": True,
-        "reason": "",
-        "adjusted_with": [name for name in site["images"] if name not in scene.names],
-        "tie_points": pair["tie_points"],
-        "used": pair["used"],
-    }
+    record = {"applied": True, "reason": ""}
     ties, reason = read_equations(scene.equations)
     if ties is None:
-        return record | {"without_own_tie_points": reason}
+        return record | {"tie_points": 0, "without_own_tie_points": reason}
     equations = ties.equations
+    used = site["pairs"].get(scene.scene, {}).get("used")  # none of a pair that came later
     images = [np.array(site["images"][name]["parameters"]) for name in scene.names]
     size = tuple(site["images"][scene.left]["size"])
     spreads = {}
@@ -441,6 +436,8 @@ def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
             for k, name in enumerate(("disparity", "y_parallax"))
         }
     return record | {
+        "tie_points": len(equations.own),
+        "used": used,
         "sites": int(np.unique(equations.site).size),
         **spreads,
         "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
