@@ -302,8 +302,9 @@ def main() -> None:
     logging.basicConfig(level=logging.CRITICAL)
     rows = []
     for k in range(options.sites):
-        rows += of_site(2 * k + 1, options)
-        print(f"site {2 * k + 1} done", flush=True)
+        for row in of_site(2 * k + 1, options):
+            print(row, flush=True)
+            rows.append(row)
     joint = [row for row in rows if "joint" in row]
     columns = ["site", "case", "best pair", "usual pair", "joint", "joint / best", "stated σ",
                "labels: pairs", "labels: joint", "images doubted"]  # fmt: skip

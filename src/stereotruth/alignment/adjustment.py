@@ -159,6 +159,8 @@ def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s:
     """Standard deviation that the places of a site share, from the scatter of the sites' means."""
     total = np.bincount(sites, weights)
     full = total > 1.0
+    if not full.any():  # each stands by itself
+        return 0.0
     mean = np.bincount(sites, weights * residuals)[full] / total[full]
     own = s**2 * np.bincount(sites, weights**2)[full] / total[full] ** 2
     return float(np.sqrt(max(robust_sigma(mean, LEAST_SIGMA) ** 2 - np.median(own), 0.0)))

@@ -55,3 +55,14 @@ def test_uncertainty_of_the_estimate_is_honest(of_class):
     assert np.median(chances) < 2.0
     # Of the weighted mean: the best fifth has about half of the weight.
     assert np.sqrt(np.mean(np.square(shared))) == pytest.approx(0.6 * of_class, abs=0.003)
+
+
+def test_observations_of_which_no_two_agree_are_blunders():
+    """As of an image that shows other ground, each in a site of its own."""
+    rng = np.random.default_rng(8)
+    design, _, where = system(rng, 24)
+    observed = rng.uniform(-6, 6, (24, 2))
+    alone = np.arange(24)
+    found = estimate(Equations(design, observed, np.full(24, 0.01), alone, where), np.eye(12))
+    assert np.isfinite(found.covariance).all()
+    assert (found.weights > 0.0).mean() < 0.5
