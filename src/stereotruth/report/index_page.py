@@ -105,7 +105,7 @@ def _city(root: Path, out: Path, page: Path) -> dict[str, Any]:
         facts.append(f"{100 * labelled:.1f} % of their pixels labelled")
     sift = [of["sift_mean_absolute_error_px"] for of in scenes]
     if any(value is not None for value in sift):
-        facts.append(f"SIFT matches less labels: {spread(sift, '.2f')} px mean absolute")
+        facts.append(f"SIFT disparity minus label: {spread(sift, '.2f')} px mean absolute")
     truth = _read(root / "results" / "evaluate" / name / "truth.json")
     truth = truth["exported_tiles"]["errors"] if truth else {}
     if truth.get("count"):
