@@ -17,6 +17,7 @@ from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
 from ..products.pictures import encode_file
+from .timeline import last_run, read_jobs, timeline
 
 PAGES = (
     "results/report/*/index.html",
@@ -55,6 +56,7 @@ def _write(root: Path, out: Path) -> None:
         "benchmarks": _benchmarks(root, out),
         "audits": _audits(root, out),
         "surface_models": _surface_models(root, out),
+        "timeline": timeline(last_run(read_jobs(root))),
         "links": [
             (name, str(way(out, root / name)), text)
             for name, text in (
