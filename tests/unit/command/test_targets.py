@@ -24,7 +24,13 @@ def test_each_plain_target_is_a_rule():
 
 @pytest.mark.parametrize(
     ("word", "meant"),
-    [("reprot", "report"), ("tiles/Goood", "tiles/Good"), ("datasets", "dataset")],
+    [
+        ("reprot", "report"),
+        ("tiles/Goood", "tiles/Good"),
+        ("datasets", "dataset"),
+        ("results/report/Goood/index.html", "results/report/Good/index.html"),
+        ("benchmark/syntetic/sgm", "benchmark/synthetic/sgm"),
+    ],
 )
 def test_a_typo_is_told_with_what_it_may_mean(folder, word, meant):
     with pytest.raises(InputError, match=f"{word}: no such target.*did you mean {meant}"):
