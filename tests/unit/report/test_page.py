@@ -338,12 +338,16 @@ return (async () => {
     }
     return [covered / (view.width * view.height), sum];
   };
-  await frame();
-  const found = { shown: !view.closest(".relief").hidden, first: seen() };
+  const after = async (last) => {  // the picture that is another one than the last
+    let now = seen();
+    for (let wait = 0; wait < 30 && now[1] === last[1]; wait++) { await frame(); now = seen(); }
+    return now;
+  };
+  const found = { shown: !view.closest(".relief").hidden, first: await after([0, 0]) };
+  let last = found.first;
   for (const key of ["ArrowRight", "+"]) {
     view.dispatchEvent(new KeyboardEvent("keydown", { key }));
-    await frame();
-    found[key] = seen();
+    last = found[key] = await after(last);
   }
   return found;
 })();
