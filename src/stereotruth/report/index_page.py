@@ -24,6 +24,7 @@ PAGES = (
     "benchmark/*/index.html",
     "audit/*/index.html",
     "score_dsm/*/*/*/index.html",
+    "results/site/*/index.html",
 )
 TEMPLATE = Path(__file__).with_name("index.html.jinja")
 LOOK_PX, LOOK_BYTES = 420, 30_000
@@ -56,6 +57,10 @@ def _write(root: Path, out: Path) -> None:
         "benchmarks": _benchmarks(root, out),
         "audits": _audits(root, out),
         "surface_models": _surface_models(root, out),
+        "sites": [
+            (page.parent.name, str(way(out, page)), "images and pairs")
+            for page in sorted(root.glob(PAGES[4]))
+        ],
         "timeline": timeline(last_run(read_jobs(root))),
         "links": [
             (name, str(way(out, root / name)), text)
