@@ -18,7 +18,7 @@ TARGETS = {
     "report": "the pages of all cities; results/report/<City>/index.html that of one",
     "evaluate": "figures from the images, and against the exact truth of synthetic cities",
     "results/project/<City>/<scene>.zarr": "disparity, status and uncertainty of a whole scene",
-    "results/predict/<City>/<scene>_<method>_dsm.tif": "surface model of a scene by a method",
+    "results/predict/<City>/<scene>/<method>_dsm.tif": "surface model of a scene by a method",
     "score_dsm/<City>/<scene>/<method>": "that surface model, held against the LiDAR",
     "benchmark": "the methods that each dataset names, scored and compared",
     "benchmark/<dataset>/<method>": "the scores of one method on one dataset",
@@ -58,9 +58,10 @@ def rules() -> list[str]:
 
 
 # Where a path has the name of a city, of a dataset.
+STAGES = "ingest|align|refine|rectify|project|heights|export|evaluate|report|predict"
 IN_PATH = (
-    (re.compile(r"(tiles|results/(?!train/)\w+|score_dsm)/(?P<name>[^/]+)(/.*)?"), "city"),
-    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.*)?"), "dataset"),
+    (re.compile(rf"(tiles|score_dsm|results/({STAGES}))/(?P<name>[^/]+)(/.+)?"), "city"),
+    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.+)?"), "dataset"),
 )
 
 
