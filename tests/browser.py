@@ -30,9 +30,9 @@ console.error = console.warn = (...text) => wrong.push("console: " + text.join("
 
 # After the page: run the test's script, and write what it returns into the page.
 PROBE = """<script>
-addEventListener("load", () => {
+addEventListener("load", async () => {
   let found = null;
-  try { found = (() => { %s })(); } catch (e) { wrong.push("probe: " + e); }
+  try { found = await (() => { %s })(); } catch (e) { wrong.push("probe: " + e); }
   const all = performance.getEntriesByType("resource").map((entry) => entry.name);
   const requests = all.filter((name) => !name.startsWith("data:"));
   const report = document.createElement("pre");
@@ -59,6 +59,7 @@ def _run(page: Path, *options: str) -> str:
             "--headless",
             "--no-sandbox",  # the tests may run as root, on pages that they made
             "--disable-gpu",
+            "--enable-unsafe-swiftshader",  # WebGL without a graphics card
             "--disable-dev-shm-usage",
             "--hide-scrollbars",
             "--no-first-run",
@@ -83,7 +84,7 @@ def look(page: Path, folder: Path, script: str, width: int = 1280) -> Seen:
     text = text.replace("<head>", f"<head>{WATCH}").replace("</body>", f"{PROBE % script}</body>")
     copy = folder / "probed.html"
     copy.write_text(text, encoding="utf-8")
-    dom = _run(copy, f"--window-size={width},1000", "--dump-dom")
+    dom = _run(copy, f"--window-size={width},1000", "--virtual-time-budget=20000", "--dump-dom")
     result = re.search(r'<pre id="probe-result">(.*?)</pre>', dom, flags=re.DOTALL)
     assert result, "the page's script did not end"
     plain = result[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")

@@ -228,5 +228,7 @@ def _with_remark(line: str, key: Key) -> str:
 if __name__ == "__main__":
     config = Path(*sys.argv[1:] or ["config"])
     guide = config / "README.md"
+    if not guide.is_file():
+        sys.exit(f"no {guide}. Usage: python -m stereotruth.configuration [FOLDER]; FOLDER: config")
     guide.write_text(with_tables(guide.read_text(encoding="utf-8")), encoding="utf-8")
     (config / "config.yaml").write_text(defaults_text(), encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import logging
 import os
 import pickle
 import sys
@@ -24,6 +25,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).parent
+log = logging.getLogger("stereotruth")
 LONGEST_S = 120.0  # that another process is waited for: one whose compilation has failed holds on
 
 
@@ -60,6 +62,7 @@ class KernelCache:
             self._claim(file)
             parts = _read(file)
         if parts is None:
+            _say_once()
             return None
         self._release(file)
         return CompileResult._rebuild(target, *parts)
@@ -96,6 +99,12 @@ class KernelCache:
         parts = (self.compiler, target.magic_tuple(), content(self.function), *_arguments(types))
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         return folder() / f"{name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.bin"
+
+
+@cache
+def _say_once() -> None:
+    """Say, once in a process, what takes its time."""
+    log.info("compiling, first run only")
 
 
 def _read(file: Path) -> tuple | None:

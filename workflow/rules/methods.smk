@@ -135,9 +135,15 @@ def products_of_own_dataset():
     ]
 
 
+def prediction_dataset():
+    """The dataset that whole scenes go by: the one that predict names, else the first."""
+    known = (name for name, of in SETTINGS.benchmark.datasets.items() if of)
+    return SETTINGS.predict.dataset or next(known, "synthetic")
+
+
 def scene_prediction():
     """How methods go over whole scenes; the disparity range is that of their dataset."""
     settings = asdict(SETTINGS.predict)
-    known = dataset_settings(settings["dataset"]).disparity_range
+    known = dataset_settings(prediction_dataset()).disparity_range
     own = {key: settings[key] for key in PredictionSettings.__dataclass_fields__}
     return own | {"disparity_range": own["disparity_range"] or known}

@@ -2,7 +2,7 @@ rule predict_scene:
     input:
         left=rules.rectify.output.left,
         right=rules.rectify.output.right,
-        files=lambda w: method_files(w.method, SETTINGS.predict.dataset),
+        files=lambda w: method_files(w.method, prediction_dataset()),
     output:
         disparity=directory("results/predict/{city}/{scene}/{method}.zarr"),
     log:
@@ -20,7 +20,7 @@ rule predict_scene:
         dask=SETTINGS.dask.scheduler_address or "",
     params:
         script=content_of("../scripts/predict_scene.py"),
-        method=lambda w: method_entry(w.method, SETTINGS.predict.dataset),
+        method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
     message:

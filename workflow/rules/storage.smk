@@ -21,9 +21,12 @@ def bucket_records():
     """The records of the products in the bucket, brought here; what differs there is marked."""
     from stereotruth.products.bucket_records import BucketRecords
 
-    records = BucketRecords(STORAGE.default_storage_prefix, copies())
-    records.pull()
-    records.mark_changed()
+    try:
+        records = BucketRecords(STORAGE.default_storage_prefix, copies())
+        records.pull()
+        records.mark_changed()
+    except InputError as error:
+        raise Refused(str(error))
     return records
 
 

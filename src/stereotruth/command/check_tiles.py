@@ -130,8 +130,9 @@ def check_labels(
         "labels",
         Level.FACT,
         f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {share:.0%} of what both "
-        f"images show: some {expected:.0%} of the visible pixels there will have a label "
-        f"(project.recipe: {recipe}), in {_tiles_in_words(nodes, covered, expected, settings)}",
+        f"images show: some {expected:.0%} of the pixels that neither image hides will have a "
+        f"label (project.recipe: {recipe}), "
+        f"in {_tiles_in_words(nodes, covered, expected, settings)}",
     )
     _hold_against_tiles(nodes, covered, per_px, settings, found)
     return share

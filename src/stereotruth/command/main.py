@@ -224,6 +224,9 @@ def pairs(
     gcps: Annotated[str, typer.Option(help="Likewise.")] = "",
     lidar_crs: Annotated[str, typer.Option(help="Likewise.")] = "",
     geoid: Annotated[str, typer.Option(help="Likewise.")] = "",
+    page: Annotated[
+        bool, typer.Option("--page", help="Write the site's page: map, pairs, residuals, closure.")
+    ] = False,
     configfile: Configured = None,
 ) -> None:
     """List the pairs of a site, best first; with a choice, write it to the scenes sheet."""
@@ -241,6 +244,10 @@ def pairs(
     show_pairs(rated)
     for line in lines:
         typer.echo(line)
+    if page:
+        from .site_page import write_page_of_site
+
+        typer.echo(f"Look at {write_page_of_site(city, configfile)}")
 
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}

@@ -23,7 +23,7 @@ KEYS: dict[str, tuple[str, ...]] = {
 }
 HEAD = """\
 # A project of stereotruth. What stands here overrides the defaults; remove the # to change one.
-# Paths count from this folder. All keys: config/README.md of the project's pages.
+# Paths count from this folder. All keys: {keys}
 scenes: scenes.tsv
 cities: cities.tsv
 """
@@ -31,7 +31,7 @@ cities: cities.tsv
 
 def configuration_text() -> str:
     """The text of a new config.yaml: keys with their defaults and remarks, commented out."""
-    lines = [HEAD.rstrip()]
+    lines = [HEAD.format(keys=(FILES / "config" / "README.md").as_uri()).rstrip()]
     section = None
     for line in (FILES / "config" / "config.yaml").read_text(encoding="utf-8").splitlines():
         if found := re.match(r"(\w+):", line):

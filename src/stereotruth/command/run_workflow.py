@@ -8,10 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
 from ..project import CONFIG, FILES, read_mapping, require_project
@@ -61,7 +62,7 @@ def arguments_for(given: Sequence[str]) -> list[str]:
 def _with_profiles(given: Sequence[str]) -> list[str]:
     """Arguments with the path of a profile that comes with the package in place of its name.
 
-    Raises InputError if the executor of that profile is not installed.
+    Raises InputError if the executor or the storage of that profile is not installed.
     """
     words = list(given)
     for k, word in enumerate(words):
@@ -73,15 +74,21 @@ def _with_profiles(given: Sequence[str]) -> list[str]:
         shipped = FILES / "profiles" / name
         if not name or "/" in name or Path(name).exists() or not shipped.is_dir():
             continue
-        executor = read_mapping(next(shipped.glob("config*.yaml"))).get("executor", "local")
-        plugin = f"snakemake_executor_plugin_{executor.replace('-', '_')}"
-        if executor != "local" and find_spec(plugin) is None:
-            raise InputError(
-                f"profile {name!r} needs the package {plugin.replace('_', '-')}",
-                remedy=f"pip install {plugin.replace('_', '-')}",
-            )
+        for package in _plugins(read_mapping(next(shipped.glob("config*.yaml")))):
+            if find_spec(package.replace("-", "_")) is None:
+                raise InputError(
+                    f"profile {name!r} needs the package {package}",
+                    remedy=f"pip install {package}",
+                )
         words[at] = f"{option}={shipped}" if equals else str(shipped)
     return words
+
+
+def _plugins(profile: Mapping[str, Any]) -> list[str]:
+    """The packages of the executor and the storage that a profile names."""
+    executor, storage = profile.get("executor", "local"), profile.get("default-storage-provider")
+    named = [] if executor == "local" else [f"snakemake-executor-plugin-{executor}"]
+    return named + ([f"snakemake-storage-plugin-{storage}"] if storage else [])
 
 
 def config_files(arguments: Sequence[str]) -> list[Path]:

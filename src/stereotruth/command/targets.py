@@ -20,7 +20,7 @@ TARGETS = {
     "results/project/<City>/<scene>.zarr": "disparity, status and uncertainty of a whole scene",
     "results/adjust/<City>.json": "corrections and residuals of images that pairs share",
     "closure": "what the labels of three pairs of images say of each other",
-    "results/predict/<City>/<scene>_<method>_dsm.tif": "surface model of a scene by a method",
+    "results/predict/<City>/<scene>/<method>_dsm.tif": "surface model of a scene by a method",
     "score_dsm/<City>/<scene>/<method>": "that surface model, held against the LiDAR",
     "benchmark": "the methods that each dataset names, scored and compared",
     "benchmark/<dataset>/<method>": "the scores of one method on one dataset",
@@ -59,23 +59,42 @@ def rules() -> list[str]:
     ]
 
 
+# Where a path has the name of a city, of a dataset.
+STAGES = "ingest|align|refine|rectify|project|heights|export|evaluate|report|predict"
+IN_PATH = (
+    (re.compile(rf"(tiles|score_dsm|results/({STAGES}))/(?P<name>[^/]+)(/.+)?"), "city"),
+    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.+)?"), "dataset"),
+)
+
+
+def _names_for(word: str, configfiles: Sequence[Path] | None) -> list[str]:
+    """What a word that is no option may be: rules, or its path with each city or dataset in it.
+
+    Empty for a path of which this is not known.
+    """
+    if "/" not in word:
+        return [] if Path(word).exists() else [*rules(), "all"]
+    for pattern, kind in IN_PATH:
+        if found := pattern.fullmatch(word):
+            settings, _ = configured(configfiles)
+            datasets = [name for name, entry in settings.benchmark.datasets.items() if entry]
+            names = list(read_scenes(settings)[0]) if kind == "city" else datasets
+            start, end = found.span("name")
+            return [word[:start] + name + word[end:] for name in names]
+    return []
+
+
 def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> None:
     """Raise InputError for a target that is a typo, with what it may mean.
 
-    ``given``: arguments of a run; targets are the words before the first option. Paths other than
-    ``tiles/<City>`` are left to Snakemake.
+    ``given``: arguments of a run; targets are the words before the first option. Paths without a
+    city or dataset at a known place are left to Snakemake.
     """
     words = list(given)
     first_option = next((k for k, word in enumerate(words) if word.startswith("-")), len(words))
-    for word in words[:first_option]:
-        if re.fullmatch(r"tiles/[^/]+/?", word):
-            settings, _ = configured(configfiles)
-            names = [f"tiles/{city}" for city in read_scenes(settings)[0]]
-        elif "/" not in word and not Path(word).exists():
-            names = [*rules(), "all"]
-        else:
-            continue
-        if word.rstrip("/") not in names:
+    for word in (word.rstrip("/") for word in words[:first_option]):
+        names = _names_for(word, configfiles)
+        if names and word not in names:
             close = difflib.get_close_matches(word, names, n=1)
             remedy = f"did you mean {close[0]}?" if close else "stereotruth targets lists them"
             raise InputError(f"{word}: no such target", remedy=remedy)

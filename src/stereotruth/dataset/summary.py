@@ -60,17 +60,23 @@ def summarise(
     }
 
 
+HIDDEN = ("hidden_in_left", "hidden_in_right", "out_of_frame")  # pixels that one image has alone
+
+
 def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
     """What was made and where to look, for the end of a run."""
     shares = summary["share_of_pixels"]
     labelled = sum(share for name, share in shares.items() if carries_label(name))
+    hidden = sum(shares.get(name, 0.0) for name in HIDDEN)
+    in_both = max(1.0 - hidden, 1e-9)
     low, high = summary["disparity_px"]["min"], summary["disparity_px"]["max"]
     lines = [
         f"{summary['city']}: {in_number(summary['labelled_pairs'], 'labelled pair')} of "
         f"{summary['size_px']} × {summary['size_px']} px "
         f"({in_counts(summary['splits']['realised'])}), "
         f"{in_number(summary['unlabelled_pairs'], 'pair')} without complete labels",
-        f"{100 * labelled:.1f} % of their pixels labelled, disparities {low:.1f} … {high:.1f} px, "
+        f"{100 * labelled:.1f} % of their pixels labelled ({100 * labelled / in_both:.1f} % of "
+        f"those that neither image hides), disparities {low:.1f} … {high:.1f} px, "
         f"rounded by at most {summary['disparity_rounding']['largest_px']:.4f} px",
         *(_quality_line(scene, found) for scene, found in summary["quality"]["scenes"].items()),
     ]

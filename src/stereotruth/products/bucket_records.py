@@ -22,7 +22,7 @@ from typing import Any
 
 from .provenance import digest
 from .records import BEGUN, PLACES, all_records, mark_begun
-from .remote_files import bucket
+from .remote_files import answering, bucket
 
 log = logging.getLogger("stereotruth")
 
@@ -38,6 +38,7 @@ class BucketRecords:
 
     def __init__(self, prefix: str, copies: Path) -> None:
         self._copies = copies
+        self._prefix = prefix
         self._storage, self._root = bucket(prefix.rstrip("/"))
         self._records = PurePosixPath(self._root, ".records", "made")
         self._states = f"{self._root}/{STATES}"
@@ -50,10 +51,14 @@ class BucketRecords:
                 yield file.relative_to(folder).as_posix(), file
 
     def pull(self) -> None:
-        """Make records and marks here those of the bucket."""
+        """Make records and marks here those of the bucket.
+
+        Raises InputError without credentials, and if nobody answers.
+        """
         shutil.rmtree(PLACES[1] / self._copies, ignore_errors=True)  # one place holds them
-        found = self._storage.find(str(self._records))
-        held = self._storage.cat(found) if found else {}
+        with answering(self._prefix):
+            found = self._storage.find(str(self._records))
+            held = self._storage.cat(found) if found else {}
         self._known = {
             str(PurePosixPath(path).relative_to(self._records)): content
             for path, content in held.items()

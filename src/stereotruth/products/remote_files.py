@@ -126,7 +126,7 @@ def _state(info: dict[str, Any], url: str) -> str:
 def _look(url: str) -> str | None:
     """The state of a file; None if there is none. Raises InputError if nobody answers."""
     storage, name = bucket(url)
-    with _answering(url):
+    with answering(url):
         try:
             info = storage.info(name)
         except FileNotFoundError as error:
@@ -142,14 +142,50 @@ def _is_absent(error: FileNotFoundError, url: str) -> bool:
     return status in ABSENT if urlsplit(url).scheme in WEB else True
 
 
+# What clients fail with, by the names of their exceptions: the problem, and the remedy.
+FAILURES = (
+    (
+        ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"),
+        "no credentials for it",
+        "export AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or name a profile by AWS_PROFILE",
+    ),
+    (
+        ("gaierror", "ClientConnectorDNSError"),
+        "its host is unknown",
+        "correct the URL or AWS_ENDPOINT_URL, and check the network",
+    ),
+    (
+        ("EndpointConnectionError", "ClientConnectorError", "ConnectTimeoutError", "TimeoutError"),
+        "nobody answers there",
+        "check AWS_ENDPOINT_URL and the network, or try again later",
+    ),
+    (
+        ("PermissionError",),
+        "the server refuses access",
+        "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, which need the right to read and list",
+    ),
+)
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it follows from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
 @contextmanager
-def _answering(url: str) -> Iterator[None]:
+def answering(url: str) -> Iterator[None]:
     """In the block, what a server or its client fails with is an InputError."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:  # clients raise what they like
+        names = {kind.__name__ for link in _chain(error) for kind in type(link).__mro__}
+        for kinds, problem, remedy in FAILURES:
+            if names & set(kinds):
+                raise InputError(problem, file=url, remedy=remedy) from None
         told = error.__cause__ if isinstance(error, FileNotFoundError) else None
         told = told or error
         raise InputError(
@@ -197,7 +233,7 @@ def fetch(url: str) -> Path | None:
             f"larger than {MAX_COPY_BYTES / 1e6:g} MB", file=url, remedy="is it the right file?"
         )
     storage, name = bucket(url)
-    with _answering(url):
+    with answering(url):
         content = storage.cat_file(name)
     if len(content) != json.loads(state)["size"]:
         raise InputError(
@@ -256,7 +292,7 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
 def _listed(url: str) -> dict[str, dict[str, Any]]:
     """What object storage has in a folder, or by a glob, by name; nothing if there is no such."""
     storage, name = bucket(url)
-    with _answering(url):
+    with answering(url):
         if "*" in name:
             return storage.glob(name, detail=True)
         try:
@@ -296,7 +332,7 @@ def open_file(path: str | Path) -> Iterator[BinaryIO]:
     except Exception as error:
         if type(error).__module__.partition(".")[0] not in CLIENTS:
             raise
-        with _answering(url):
+        with answering(url):
             raise
 
 

@@ -112,7 +112,7 @@ def _of_images(
         matches = f"{sum(values('sift_matches')):.0f} matches, mean absolute"
         height = metres(max(errors), height_m_per_px)
         note = _and(of(len(errors)), matches, height and f"≤ {height}" if errors[1:] else height)
-        found.append(Headline("SIFT matches less labels", f"{spread(errors, '.2f')} px", note))
+        found.append(Headline("SIFT disparity minus label", f"{spread(errors, '.2f')} px", note))
     if medians := values("y_parallax_median_px"):
         text = f"{spread(medians, '+.2f')} px"
         note = _and(

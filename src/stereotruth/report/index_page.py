@@ -17,12 +17,14 @@ from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
 from ..products.pictures import encode_file
+from .timeline import last_run, read_jobs, timeline
 
 PAGES = (
     "results/report/*/index.html",
     "benchmark/*/index.html",
     "audit/*/index.html",
     "score_dsm/*/*/*/index.html",
+    "results/site/*/index.html",
 )
 TEMPLATE = Path(__file__).with_name("index.html.jinja")
 LOOK_PX, LOOK_BYTES = 420, 30_000
@@ -55,6 +57,11 @@ def _write(root: Path, out: Path) -> None:
         "benchmarks": _benchmarks(root, out),
         "audits": _audits(root, out),
         "surface_models": _surface_models(root, out),
+        "sites": [
+            (page.parent.name, str(way(out, page)), "images and pairs")
+            for page in sorted(root.glob(PAGES[4]))
+        ],
+        "timeline": timeline(last_run(read_jobs(root))),
         "links": [
             (name, str(way(out, root / name)), text)
             for name, text in (
@@ -105,7 +112,7 @@ def _city(root: Path, out: Path, page: Path) -> dict[str, Any]:
         facts.append(f"{100 * labelled:.1f} % of their pixels labelled")
     sift = [of["sift_mean_absolute_error_px"] for of in scenes]
     if any(value is not None for value in sift):
-        facts.append(f"SIFT matches less labels: {spread(sift, '.2f')} px mean absolute")
+        facts.append(f"SIFT disparity minus label: {spread(sift, '.2f')} px mean absolute")
     truth = _read(root / "results" / "evaluate" / name / "truth.json")
     truth = truth["exported_tiles"]["errors"] if truth else {}
     if truth.get("count"):

@@ -7,6 +7,7 @@ whose input is missing is left out. Equal input gives equal bytes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -29,13 +30,13 @@ from .settings import Settings
 
 PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
 BASE64 = 3 / 4  # bytes of a picture per byte in the page
-SHARES = {"figures": 0.1, "thumbnails": 0.4, "sliders": 0.5}
+SHARES = {"figures": 0.1, "thumbnails": 0.38, "sliders": 0.48, "reliefs": 0.04}
 COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
 # At most, however few there are:
-FIGURE_BYTES, THUMBNAIL_BYTES, SLIDER_BYTES = 600_000, 24_000, 200_000
+FIGURE_BYTES, THUMBNAIL_BYTES, SLIDER_BYTES, RELIEF_BYTES = 600_000, 24_000, 200_000, 192**2
 KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
-LARGE = ("slider_left", "slider_warped", "slider_difference", "slider_disparity")
+LARGE = ("left", "warped", "difference", "disparity", "hillshade")
 
 
 def _chosen(names: Sequence[str], most: int) -> set[str]:
@@ -53,14 +54,26 @@ def _allowance(share: str, count: int, most: int) -> int:
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The tiles as they were drawn, by name, and those with large pictures."""
+    """The tiles as they were drawn, by name, and their labels by whole px.
+
+    ``large``: those with large pictures; ``first``: the one of these on top of the page;
+    ``limits_px``: of the colours of disparity.
+    """
 
     made: dict[str, tile_pictures.TilePictures]
+    counts: dict[str, Mapping[int, int]]
     large: set[str]
+    limits_px: tuple[float, float] | None
 
     @classmethod
     def drawn(
-        cls, city: str, files: CityFiles, records: CityRecords, sliders: int, workers: int
+        cls,
+        city: str,
+        files: CityFiles,
+        records: CityRecords,
+        sizes: Mapping[str, PixelSize],
+        sliders: int,
+        workers: int,
     ) -> _Tiles:
         """Draw the pictures of all tiles, large ones of ``sliders`` of them."""
         rows = records.rows
@@ -68,15 +81,41 @@ class _Tiles:
         large = _chosen(labelled, sliders)
         small = len(KINDS) * len(labelled) + 2 * (len(rows) - len(labelled))
         thumbnail = (THUMBNAIL_PX, _allowance("thumbnails", small, THUMBNAIL_BYTES))
-        slider = (SLIDER_PX, _allowance("sliders", len(LARGE) * len(large), SLIDER_BYTES))
-
-        def work(row: Mapping[str, str]) -> tile_pictures.TilePictures:
-            size = slider if row["tile"] in large else None
-            return tile_pictures.tile_pictures(files.folder, row, thumbnail=thumbnail, slider=size)
-
+        big = tile_pictures.Large(
+            SLIDER_PX,
+            _allowance("sliders", len(LARGE) * len(large), SLIDER_BYTES),
+            int(math.sqrt(_allowance("reliefs", len(large), RELIEF_BYTES))),
+        )
         with ThreadPoolExecutor(workers) as pool:
+            counted = list(
+                pool.map(lambda row: tile_pictures.disparity_counts(files.folder, row), rows)
+            )
+            limits = tile_pictures.disparity_limits(counted)
+
+            def work(row: Mapping[str, str]) -> tile_pictures.TilePictures:
+                size = sizes.get(row["scene"])
+                return tile_pictures.tile_pictures(
+                    files.folder,
+                    row,
+                    thumbnail=thumbnail,
+                    large=big if row["tile"] in large else None,
+                    limits_px=limits,
+                    base_to_height=size.base_to_height if size else 1.0,
+                )
+
             drawn = list(progress(pool.map(work, rows), len(rows), f"{city}: tiles drawn"))
-        return cls({row["tile"]: of for row, of in zip(rows, drawn)}, large)
+        names = [row["tile"] for row in rows]
+        return cls(dict(zip(names, drawn)), dict(zip(names, counted)), large, limits)
+
+    @property
+    def first(self) -> str | None:
+        """Of the tiles with large pictures the one whose labels span most; None of none."""
+        spans = {
+            name: np.ptp(of.disparity_px)
+            for name, of in self.made.items()
+            if of.relief is not None and of.disparity_px is not None
+        }
+        return max(spans, key=lambda name: spans[name], default=None)
 
 
 @dataclass(frozen=True)
@@ -138,6 +177,8 @@ def _of_tiles(records: CityRecords, tiles: _Tiles) -> dict[str, Any]:
     return {
         "rows": rows,
         "made": tiles.made,
+        "first": tiles.first,
+        "limits_px": tiles.limits_px,
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "shares": {row["tile"]: sections.status_shares(row) for row in rows},
         "total": total,
@@ -148,7 +189,7 @@ def _of_tiles(records: CityRecords, tiles: _Tiles) -> dict[str, Any]:
         "no_match": f"rgb{tile_pictures.NO_MATCH}",
         "no_difference": f"rgb{tile_pictures.NO_DIFFERENCE}",
         "windows": sections.tile_index(rows),
-        "histograms": sections.histograms(rows, tiles.made),
+        "histograms": sections.histograms(rows, tiles.counts),
         "manifest": table(rows, sections.manifest_columns(rows)),
         "few_large": len(tiles.large) < len(records.labelled),
         "large_count": len(tiles.large),
@@ -190,8 +231,8 @@ def write_report(
     Raises InputError if there is no manifest.
     """
     records = CityRecords.of(files)
-    tiles = _Tiles.drawn(city, files, records, sliders, workers)
     sizes = _pixel_sizes(files.folder, records.labelled)
+    tiles = _Tiles.drawn(city, files, records, sizes, sliders, workers)
     height = max((size.height_m for size in sizes.values()), default=None)
     made_of = {
         "tiles": records.export,

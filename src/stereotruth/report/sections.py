@@ -14,7 +14,6 @@ from ..dataset.split_names import NONE, SPLITS
 from ..products.charts import Chart
 from ..products.html_tables import Table, cells_of, columns_of, limit, missed, table, words
 from . import drawings
-from .tile_pictures import TilePictures
 
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
@@ -109,15 +108,15 @@ def _points(record: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def histograms(
-    rows: Sequence[Mapping[str, str]], made: Mapping[str, TilePictures]
+    rows: Sequence[Mapping[str, str]], counts: Mapping[str, Mapping[int, int]]
 ) -> dict[str, list[Chart]]:
-    """Disparities of the tiles' files, by scene and by split."""
+    """Disparities of the tiles' files, by scene and by split; ``counts`` by tile."""
 
     def counted(key: str, value: str) -> dict[int, int]:
         total: dict[int, int] = {}
         for row in rows:
             if row.get(key) == value:
-                for px, count in made[row["tile"]].histogram.items():
+                for px, count in counts[row["tile"]].items():
                     total[px] = total.get(px, 0) + count
         return total
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..dataset.warped_tile import warp_tile
 from ..products import pictures
 from ..products.pictures import Picture, encode
 from ..products.rasters import read_flags, read_image, read_tile
+from .relief import Relief, hillshade
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
@@ -38,18 +40,51 @@ STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
 
 @dataclass
 class TilePictures:
-    """Data URIs of a tile by name, and what their colours mean.
+    """Data URIs of a tile by name, and what they show.
 
-    ``disparity_px``: limits of the colours; ``histogram``: pixels by whole px of disparity;
-    ``difference_dn``: limit of the difference's colours in the image's units; ``correlation``
-    of left and warped right image.
+    ``disparity_px``: percentiles 1 and 99 of the labels; ``difference_dn``: limit of the
+    difference's colours in the image's units; ``correlation`` of left and warped right image;
+    ``relief``: the grid of the 3-D view.
     """
 
     uris: dict[str, str]
     disparity_px: tuple[float, float] | None = None
-    histogram: dict[int, int] = field(default_factory=dict)
     difference_dn: float | None = None
     correlation: float | None = None
+    relief: Relief | None = None
+
+
+@dataclass(frozen=True)
+class Large:
+    """Of the large pictures of a tile: longer side in px, bytes of each, side of the 3-D grid."""
+
+    side: int
+    limit: int
+    grid: int
+
+
+def disparity_counts(folder: Path, row: Mapping[str, str]) -> Counter[int]:
+    """Labels of a tile by whole px of disparity; none of a pair without labels."""
+    if not row.get("disp"):
+        return Counter()
+    disparity = read_tile(folder / row["disp"])
+    values, counts = np.unique(
+        np.floor(disparity[np.isfinite(disparity)]).astype(int), return_counts=True
+    )
+    return Counter(dict(zip(values.tolist(), counts.tolist())))
+
+
+def disparity_limits(counted: Iterable[Mapping[int, int]]) -> tuple[float, float] | None:
+    """The whole px that hold all labels of all tiles but a hundredth at either end."""
+    total: Counter[int] = Counter()
+    for counts in counted:
+        total.update(counts)
+    if not total:
+        return None
+    values = np.array(sorted(total))
+    share = np.cumsum([total[v] for v in values.tolist()]) / total.total()
+    low, high = values[np.searchsorted(share, (0.01, 0.99))].tolist()
+    return float(low), float(high + 1)
 
 
 def status_colours(names: Sequence[str]) -> dict[str, str]:
@@ -78,20 +113,23 @@ def tile_pictures(
     row: Mapping[str, str],
     *,
     thumbnail: tuple[int, int],
-    slider: tuple[int, int] | None,
+    large: Large | None,
+    limits_px: tuple[float, float] | None,
+    base_to_height: float = 1.0,
 ) -> TilePictures:
     """The pictures of one tile; ``row`` is its line of the manifest in ``folder``.
 
-    ``thumbnail``, ``slider``: longer side in px and bytes of each picture; without ``slider``
-    there is no warped image and no difference. A pair without labels has its images only.
+    ``thumbnail``: longer side in px and bytes of each picture; without ``large`` there is no
+    warped image, no difference, no hillshade and no 3-D view. A pair without labels has its images
+    only. ``limits_px``: of the colours of disparity; ``base_to_height``: px of disparity for a px
+    of height.
     """
     folder = Path(folder)
     side, size = thumbnail
     left, right = (read_image(folder / row[kind]).astype(np.float64) for kind in ("left", "right"))
-    limits = _limits(left)
     result = TilePictures({})
     for name, image in (("left", left), ("right", right)):
-        shown = _shown(image, limits if name == "left" else _limits(right))
+        shown = _shown(image, _limits(image))
         result.uris[name] = encode(pictures.shrink(shown, side), size)
     if row.get("status"):
         status, names = read_flags(folder / row["status"])
@@ -104,33 +142,39 @@ def tile_pictures(
         return result
     disparity = read_tile(folder / row["disp"])
     known = disparity[np.isfinite(disparity)]
-    if known.size:
-        low, high = (float(v) for v in np.percentile(known, (1, 99)))
-        result.disparity_px = low, high
-        values, counts = np.unique(np.floor(known).astype(int), return_counts=True)
-        result.histogram = dict(zip(values.tolist(), counts.tolist()))
-        coloured = pictures.colours(disparity, (low, high))
-        result.uris["disparity"] = encode(pictures.shrink(coloured, side), size)
-    if slider is None or not known.size:
+    if not known.size:
         return result
-    side, size = slider
+    low, high = (float(v) for v in np.percentile(known, (1, 99)))
+    result.disparity_px = low, high
+    coloured = pictures.colours(disparity, limits_px)
+    result.uris["disparity"] = encode(pictures.shrink(coloured, side), size)
+    if large is not None:
+        shaded = hillshade(disparity, base_to_height)
+        _large_pictures(result, folder, row, large, {"disparity": coloured, "hillshade": shaded})
+        result.relief = Relief.of(disparity, base_to_height, large.grid)
+    return result
+
+
+def _large_pictures(
+    result: TilePictures,
+    folder: Path,
+    row: Mapping[str, str],
+    large: Large,
+    layers: Mapping[str, Picture],
+) -> None:
+    """Add the large pictures, named ``slider_…``: the ``layers``, left, warped, difference."""
     tile = warp_tile(folder, row)
+    limits = _limits(tile.left)
     sums = tile.sums
     matched = sums.match(tile.warped)
     nothing = ~np.isfinite(matched)
     spread = max(DIFFERENCE * (limits[1] - limits[0]), 1e-9)
-    large = {
-        "slider_left": _shown(left, limits),
-        "slider_warped": np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2),
-        "slider_difference": pictures.colours(
-            tile.left - matched, (-spread, spread), pictures.DIFFERENCES
-        ),
-        "slider_disparity": coloured,
-    }
-    large["slider_warped"][nothing] = NO_MATCH
-    large["slider_difference"][nothing] = NO_DIFFERENCE
-    for name, picture in large.items():
-        result.uris[name] = encode(pictures.shrink(picture, side), size)
+    warped = np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2)
+    warped[nothing] = NO_MATCH
+    difference = pictures.colours(tile.left - matched, (-spread, spread), pictures.DIFFERENCES)
+    difference[nothing] = NO_DIFFERENCE
+    images = {"left": _shown(tile.left, limits), "warped": warped, "difference": difference}
+    for name, picture in {**images, **layers}.items():
+        result.uris[f"slider_{name}"] = encode(pictures.shrink(picture, large.side), large.limit)
     result.difference_dn = spread
     result.correlation = sums.coefficient if np.isfinite(sums.coefficient) else None
-    return result

@@ -50,6 +50,8 @@ def test_a_profile_of_the_package_is_named_without_its_path(tmp_path, monkeypatc
     monkeypatch.setattr("stereotruth.command.run_workflow.find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install snakemake-executor-plugin-slurm"):
         arguments_for(["--profile", "slurm"])
+    with pytest.raises(InputError, match="pip install snakemake-storage-plugin-s3"):
+        arguments_for(["--profile", "s3"])
 
 
 def test_the_built_in_cities_are_asked_for_by_name(tmp_path, monkeypatch):

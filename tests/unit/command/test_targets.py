@@ -9,6 +9,7 @@ import pytest
 from stereotruth.command.targets import TARGETS, list_targets, refuse_unknown, rules
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
+from stereotruth.project import FILES
 
 
 def test_targets_are_listed_with_the_names_of_the_project(folder):
@@ -22,9 +23,25 @@ def test_each_plain_target_is_a_rule():
     assert plain <= set(rules())
 
 
+def test_each_path_is_what_a_rule_makes():
+    rules_text = "".join(
+        file.read_text(encoding="utf-8")
+        for file in sorted((FILES / "workflow" / "rules").glob("*.smk"))
+    )
+    for target in TARGETS:
+        path = re.sub(r"<(\w+)>", lambda found: f"{{{found[1].lower()}}}", target)
+        assert "/" not in path or f'"{path}"' in rules_text, target
+
+
 @pytest.mark.parametrize(
     ("word", "meant"),
-    [("reprot", "report"), ("tiles/Goood", "tiles/Good"), ("datasets", "dataset")],
+    [
+        ("reprot", "report"),
+        ("tiles/Goood", "tiles/Good"),
+        ("datasets", "dataset"),
+        ("results/report/Goood/index.html", "results/report/Good/index.html"),
+        ("benchmark/syntetic/sgm", "benchmark/synthetic/sgm"),
+    ],
 )
 def test_a_typo_is_told_with_what_it_may_mean(folder, word, meant):
     with pytest.raises(InputError, match=f"{word}: no such target.*did you mean {meant}"):
@@ -33,6 +50,7 @@ def test_a_typo_is_told_with_what_it_may_mean(folder, word, meant):
 
 def test_what_snakemake_knows_is_left_to_it(folder):
     refuse_unknown(["report", "tiles/Good", "results/x.json", "--forcerun", "anything"])
+    refuse_unknown(["results/closure/Good.json", "results/training_cities/cities/1"])
 
 
 def test_built_in_datasets_are_there_unless_others_are_named():

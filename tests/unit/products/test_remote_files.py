@@ -112,7 +112,7 @@ def test_a_server_that_is_gone_is_not_taken_for_a_missing_file(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     with answering(200) as url:
         pass
-    with pytest.raises(InputError, match="does not answer as it should"):
+    with pytest.raises(InputError, match="nobody answers there"):
         remote_files.fetch(f"{url}/left_RPC.TXT")
 
 

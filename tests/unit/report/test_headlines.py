@@ -50,20 +50,20 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
     }
     said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
     found = cards({"A-1": SCENE})
-    assert found["SIFT matches less labels"].value == "0.24 px"
+    assert found["SIFT disparity minus label"].value == "0.24 px"
     for title in (
-        "SIFT matches less labels",
+        "SIFT disparity minus label",
         "y-parallax of matches",
         "left and warped right",
         "pixels labelled",
     ):
         assert re.search(rf"(?<![\d.]){re.escape(found[title].value)}(?!\d)", said), title
-    assert "1315 matches" in found["SIFT matches less labels"].note
+    assert "1315 matches" in found["SIFT disparity minus label"].note
 
 
 def test_several_scenes_have_their_range():
     other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
-    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT matches less labels"]
+    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity minus label"]
     assert card.value == "0.24–0.31 px"
     assert card.note == "2 scenes; 1400 matches, mean absolute; ≤ 0.62 m of height"
 
@@ -71,7 +71,7 @@ def test_several_scenes_have_their_range():
 def test_metres_stand_beside_px_where_the_geometry_is_known():
     truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
     found = cards({"A-1": SCENE}, height=1.03, truth=truth)
-    assert found["SIFT matches less labels"].note.endswith("0.25 m of height")
+    assert found["SIFT disparity minus label"].note.endswith("0.25 m of height")
     assert found["error against the truth"].note == "mean absolute; 0.022 m of height"
     assert found["disparities"].note == "40 m of height"
     assert cards({"A-1": SCENE})["disparities"].note == "of the tiles"

@@ -61,7 +61,7 @@ def test_figures_are_those_of_the_files(folder):
     for words in (
         "4 labelled pairs of 256 × 256 px (2 train, 1 val, 1 test)",
         "82.9 % of their pixels labelled",
-        "SIFT matches less labels: 0.24 px mean absolute",
+        "SIFT disparity minus label: 0.24 px mean absolute",
         "error against the exact truth: 0.021 px",
         "1 tile beyond a limit of quality",
     ):

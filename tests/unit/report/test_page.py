@@ -105,7 +105,9 @@ def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch)
             CITY, CityFiles(tmp_path / "tiles"), tmp_path / "index.html", sliders=sliders
         )
         text = (tmp_path / "index.html").read_text()
-        sizes.append(sum(map(len, re.findall(r'src="(data:[^"]*)"', text))))
+        embedded = re.findall(r'(?:src="data:|data-values=")([^"]*)"', text)
+        sizes.append(sum(map(len, embedded)))
+        assert len(re.findall("<canvas", text)) == sliders
         assert len(re.findall('class="stack"', text)) == sliders
         assert len(re.findall('class="quads"', text)) == 12
     assert 30_000 < sizes[0] < sizes[1] <= 200_000
@@ -159,7 +161,7 @@ def test_headlines_and_tables_say_what_the_files_say(made):
     assert heads["labelled pairs"] == "5"
     assert "1 more without full labels" in text
     assert heads["GCP residuals, rms"] == "0.79 px"
-    assert heads["SIFT matches less labels"] == "0.27 px"  # of the scene, not the mean of tiles
+    assert heads["SIFT disparity minus label"] == "0.27 px"  # of the scene, not the mean of tiles
     assert heads["error against the truth"] == "0.125 px"  # of the tiles, not the whole scene
     assert "hidden pixels labelled" not in heads  # empty for the tiles
     status = re.search(r"What became of the pixels.*?</table>", text, re.DOTALL)[0]
@@ -253,7 +255,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
     )
     text = (tmp_path / "index.html").read_text()
     sections = re.findall(r'<section id="(\w+)"', text)
-    assert sections == ["map", "disparities", "tiles", "manifest", "provenance"]
+    assert sections == ["large", "map", "tiles", "disparities", "manifest", "provenance"]
     assert re.findall(r'<li><a href="#([a-z]+)">', text) == sections
     assert "exact truth" not in text.lower()
     assert "quality gates" not in text.lower()
@@ -291,6 +293,7 @@ location.hash = "#tile-T_4";
 dispatchEvent(new HashChangeEvent("hashchange"));
 return {
   images: [...document.images].map((i) => [i.alt, i.naturalWidth]),
+  boxes: [...document.querySelectorAll("image[data-of]")].map((i) => /^data:/.test(i.href.baseVal)),
   clip, focused, layers: [before, layers()], sorted,
   opened: document.querySelector("#tile-T_4 details").open,
   wide: document.documentElement.scrollWidth - innerWidth, width: innerWidth,
@@ -309,8 +312,9 @@ def test_the_page_works_in_a_browser_without_a_network(made, tmp_path, width):
     assert found["width"] == width
     assert found["wide"] <= 0  # nothing sticks out sideways
     assert not found["broken"] and found["title"].startswith(CITY)
-    # 4 pictures of 5 tiles, 4 large ones of 2, 2 of the pair without labels, map, tie points
-    assert len(found["images"]) == 20 + 8 + 2 + 2
+    # 4 pictures of 5 tiles, 5 large ones of 2, 2 of the pair without labels, map, tie points
+    assert len(found["images"]) == 20 + 10 + 2 + 2
+    assert found["boxes"] == [True] * 6  # of the epipolar maps have their images
     assert all(alt and size > 0 for alt, size in found["images"])
     assert [re.search(r"([\d.]+)%", text)[1] for text in found["clip"]] == ["50", "80", "20"]
     assert found["focused"]
@@ -319,6 +323,46 @@ def test_the_page_works_in_a_browser_without_a_network(made, tmp_path, width):
     upwards = sorted(means, key=means.__getitem__)
     assert found["sorted"] == [["ascending", upwards], ["descending", upwards[::-1]]]
     assert found["opened"]
+
+
+TURNED = """
+return (async () => {
+  const view = document.querySelector(".relief canvas"), flat = view.getContext("2d");
+  const frame = () => new Promise((done) => setTimeout(done, 300));
+  const seen = () => {
+    const { data } = flat.getImageData(0, 0, view.width, view.height);
+    let covered = 0, sum = 0;
+    for (let k = 0; k < data.length; k += 4) {
+      covered += data[k + 3] > 0;
+      sum = (sum * 31 + data[k] * data[k + 3]) % 1000003;
+    }
+    return [covered / (view.width * view.height), sum];
+  };
+  const after = async (last) => {  // the picture that is another one than the last
+    let now = seen();
+    for (let wait = 0; wait < 30 && now[1] === last[1]; wait++) { await frame(); now = seen(); }
+    return now;
+  };
+  const found = { shown: !view.closest(".relief").hidden, first: await after([0, 0]) };
+  let last = found.first;
+  for (const key of ["ArrowRight", "+"]) {
+    view.dispatchEvent(new KeyboardEvent("keydown", { key }));
+    last = found[key] = await after(last);
+  }
+  return found;
+})();
+"""
+
+
+@needs_chromium
+def test_the_3d_view_draws_turns_and_comes_nearer(made, tmp_path):
+    seen = look(made, tmp_path, TURNED)
+    assert seen.wrong == []
+    found = seen.found
+    assert found["shown"]
+    assert 0.1 < found["first"][0] < 0.9
+    assert found["ArrowRight"][1] != found["first"][1]
+    assert found["+"][0] > 1.1 * found["ArrowRight"][0]
 
 
 @needs_chromium

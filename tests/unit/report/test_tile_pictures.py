@@ -14,13 +14,18 @@ from ...synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
+LARGE = tile_pictures.Large(side=SIZE, limit=10**6, grid=32)
+
 
 def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
     rows = write_city(tmp_path, 1)
     made = tile_pictures.tile_pictures(
-        tmp_path, rows[0], thumbnail=(SIZE, 10**6), slider=(SIZE, 10**6)
+        tmp_path, rows[0], thumbnail=(SIZE, 10**6), large=LARGE, limits_px=None
     )
-    assert made.histogram == {SHIFT: SIZE**2 - 600}
+    counts = tile_pictures.disparity_counts(tmp_path, rows[0])
+    assert counts == {SHIFT: SIZE**2 - 600}
+    assert tile_pictures.disparity_limits([counts, {40: 1}]) == (SHIFT, SHIFT + 1)
+    assert made.relief is not None
     assert made.disparity_px == (SHIFT, SHIFT)
     assert made.correlation == pytest.approx(1.0)
     left, warped = picture(made.uris["slider_left"]), picture(made.uris["slider_warped"])
@@ -41,7 +46,7 @@ def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
     rows = write_city(tmp_path, 1)
     write_tiff(tmp_path / rows[0]["disp"], np.full((SIZE, SIZE), 4, np.float32), nodata=-999)
     made = tile_pictures.tile_pictures(
-        tmp_path, rows[0], thumbnail=(9, 10**6), slider=(SIZE, 10**6)
+        tmp_path, rows[0], thumbnail=(9, 10**6), large=LARGE, limits_px=None
     )
     assert made.correlation < 0.9
     assert picture(made.uris["slider_difference"])[40:, 20:80].min(axis=2).mean() < 150

@@ -6,17 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 from matplotlib.figure import Figure
 
 from ...products.files import atomic_folder, write_json, write_table
 from ...products.html_page import way, write_page
 from ...products.html_tables import Headline, minus, table
-from ...products.pictures import colours, encode, encode_file, gradient, save_figure, shrink
+from ...products.pictures import (
+    Picture,
+    colours,
+    encode,
+    encode_file,
+    gradient,
+    save_figure,
+    shrink,
+)
+from ...report.relief import hillshade
 from .edges import HIGH, LOW, SHARP, S
 from .height_errors import OPEN
+from .height_raster import HeightRaster
 from .score import Verdict
 
 MAP_BYTES, FIGURE_BYTES = 250_000, 60_000
+MAP_PX = 700
 COLOURS = "RdYlBu_r"
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 
@@ -67,6 +79,15 @@ def _draw_profile(path: Path, profile: list[float | None]) -> None:
     save_figure(path, figure)
 
 
+def _shaded(model: HeightRaster) -> Picture:
+    """Hillshade of the model, read at ``MAP_PX`` along its longer side."""
+    with rasterio.open(model.path) as dataset:
+        times = max(max(dataset.shape) / MAP_PX, 1.0)
+        shape = tuple(max(2, round(side / times)) for side in dataset.shape)
+        read = dataset.read(1, out_shape=shape, masked=True)
+    return hillshade(read.astype(float).filled(np.nan) / (times * np.mean(model.cell_m)), 1.0)
+
+
 def _limit(verdict: Verdict) -> float:
     """Ends of the map's colours, m: what nine tenths of the differences keep, 0.5 at least."""
     size = np.abs(verdict.differences[np.isfinite(verdict.differences)])
@@ -86,7 +107,8 @@ def _values(
         "registration": _registration(figures["registration"]),
         "edges": figures["edges"],
         "table": table(texts),
-        "map": encode(shrink(picture, 700), MAP_BYTES),
+        "shaded": encode(_shaded(verdict.model), MAP_BYTES),
+        "map": encode(shrink(picture, MAP_PX), MAP_BYTES),
         "profile": encode_file(folder / "edges.png", FIGURE_BYTES, 620),
         "limit": limit,
         "gradient": gradient(COLOURS),

@@ -75,7 +75,15 @@ def compare(
     shown = curves if draw_curves(curves, methods, scores) else None
     figure = out / "figure10.png"
     write_benchmark(
-        out / "index.html", dataset.name, methods, tables, scores, figure, shown, index=index
+        out / "index.html",
+        dataset.name,
+        methods,
+        tables,
+        scores,
+        figure,
+        shown,
+        pairs=columns,
+        index=index,
     )
     for line in tables[0].markdown().splitlines():
         if line.startswith("|"):

@@ -53,15 +53,15 @@ def confidence_table(methods: Sequence[Row]) -> Table:
         "Method, pixels",
         "EPE (px)",
         "AUSE (px)",
-        "of ignorance",
+        "AUSE, share of random",
         *(f"in {k:g} % interval (%)" for k in SHOWN),
         "width of 90 % (px)",
-        "σ times",
+        "factor of σ",
     ]
     caption = (
         "Valid pixels with an uncertainty. AUSE: area between the sparsification curve and an "
-        "oracle's, 0 at best; of ignorance: as a share of that of uncertainties that know nothing. "
-        "σ times: what the uncertainties would have to be multiplied by for one σ to hold 68.27 %."
+        "oracle's, 0 at best; share of random: of the AUSE of uncertainties in random order. "
+        "Factor of σ: the uncertainties times this factor hold 68.27 % of the errors."
     )
     return Table("confidence", title, rows, [(caption, plain_table(heading, lines))])
 

@@ -11,9 +11,11 @@ from typing import Any
 
 from ...products.html_page import way, write_page
 from ...products.html_tables import Headline, metres, minus
-from ...products.pictures import encode_file
+from ...products.pictures import DISPARITIES, ERRORS, encode, encode_file, gradient, shrink
 from .page_charts import cumulative_chart, strata_chart
 from .page_tables import sections
+from .panels import ERROR_PX, Column, map_pictures
+from .protocols import one_id
 from .score_method import describe
 from .tables import Table, with_interval
 
@@ -21,6 +23,7 @@ Row = Mapping[str, Any]
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 FIGURE_PX, FIGURE_BYTES = 2600, 3_000_000
 PANEL_PX, PANELS_BYTES = 2000, 12_000_000  # the latter of all together
+SWIPE_PX, SWIPE_BYTES = 800, 4_000_000  # likewise
 
 
 def write_benchmark(
@@ -32,12 +35,14 @@ def write_benchmark(
     figure: str | Path | None,
     curves: str | Path | None = None,
     *,
+    pairs: Sequence[Column] = (),
     index: str | Path | None = None,
 ) -> None:
     """Write the page of a dataset.
 
     ``methods``: their summaries; ``scores``: their folders, with pictures of tiles; ``figure``:
-    figure 10; ``curves``: the sparsification curves; ``index``: the page of all pages.
+    figure 10; ``curves``: the sparsification curves; ``pairs``: those of which two methods can be
+    swiped over each other, the first one with truth is taken; ``index``: the page of all pages.
     """
     panels = {
         of["label"]: sorted((Path(folder) / "panels").glob("*.png"))
@@ -56,7 +61,9 @@ def write_benchmark(
             *((of["label"], str(way(out, folder)), "") for of, folder in zip(methods, scores)),
         ],
         "charts": [chart for chart in charts if chart],
-        "sections": sections(tables),
+        "sections": sections(tables, one_id(methods)),
+        "protocol": one_id(methods),
+        "swipe": _swipe(pairs),
         "figure": None if figure is None else encode_file(Path(figure), FIGURE_BYTES, FIGURE_PX),
         "curves": None if curves is None else encode_file(Path(curves), FIGURE_BYTES, FIGURE_PX),
         "panels": {
@@ -65,6 +72,25 @@ def write_benchmark(
         },
     }
     write_page(out, TEMPLATE, values)
+
+
+def _swipe(pairs: Sequence[Column]) -> dict[str, Any] | None:
+    """Left image, truth, disparities and errors of the first pair with truth, to be swiped."""
+    pair = next((of for of in pairs if of.truth is not None), None)
+    if pair is None:
+        return None
+    limits, shown = map_pictures(pair)
+    allowed = min(200_000, SWIPE_BYTES // len(shown))
+    names = [name for name in shown if name not in ("left", "right")]
+    return {
+        "title": pair.title,
+        "pictures": {of: encode(shrink(shown[of], SWIPE_PX), allowed) for of in ("left", *names)},
+        "first": names[-2:] if len(pair.found) > 1 else ["left", names[-1]],
+        "limits": limits,
+        "disparities": gradient(DISPARITIES),
+        "error_px": ERROR_PX,
+        "errors": gradient(ERRORS),
+    }
 
 
 def headlines(methods: Sequence[Row], tables: Sequence[Table]) -> list[Headline]:

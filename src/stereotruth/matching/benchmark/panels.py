@@ -106,6 +106,12 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
     save_figure(path, figure, dpi=DPI)
 
 
+def map_pictures(column: Column) -> tuple[tuple[float, float], dict[str, Picture]]:
+    """Limits of the disparities' colours, and the pictures of a pair by name."""
+    limits = disparity_limits([column])
+    return limits, _cells(column, limits)
+
+
 def _cells(column: Column, limits: tuple[float, float]) -> dict[str, Picture]:
     """Pictures of a pair by name, in the order of figure 10."""
     found = {"left": grey(column.left), "right": grey(column.right)}

@@ -66,8 +66,8 @@ class Predict(Settings):
     """that the target `predict` goes over all scenes with;
     `results/predict/<city>/<scene>/<method>_dsm.tif` asks for any one"""
 
-    dataset: Annotated[Text, Unit("name of `benchmark.datasets`")] = "synthetic"
-    """whose disparity range is taken, and the networks trained on which"""
+    dataset: Annotated[Text | None, Unit("name of `benchmark.datasets`")] = None
+    """whose disparity range is taken, and the networks trained on which; null: the first"""
 
     dsm: SurfaceModel = field(default_factory=SurfaceModel)
     """of the surface models:"""

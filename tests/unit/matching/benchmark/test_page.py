@@ -73,9 +73,11 @@ def test_by_what_pixels_show_the_best_of_each_row_is_bold(text, scores):
 
 def test_headings_come_before_table_numbers(text):
     headings = re.findall(r"<h2>(.*?)</h2>", text)
-    accuracy = r"Accuracy, time and memory \(own-\w+\) <small>table 5 of the paper</small>"
+    accuracy = r"Accuracy, time and memory <small>table 5 of the paper</small>"
     assert any(re.fullmatch(accuracy, heading) for heading in headings)
     assert not any(heading.startswith("Table") for heading in headings)
+    (protocol,) = re.findall(r"Protocol of all scores: <code>(own-\w+)</code>", text)
+    assert text.count(protocol) == 1
 
 
 def test_the_cards_say_who_is_best_and_by_how_much(compared, scores):
@@ -134,7 +136,9 @@ def test_charts_have_a_line_and_a_point_where_the_files_say(compared):
 def test_another_table_is_shown_as_it_is_written():
     lines = [["A", "1.5 [1.0, 2.0]", "–"], ["B", "-0.5", "7"]]
     shown = plain_table(["Name", "One", "Two"], lines)
-    (section,) = sections([Table("more", "More: of it", [{"x": 1}], [("A `caption`", shown)])])
+    table = Table("more", "More: of it (own-1)", [{"x": 1}], [("A `caption`", shown)])
+    empty = Table("none", "None (own-1)", [], [("No scores", plain_table(["Name"], []))])
+    (section,) = sections([table, empty], "own-1")
     assert (section.heading, section.also) == ("More: of it", "")
     ((caption, shown),) = section.shown
     assert caption == "A caption"
@@ -162,3 +166,24 @@ def test_a_click_on_a_heading_sorts(compared, tmp_path):
     assert len(found["up"]) > 1 and found["up"] == sorted(found["up"])
     assert found["down"] == found["up"][::-1]
     assert found["wide"] <= 0
+
+
+SWIPE = """
+const swipe = document.querySelector(".swipe"), [left, right] = swipe.querySelectorAll("select");
+const seen = () => [...swipe.querySelectorAll("img")].filter((i) => i.offsetParent).map(
+  (i) => [i.dataset.name, i.className, i.naturalWidth > 0]);
+const found = { names: [...left.options].map((o) => o.value), first: seen() };
+left.value = "truth"; right.value = "Two";
+right.dispatchEvent(new Event("change"));
+return { ...found, then: seen() };
+"""
+
+
+@needs_chromium
+def test_two_methods_can_be_swiped_over_each_other(compared, tmp_path):
+    seen = look(Path(compared / "compared/index.html"), tmp_path, SWIPE)
+    assert seen.wrong == []
+    names = ["left image", "truth", "Two", "Half", "error of Two", "error of Half"]
+    assert seen.found["names"] == names
+    assert seen.found["first"] == [["error of Two", "over", True], ["error of Half", "under", True]]
+    assert seen.found["then"] == [["truth", "over", True], ["Two", "under", True]]
