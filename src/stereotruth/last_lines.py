@@ -113,6 +113,8 @@ def _training(product: str, dataset: str, method: str) -> Iterator[str]:
 def _scores(product: str, dataset: str) -> Iterator[str]:
     summary = _read(product, "scores.json")
     yield f"{summary['label']} on {dataset}: {describe(summary)}; look at {product}/cities.csv"
+    for doubt in summary["doubts"]:
+        yield f"Warning: {summary['label']} on {dataset}: {doubt}"
 
 
 def _audit(product: str, dataset: str) -> Iterator[str]:

@@ -44,7 +44,7 @@ FILES = {
         },
     },
     "results/train/own/net/training.json": {"best": {"val_epe_px": 1.25, "val_d1": 0.5}},
-    "benchmark/own/sgm/scores.json": SCORES,
+    "benchmark/own/sgm/scores.json": SCORES | {"doubts": ["is the sign turned?"]},
     "audit/own/summary.json": {"statements": ["4 pairs: 3 good.", "Labels fit."]},
 }
 
@@ -82,6 +82,7 @@ def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
         "net trained on own: EPE 1.250 px, D1 50.00 % on the validation tiles; "
         "look at results/train/own/net/curves.png",
         "SGM on own: EPE 0.500 px, D1 (3 px) 2.00 %; 4 pairs; look at benchmark/own/sgm/cities.csv",
+        "Warning: SGM on own: is the sign turned?",
         "Look at benchmark/own/index.html",
         "Audit of own: 4 pairs: 3 good.",
         "Labels fit.",

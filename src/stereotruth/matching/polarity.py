@@ -23,6 +23,13 @@ What the method says of pixels whose match lies in such columns, outside the rig
 networks say something of every pixel, with a negative range as with a positive one. Methods that
 leave these pixels out cannot do so here, since they do not see where the image ends; theirs become
 NaN with ``outside: invalid`` (SGM has it so by itself).
+
+``polarity: mirrored`` is for pairs whose disparity falls with height, and methods that learned
+relief from cameras whose disparity grows with it. Both images are flipped from left to right, each
+in its place: x becomes w − 1 − x, so that the disparity becomes −d, still of the left image's
+pixels. The method is asked as with ``positive`` in [1 − high, 1 − low), and its result is flipped
+back and changes sign. (Images that are exchanged besides keep the sign of d, and their disparities
+are those of the right image's pixels.)
 """
 
 from __future__ import annotations
@@ -37,7 +44,7 @@ from ..errors import InputError
 from .matcher import BatchMatcher, DisparityRange, ImagePair, Matched, Matcher, UncertainMatcher
 
 RIM_PX = 1
-POLARITIES = ("any", "positive")
+POLARITIES = ("any", "positive", "mirrored")
 OUTSIDE = ("kept", "invalid")
 
 
@@ -116,6 +123,67 @@ class PositiveBatchMethod(PositiveMethod):
             )
 
 
+class MirroredMethod(UncertainMatcher):
+    """A method that is given both images flipped from left to right, as a Matcher.
+
+    ``method``: the one that is asked, of any range.
+    """
+
+    def __init__(self, method: UncertainMatcher) -> None:
+        self._method = method
+        self.margin_px = method.margin_px
+        if hasattr(method, "device"):
+            self.device = method.device
+
+    def scaling(self, left: Any, right: Any) -> Any:
+        """What the method says of whole images."""
+        return self._method.scaling(left[:, ::-1], right[:, ::-1])
+
+    def with_uncertainty(
+        self,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        disparity_range: DisparityRange,
+        scaling: Any = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """The disparity, and its standard uncertainty if the method states one."""
+        found, sigma = self._method.with_uncertainty(
+            flipped(left), flipped(right), _negated(disparity_range), scaling
+        )
+        return -flipped(found), None if sigma is None else flipped(sigma)
+
+
+class MirroredBatchMethod(MirroredMethod):
+    """Such a method that takes many pairs at once."""
+
+    _method: PositiveBatchMethod
+
+    def many(
+        self,
+        pairs: Iterable[ImagePair],
+        disparity_range: DisparityRange,
+    ) -> Iterator[Matched]:
+        """The results of many pairs, in their order; see :class:`matcher.BatchMatcher`."""
+        turned = (ImagePair(name, flipped(left), flipped(right)) for name, left, right in pairs)
+        for found in self._method.many(turned, _negated(disparity_range)):
+            sigma = found.uncertainty
+            yield found._replace(
+                disparity=-flipped(found.disparity),
+                uncertainty=None if sigma is None else flipped(sigma),
+            )
+
+
+def flipped(image: NDArray[Any]) -> NDArray[Any]:
+    """An image [h, w] or [h, w, 3] with its columns from right to left."""
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _negated(disparity_range: DisparityRange) -> DisparityRange:
+    """The range of −d for whole disparities d of a range."""
+    low, high = disparity_range
+    return 1 - high, 1 - low
+
+
 def _added(disparity_range: DisparityRange) -> tuple[tuple[int, int], tuple[int, int]]:
     """Columns before and after the left image, and the right one."""
     low, high = disparity_range
@@ -163,17 +231,20 @@ def with_polarity(
         if value not in known:
             raise InputError(
                 f"method {name!r}: {key} is {value!r}",
-                remedy=f"take one of {', '.join(map(str, known[:2]))}",
+                remedy=f"take one of {', '.join(filter(None, known))}",
             )
     if polarity == "any":
         if outside is not None:
             raise InputError(
-                f"method {name!r} has outside without polarity: positive",
+                f"method {name!r} has outside without polarity: positive or mirrored",
                 remedy="take outside away, or add the polarity",
             )
         return method
     invalid = outside == "invalid" or (
         outside is None and getattr(method, "invalid_outside", False)
     )
-    kind = PositiveBatchMethod if isinstance(method, BatchMatcher) else PositiveMethod
-    return kind(method, invalid)
+    is_batch = isinstance(method, BatchMatcher)
+    made = (PositiveBatchMethod if is_batch else PositiveMethod)(method, invalid)
+    if polarity == "positive":
+        return made
+    return (MirroredBatchMethod if is_batch else MirroredMethod)(made)

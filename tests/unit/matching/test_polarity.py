@@ -107,6 +107,27 @@ def test_opencv_of_positive_disparities_gives_that_of_both_signs_but_next_to_the
     assert np.isfinite(found[:, :30]).any()
 
 
+@pytest.mark.parametrize("span", [RANGE, (3, 60), (-110, -10)])
+def test_a_mirrored_matcher_sees_flipped_images_and_gives_disparities_of_the_left_one(pair, span):
+    asked = []
+
+    def positive(left, right, disparity_range):
+        asked.append(disparity_range)
+        return positive_block_matching(left, right, disparity_range)
+
+    method = with_polarity("p", FunctionMethod(positive), "mirrored")
+    found, expected = method(*pair, span), block_matching(*pair, span)
+    # equal costs of two disparities are decided by their order, which is turned around
+    assert np.mean(np.abs(found - expected) < 1e-3) > 0.8
+    match = np.indices(SHAPE)[1] - patches()
+    here = (match >= 3) & (match < SHAPE[1] - 3) & (patches() > span[0]) & (patches() < span[1] - 1)
+    assert here.any()
+    assert np.mean(np.abs(found - patches())[here] < 0.5) > 0.8
+    # a range below 0 is one above 0 in the flipped images, and nothing is widened for it
+    low, high = asked[0]
+    assert (low, high) == ((11, 111) if span == (-110, -10) else (0, span[1] - span[0]))
+
+
 def test_what_matches_outside_is_kept_or_not(pair):
     match = np.indices(SHAPE)[1] - patches()
     inside = (match >= 0) & (match < SHAPE[1])

@@ -56,6 +56,7 @@ def write_benchmark(
         "dataset": dataset,
         "headlines": headlines(methods, tables),
         "methods": [(of["label"], describe(of), _settings(of)) for of in methods],
+        "doubts": [f"{of['label']}: {doubt}" for of in methods for doubt in of["doubts"]],
         "links": [
             *((f"{t.name}.csv", f"{t.name}.csv", "") for t in tables),
             *((of["label"], str(way(out, folder)), "") for of, folder in zip(methods, scores)),

@@ -4,8 +4,9 @@ scores.csv   a row per tile
 cities.csv   a row per city, and one of all, with 95 % confidence intervals, and the median absolute
              error of the valid pixels (``median_px``; what is beyond 16 px counts as 16)
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
-scores.json  all of it but the tiles, with settings, time and memory, and of methods that state
-             uncertainties what :mod:`.confidence` says of them by stratum
+scores.json  all of it but the tiles, with settings, time and memory, what makes the results
+             doubtful (see :mod:`.doubts`), why rows have no intervals (``no_interval``), and
+             of methods that state uncertainties what :mod:`.confidence` says of them by stratum
 cumulative.csv  the distribution of errors (see :mod:`.cumulative`)
 sparsification.csv  of such methods: mean errors by the share of pixels taken away
 panels/      pictures of tiles: left, right, truth, disparity, error
@@ -30,6 +31,7 @@ from ...products.files import atomic_folder, write_table
 from ...products.rasters import read_image
 from .confidence import SHARES, Confidence
 from .cumulative import Cumulative
+from .doubts import Doubts
 from .panels import Column, draw_columns
 from .prediction_files import read_prediction, read_record, read_uncertainty
 from .protocols import Protocol, pair_sha256, protocol_of
@@ -70,6 +72,7 @@ class _Sums:
     products: Products
     collector: Collector
     cumulative: Cumulative
+    doubts: Doubts
     confidences: dict[str, Confidence] = field(default_factory=dict)
     errors: dict[str, ErrorSum] = field(default_factory=dict)
     scored: list[tuple[str, str]] = field(default_factory=list)  # pairs, digests of their truth
@@ -79,7 +82,10 @@ class _Sums:
         """Of no pair yet."""
         thresholds = protocol.thresholds_px
         scorer = Scorer(dataset.disparity_range, thresholds, dataset.grows_with_height)
-        return cls(scorer, protocol, products, Collector(thresholds), Cumulative(thresholds))
+        doubts = Doubts(dataset.disparity_range)
+        return cls(
+            scorer, protocol, products, Collector(thresholds), Cumulative(thresholds), doubts
+        )
 
     def add(
         self, pair: Pair, labels: np.ndarray, found: np.ndarray, sigma: np.ndarray | None
@@ -94,6 +100,7 @@ class _Sums:
             truths = [truth, *exact_of_pair.values()]
         self.scored.append((pair.name, pair_sha256(pair, truths)))
         here = scorer.counted(truth)
+        self.doubts.add(found, np.where(here, truth, np.nan))
         self.cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
         sums = scorer.sums(found, truth, strata_of_labels)
         for stratum, exact in exact_of_pair.items():
@@ -192,6 +199,7 @@ def score(
             "thresholds_px": list(protocol.thresholds_px),
             "bootstrap": plan.bootstrap,
             "height_m_per_px": height_m_per_px(pairs, products),
+            "doubts": sums.doubts.lines(),
             **rows,
             "confidence": [{"stratum": name, **of.figures()} for name, of in confidences],
         }
@@ -201,6 +209,8 @@ def score(
         text = json.dumps(summary, indent=2) + "\n"
         (scratch / "scores.json").write_text(text, encoding="utf-8")
     log.info("%s: %s", label, describe(summary))
+    for doubt in summary["doubts"]:
+        log.warning("%s: %s", label, doubt)
     return summary
 
 
@@ -287,4 +297,5 @@ def _row(
         row[key] = value
         if key in intervals:
             row[f"{key}_low"], row[f"{key}_high"] = intervals[key] or (None, None)
+    row["no_interval"] = scores.no_interval(sampling["times"], where, stratum)
     return row

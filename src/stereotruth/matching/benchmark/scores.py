@@ -75,10 +75,8 @@ class Scores:
 
         None of fewer than ``MIN_TILES`` tiles, which would not show how much tiles differ.
         """
-        sums = self.sums[:, self.strata.index(stratum)]
-        sums = sums if where is None else sums[where]
-        sums = sums[sums[:, 0] > 0]
-        if len(sums) < MIN_TILES or not times:
+        sums = self._with_labels(where, stratum)
+        if self.no_interval(times, where, stratum):
             return dict.fromkeys(
                 name for name in self._figures(self.sums[0, 0]) if name != "labelled"
             )
@@ -90,6 +88,21 @@ class Scores:
                 low, high = np.percentile(values, CONFIDENCE) if values else (np.nan, np.nan)
                 found[name] = (round(float(low), 6), round(float(high), 6)) if values else None
         return found
+
+    def no_interval(self, times: int, where: Bools | None = None, stratum: str = ALL) -> str | None:
+        """Why :meth:`intervals` has none; None where it has them."""
+        if not times:
+            return "benchmark.bootstrap is 0"
+        count = len(self._with_labels(where, stratum))
+        if count < MIN_TILES:
+            return f"{count} tiles have such labels, and resampling needs {MIN_TILES}"
+        return None
+
+    def _with_labels(self, where: Bools | None, stratum: str) -> Floats:
+        """Sums [tile, quantity] of the chosen tiles that have labels in the stratum."""
+        sums = self.sums[:, self.strata.index(stratum)]
+        sums = sums if where is None else sums[where]
+        return sums[sums[:, 0] > 0]
 
 
 def resampled(sums: Floats, times: int, seed: int) -> Floats:

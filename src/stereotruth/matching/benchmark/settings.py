@@ -35,14 +35,15 @@ class Method:
     weights: Annotated[Text | None, Unit("path")] = None
     """of a network; null: those that rule train makes"""
 
-    polarity: Literal["any", "positive"] = "any"
+    polarity: Literal["any", "positive", "mirrored"] = "any"
     """of the disparities x_left − x_right that the method sees by itself: positive ones only, as
     most networks, or any; the images of the former are moved and widened for ranges that begin
-    below 0"""
+    below 0; mirrored: likewise, with both images flipped from left to right, for pairs whose
+    disparity falls with height"""
 
     outside: Literal["kept", "invalid"] | None = None
-    """with `polarity: positive`, disparities of pixels whose match lies outside the right image;
-    null: invalid for SGM, kept for others"""
+    """with `polarity: positive` or `mirrored`, disparities of pixels whose match lies
+    outside the right image; null: invalid for SGM, kept for others"""
 
     licence: Text = ""
     """of the method and its weights, for `scores.json`"""

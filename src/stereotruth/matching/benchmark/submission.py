@@ -126,5 +126,6 @@ def _figures(summary: Mapping[str, Any]) -> Iterable[tuple[str, float | None]]:
     for row in (summary["all"], *summary["cities"], *summary["strata"]):
         place = row.get("city") or row["stratum"]
         for key, value in row.items():
-            if key not in ("city", "stratum") and not key.endswith(("_low", "_high")):
+            told = ("city", "stratum", "no_interval")
+            if key not in told and not key.endswith(("_low", "_high")):
                 yield f"{key} of {place}", value

@@ -125,3 +125,16 @@ def test_few_tiles_have_no_intervals():
     scores, _ = random_tiles(4)
     assert set(scores.intervals(100, 1).values()) == {None}
     assert set(random_tiles(9)[0].intervals(0, 1).values()) == {None}
+
+
+def test_rows_without_intervals_say_why():
+    few = Collector((3.0,))
+    for number in range(4):
+        few.add(f"t{number}", "KM", {"all": np.array([10, 10, 5.0, 1, 5.0, 1])})
+    scores = few.scores()
+    assert set(scores.intervals(100, 1).values()) == {None}
+    assert scores.no_interval(100) == "4 tiles have such labels, and resampling needs 5"
+    few.add("t4", "KM", {"all": np.array([10, 10, 9.0, 1, 9.0, 1])})
+    assert few.scores().no_interval(100) is None
+    assert None not in few.scores().intervals(100, 1).values()
+    assert few.scores().no_interval(0) == "benchmark.bootstrap is 0"
