@@ -25,7 +25,8 @@ from tests.synthetic.copc_server import (
 )
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.octree import Footprint, open_octree
+from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.octree import open_octree
 
 SIDE = 2048.0
 

@@ -20,7 +20,7 @@ from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
 from ..errors import InputError
 from .las_files import _decoding
 from .las_layout import LASZIP, LAYERED, Layout, _Packing, _records, _require
-from .octree import MOST_NODES, Node, Octree, good_key
+from .octree_nodes import MOST_NODES, Node, Octree, good_key
 from .ranges import Range, Ranges
 
 INFO = (b"copc", 1)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.octree import Footprint, open_octree
+from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.octree import open_octree
 from tests.synthetic.copc_server import (
     CORNER,
     FILE_FAULTS,
