@@ -1,4 +1,4 @@
-"""Points of an octree (COPC, EPT) that lie in a footprint, with a proof that none is missing.
+"""Points of an octree (COPC) that lie in a footprint, with checks that none is missing.
 
 An octree keeps its points in nodes: cubes of half the side of their parent's. Which nodes may hold
 points of a footprint follows from the octree's own cube, never from the header's bounds, which
@@ -6,7 +6,8 @@ writers get wrong. Before any point is read, the counts of all nodes of the hier
 the header's count. While points are read, each node must hold as many as the hierarchy says, all of
 them within the node's cube: else other nodes may hold points of the footprint too, and the file is
 refused. One fault cannot be told without reading all: a hierarchy that gives the points of a node
-to a smaller one inside it, outside of the footprint, and the other way round. Sources: COPC 1.0 (Hobu), "Hierarchy"; EPT 1.1.0 (Hobu/Entwine), "Hierarchy".
+to a smaller one inside it, outside of the footprint, and the other way round. Source: COPC 1.0
+(Hobu), "Hierarchy".
 """
 
 from __future__ import annotations
@@ -33,10 +34,7 @@ _WHOLE = "have the file written again, or download it and name the copy to read 
 
 @dataclass(frozen=True)
 class Node:
-    """A node with points. ``start``: its first byte in the file, 0 where it has a file of its own.
-
-    ``bytes`` of its compressed points; 0 where only its own file tells.
-    """
+    """A node with points: its first byte in the file, and the bytes of its compressed points."""
 
     key: tuple[int, int, int, int]  # level, x, y, z
     points: int
@@ -63,7 +61,7 @@ class NodePlan:
 
     @property
     def bytes(self) -> int:
-        """Bytes of all nodes; 0 where nodes have files of their own."""
+        """Bytes of all nodes."""
         return sum(node.bytes for node in self.nodes)
 
 
