@@ -271,14 +271,57 @@ def stores_of(
     return found
 
 
+def adjusted_scenes(
+    settings: Configuration,
+    scenes: Mapping[str, sheets.Scene],
+    names: Mapping[str, tuple[str, str]],
+) -> dict[str, tuple[str, str]]:
+    """Scenes whose images are adjusted together with those of other scenes of their city.
+
+    Each with the names of both images; one that is not in the images sheet is named by the path in
+    the scenes sheet. They are
+    the scenes that share an image with another one, or have an image whose correction is fixed;
+    none without refinement, and none whose own alignment is fixed. ``names``: see
+    :func:`names_in_pair`, by scene.
+    """
+    fixed = settings.alignment.fixed
+    if not settings.alignment.refine:
+        return {}
+    of_scenes: dict[str, tuple[str, str]] = {}
+    taken: dict[tuple[str, str], set[str]] = {}
+    paths: dict[str, str] = {}
+    for name, scene in scenes.items():
+        if name in fixed:
+            continue
+        files = scene.left_image, scene.right_image
+        keys = [sheets.file_key(file) for file in files]
+        for key, file in zip(keys, files):
+            paths[key] = min(paths.get(key, file), file)
+        images = [own or key for own, key in zip(names[name], keys)]
+        of_scenes[name] = images[0], images[1]
+        for image in images:
+            taken.setdefault((scene.city, image), set()).add(name)
+    return {
+        name: (paths.get(images[0], images[0]), paths.get(images[1], images[1]))
+        for name, images in of_scenes.items()
+        if any(len(taken[scenes[name].city, image]) > 1 or image in fixed for image in images)
+    }
+
+
 @in_words()
-def check_fixed(settings: Configuration, scenes: Mapping[str, sheets.Scene]) -> None:
-    """Raise InputError if alignment.fixed names a scene or a file that does not exist."""
+def check_fixed(
+    settings: Configuration,
+    scenes: Mapping[str, sheets.Scene],
+    images: Mapping[str, sheets.Image],
+) -> None:
+    """Raise InputError if alignment.fixed names no scene and no image, or no file."""
     for name, file in settings.alignment.fixed.items():
-        if name not in scenes or not Path(file).is_file():
+        known = name in scenes or name in images
+        if not known or not Path(file).is_file():
             raise InputError(
                 f"alignment.fixed: {name}: {file}: "
-                + ("no such file" if name in scenes else "no such scene"),
+                + ("no such file" if known else "no such scene or image"),
                 file=sheet(settings, "scenes"),
-                remedy="take a scene of the sheet, and the path of its alignment.json",
+                remedy="take a scene of the sheet and the path of its alignment.json, or an image "
+                "of the images sheet and a copy of results/adjust/<city>.json",
             )

@@ -181,7 +181,7 @@ MINE = {"root": "mine", "layout": "whu", "disparity_range": [-64, 64]}
         ("project.recipe", "papr", ["'papr'", "surface, paper"]),
         ("ingest.drop_classes", [300], ["ingest.drop_classes.0: 300"]),
         ("ingest.drop_classes", [7, 7], ["ingest.drop_classes", "a value twice"]),
-        ("alignment.fixed", {"S-1": 3}, ["alignment.fixed.S-1: 3", "scene: path"]),
+        ("alignment.fixed", {"S-1": 3}, ["alignment.fixed.S-1: 3", "scene or image: path"]),
         ("strips", 0, ["strips: 0", "1 … 1000"]),
         ("strips", {"S-1": 0}, ["strips.S-1: 0", "1 … 1000"]),
         ("predict.offset", "best", ["predict.offset: 'best'", "px, auto"]),

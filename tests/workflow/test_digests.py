@@ -24,6 +24,8 @@ REACH = {
     "ingest": {"lidar", "products"},
     "align": {"alignment", "epipolar", "products"},
     "refine": {"alignment", "epipolar", "lidar", "products"},
+    "adjust": {"alignment", "epipolar", "lidar", "products"},
+    "adjusted_alignment": {"alignment", "epipolar", "lidar", "products"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
     "project": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},

@@ -32,6 +32,7 @@ rule align:
         names=lambda wildcards: IMAGE_NAMES[wildcards.scene],
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
+        alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         code=source_digest("alignment.align", "alignment.align_report"),
     message:
         "Aligning scene {wildcards.scene} to its ground control points"

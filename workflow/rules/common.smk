@@ -9,6 +9,7 @@ from stereotruth.errors import InputError, in_words
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.project import (
     FILES,
+    adjusted_scenes,
     check_fixed,
     is_synthetic,
     lidar_of,
@@ -35,7 +36,8 @@ try:
     IMAGE_NAMES = {name: names_in_pair(scene, images) for name, scene in SCENES.items()}
     LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
     STORES = stores_of(SCENES, LIDAR)
-    check_fixed(SETTINGS, SCENES)
+    check_fixed(SETTINGS, SCENES, images)
+    ADJUSTED = adjusted_scenes(SETTINGS, SCENES, IMAGE_NAMES)
 except InputError as error:
     raise Refused(str(error))
 

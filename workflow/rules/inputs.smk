@@ -39,6 +39,8 @@ def alignment_of(wildcards):
     """The alignment that the scene's rectified images and labels are made with."""
     if fixed := SETTINGS.alignment.fixed.get(wildcards.scene):
         return given(fixed)
+    if wildcards.scene in ADJUSTED:
+        return f"results/adjust/{wildcards.city}/{wildcards.scene}/alignment.json"
     stage = "refine" if SETTINGS.alignment.refine else "align"
     return f"results/{stage}/{wildcards.city}/{wildcards.scene}/alignment.json"
 
@@ -46,7 +48,45 @@ def alignment_of(wildcards):
 def refinements(wildcards):
     """The alignments that a city's labels are made with, where they are not those of rule align."""
     files = [alignment_of(scene) for scene in scenes_of(wildcards.city)]
-    return [file for file in files if file.startswith("results/refine/")]
+    return [file for file in files if file.startswith(("results/refine/", "results/adjust/"))]
+
+
+def refinement_figures(wildcards):
+    """The figures of the refinements of a city's scenes, each by its own tie points."""
+    return [
+        f"results/refine/{scene.city}/{scene.scene}/refinement.png"
+        for scene in scenes_of(wildcards.city)
+        if SETTINGS.alignment.refine and scene.scene not in SETTINGS.alignment.fixed
+    ]
+
+
+def adjusted_pairs(city):
+    """The scenes of a city whose images are adjusted together, by name."""
+    return sorted(scene for scene in ADJUSTED if SCENES[scene].city == city)
+
+
+def of_adjusted_pairs(file):
+    """Input function: a file of each scene of a city whose images are adjusted together."""
+
+    def files_of(wildcards):
+        return [
+            file.format(city=wildcards.city, scene=scene)
+            for scene in adjusted_pairs(wildcards.city)
+        ]
+
+    return files_of
+
+
+def gcps_of_adjusted(wildcards):
+    """The control points of all images that are adjusted together, each file once."""
+    files = [SCENES[scene].gcps for scene in adjusted_pairs(wildcards.city)]
+    return [given(file) for file in dict.fromkeys(filter(None, files))]
+
+
+def fixed_images(wildcards):
+    """Files of ``alignment.fixed`` by image of a city that is adjusted with others."""
+    images = {name for scene in adjusted_pairs(wildcards.city) for name in ADJUSTED[scene]}
+    return {k: v for k, v in SETTINGS.alignment.fixed.items() if k in images}
 
 
 def strips_made(wildcards, file):

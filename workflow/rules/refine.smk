@@ -20,6 +20,7 @@ rule refine:
             category="Alignment",
             labels={"scene": "{scene}", "kind": "figure of the refinement"},
         ),
+        equations="results/refine/{city}/{scene}/equations.json",
     log:
         "logs/refine/{city}/{scene}.log",
     benchmark:
@@ -33,8 +34,9 @@ rule refine:
     params:
         script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
+        alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         bands=asdict(SETTINGS.rectify),
-        code=source_digest("alignment.refine", "alignment.refine_report"),
+        code=source_digest("alignment.refine", "alignment.refine_report", "alignment.tie_equations"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:

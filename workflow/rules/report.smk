@@ -7,9 +7,7 @@ rule report_city:
             f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
         ],
         refinements=refinements,
-        refinement_figures=lambda w: [
-            str(Path(file).with_name("refinement.png")) for file in refinements(w)
-        ],
+        refinement_figures=refinement_figures,
         table4=rules.evaluate_images.output.table4,
         sift=rules.evaluate_images.output.sift,
         sift_figure=rules.evaluate_images.output.sift_figure,

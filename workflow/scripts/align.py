@@ -1,7 +1,10 @@
 """One scene's images to its ground control points."""
 
+import logging
+
 from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.align_report import write_alignment
+from stereotruth.errors import InputError
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
@@ -15,17 +18,24 @@ if __name__ == "__main__":
     ):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
+        alignment = None
         if snakemake.input.gcps:
-            alignment = align(
-                *images,
-                snakemake.input.gcps,
-                names=snakemake.params.names,
-                model=model,
-                scene=scene,
-                strict=strict,
-                provenance=provenance,
-            )
-        else:
+            try:
+                alignment = align(
+                    *images,
+                    snakemake.input.gcps,
+                    names=snakemake.params.names,
+                    model=model,
+                    scene=scene,
+                    strict=strict,
+                    provenance=provenance,
+                )
+            except InputError as error:
+                if snakemake.params.alone:
+                    raise
+                # The points count among those of all images of the site (rule adjust).
+                logging.getLogger("stereotruth").info("by the RPCs alone: %s", error)
+        if alignment is None:
             alignment = from_rpcs(*images, model=model, scene=scene, provenance=provenance)
         write_alignment(
             alignment,

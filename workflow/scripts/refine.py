@@ -3,6 +3,7 @@
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_report import write_refinement
+from stereotruth.alignment.tie_equations import write_equations
 from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
@@ -28,6 +29,7 @@ if __name__ == "__main__":
             masks=masks,
             bands=Settings(**snakemake.params.bands),
             strict=snakemake.params.strict,
+            alone=snakemake.params.alone,
             provenance=describe(inputs, {}, snakemake.params.code),
         )
         write_refinement(
@@ -37,4 +39,9 @@ if __name__ == "__main__":
             snakemake.output.observations,
             snakemake.output.figure,
             given.left[0],
+        )
+        write_equations(
+            snakemake.output.equations,
+            observations.of_images if observations else None,
+            alignment.refinement["reason"],
         )

@@ -12,7 +12,7 @@ from ..epipolar.model import EpipolarModel
 from ..epipolar.rpc import SensorModel
 from ..numerics.robust import TUKEY, robust_sigma, tukey_weights
 from .align import RPC_TILT
-from .aligned_pair import Alignment
+from .aligned_pair import Alignment, ViewFit
 from .tie_points import Geometry, TiePoints
 
 Bools = NDArray[np.bool_]
@@ -36,7 +36,7 @@ class Observations:
     ``at``: place in the left grid.
     ``before``: disparity of LiDAR minus that of the images, and y-parallax (y of the right position
     found minus that of the left), with the alignment as it came; ``after`` with the refined one.
-    ``used`` bool[n]: not a blunder.
+    ``used`` bool[n]: not a blunder. ``of_images``: the same, as equations of both images.
     """
 
     ties: TiePoints
@@ -44,6 +44,7 @@ class Observations:
     before: Floats
     after: Floats
     used: Bools
+    of_images: PairEquations
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,23 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
+class PairEquations:
+    """What the tie points of a pair say of its images, whatever alignment they were found with.
+
+    ``equations``: of the parameters [12] of :func:`parameters_of` of both images, left first.
+    ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
+    with which the tie points were matched. ``places``: where the images were compared, with and
+    without a match. ``common_px``: see :func:`estimate`.
+    """
+
+    equations: Equations
+    start: Floats
+    linearised_at: Floats
+    places: int
+    common_px: float
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters [12] in the order of ``Alignment.covariance``, and what they rest on.
 
@@ -76,6 +94,7 @@ class Estimate:
     ``statistic``: chi-square of the observations against no change, ``contradiction``: that of the
     observations against the prior, the uncertainties of both counted.
 
+    ``information`` [n, 2] px⁻²: weight over variance of each observation, along and across.
     ``root`` [12, r]: a root of the prior's covariance; ``normal`` [r, r]: information of the
     observations about parameters / root; ``alone`` [12]: what they say by themselves.
     """
@@ -93,6 +112,7 @@ class Estimate:
     root: Floats
     normal: Floats
     alone: Floats
+    information: Floats
 
     def amount_along(self, direction: Floats) -> tuple[float, float]:
         """By how much of a direction [12] observations and prior differ, and its deviation.
@@ -197,6 +217,41 @@ def _agreement(at: Floats, observed: Floats, scale: Floats) -> Floats:
     return observed - basis @ best
 
 
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Normal equations of observations that share an unknown error of SYSTEMATIC px.
+
+    ``normal`` [r, r] and ``right`` [r] without that error; ``single`` [r, r]: normal matrix as if
+    there were none; ``shared`` [r, 2]: what parameters and the error have in common; ``total`` [2]
+    px⁻²: information about the error, along and across.
+    """
+
+    normal: Floats
+    right: Floats
+    single: Floats
+    shared: Floats
+    total: Floats
+
+    @classmethod
+    def of(cls, design: Floats, observed: Floats, information: Floats) -> Sums:
+        """Of a design [n, 2, r], observations [n, 2] px and their ``information`` [n, 2] px⁻²."""
+        weighted = design * information[:, :, None]
+        normal = np.einsum("nap,naq->pq", weighted, design)
+        right = np.einsum("nap,na->p", weighted, observed)
+        shared = weighted.sum(axis=0).T  # [r, 2], with what all observations have in common
+        total = information.sum(axis=0) + SYSTEMATIC**-2.0
+        single = normal.copy()
+        normal -= (shared / total) @ shared.T
+        right -= (shared / total) @ np.sum(information * observed, axis=0)
+        return cls(normal, right, single, shared, total)
+
+    def spread(self, common: Floats) -> Floats:
+        """Covariance [r, r] of ``right``, by errors that have ``common`` [2] px in common."""
+        floor, total = SYSTEMATIC**-2.0, self.total
+        share = self.shared * (total + floor - (common * floor) ** 2) / total**2
+        return self.single - share @ self.shared.T
+
+
 def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Estimate:
     """Parameters [12] from the equations and the prior, a covariance [12, 12] about zero.
 
@@ -229,14 +284,8 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
         )
         variance = expected**2 * (sigma**2 + counts[:, None] * site_sigma**2)
         information = weights[:, None] / variance
-        weighted = inner * information[:, :, None]
-        normal = np.einsum("nap,naq->pq", weighted, inner)
-        right = np.einsum("nap,na->p", weighted, observed)
-        shared = weighted.sum(axis=0).T  # [r, 2], with what all observations have in common
-        total = information.sum(axis=0) + SYSTEMATIC**-2.0
-        single = normal.copy()
-        normal -= (shared / total) @ shared.T
-        right -= (shared / total) @ np.sum(information * observed, axis=0)
+        sums = Sums.of(inner, observed, information)
+        normal, right = sums.normal, sums.right
         last = z
         # Weights and scatter are those about what the tie points say by themselves: an alignment
         # that is far off and sure of itself shall not make them look bad.
@@ -251,11 +300,8 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
     own = expected[:, 0]
     common = np.array([_shared_sigma(residuals[:, k], information[:, k], own) for k in (0, 1)])
     common = np.hypot(common, common_px)
-    # That of the right side, by errors of the observations that have this in common:
-    floor = SYSTEMATIC**-2.0
-    single -= (shared * (total + floor - (common * floor) ** 2) / total**2) @ shared.T
     to_parameters = root @ np.linalg.inv(np.eye(rank) + normal)
-    covariance = to_parameters @ (np.eye(rank) + single) @ to_parameters.T
+    covariance = to_parameters @ (np.eye(rank) + sums.spread(common)) @ to_parameters.T
     return Estimate(
         np.round(root @ z, 8),  # so that the count of threads leaves no trace
         np.round(covariance, 14),
@@ -270,6 +316,7 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
         root,
         normal,
         root @ alone,
+        information,
     )
 
 
@@ -299,6 +346,46 @@ def linearised_at(
         fit.design(at[:, 0], at[:, 1]) for fit, at in zip(alignment.fits, (ties.left, ties.right))
     )
     return np.concatenate([-slopes @ ties.carry @ left, slopes @ right], axis=-1), slopes
+
+
+def over_the_image(fit: ViewFit) -> ViewFit:
+    """The fit with parameters that are those of the image alone: from its middle, by half a side.
+
+    Its covariance is left as it was, in the parameters that the fit had.
+    """
+    cols, rows = fit.size
+    return replace(fit, origin=((cols - 1) / 2, (rows - 1) / 2), scale=max(cols, rows) / 2)
+
+
+def parameters_of(fit: ViewFit) -> Floats:
+    """[6] of a fit's affine against none, in the order of ``covariance`` and its coordinates."""
+    change = fit.affine - np.eye(2, 3)
+    at_origin = change[:, 2] + change[:, :2] @ np.array(fit.origin)
+    return np.column_stack([change[:, :2] * fit.scale, at_origin]).ravel()
+
+
+def pair_equations(
+    start: Alignment,
+    current: Alignment,
+    model: EpipolarModel,
+    ties: TiePoints,
+    places: int,
+    common_px: float,
+) -> PairEquations:
+    """The equations of tie points that were matched with an alignment ``current``.
+
+    ``start``: that by control points or RPCs; ``model``: of the current one.
+    """
+
+    def parameters(alignment: Alignment) -> Floats:
+        return np.concatenate([parameters_of(over_the_image(fit)) for fit in alignment.fits])
+
+    left, right = (over_the_image(fit) for fit in current.fits)
+    design, slopes = linearised_at(replace(current, left_fit=left, right_fit=right), model, ties)
+    at = parameters(current)
+    observed = np.einsum("nab,nb->na", slopes, ties.shift) + design @ at
+    equations = Equations(design, observed, ties.sigma, ties.site, ties.left)
+    return PairEquations(equations, parameters(start), at, places, common_px)
 
 
 def with_corrections(alignment: Alignment, parameters: Floats) -> Alignment:

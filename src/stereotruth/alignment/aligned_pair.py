@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..epipolar.rpc import SensorModel
+from ..errors import InputError
 from ..products.files import atomic_file, read_perhaps_edited, read_record, sealed
 
 log = logging.getLogger("stereotruth")
@@ -190,13 +191,20 @@ class Alignment:
         """Read what :meth:`save` wrote, or what a user made of it for ``alignment.fixed``.
 
         A file that is not as it was written is told in the log. Raises InputError if it cannot be
-        used.
+        used, or says why the pair has no alignment.
         """
 
         def read(file: str | Path) -> dict[str, Any]:
             values, is_as_written = read_perhaps_edited(file)
             if not is_as_written:
                 log.warning("%s: edited since it was made; its values are used as they are", file)
+            if "refused" in values:
+                raise InputError(
+                    values["refused"],
+                    file=file,
+                    remedy="remove the pair from the scenes sheet, or correct the image's RPC, "
+                    "file or control points",
+                )
             return values
 
         return read_record(path, cls.from_dict, what="alignment", stage="align", read=read)

@@ -34,6 +34,14 @@ LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
 
 
+class TooFewPoints(InputError):
+    """Control points that cannot carry the correction of an image by themselves."""
+
+
+class NoPoints(TooFewPoints):
+    """Control points of a site, none of which the images of a pair show."""
+
+
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
     """n points in ascending order of their ids, whatever the order in the file.
@@ -76,8 +84,8 @@ def read_gcps(
     file = Path(file)
     of = f" (scene {scene})" if scene else ""
 
-    def fail(problem: str, remedy: str) -> InputError:
-        return InputError(problem + of, file=file, remedy=remedy)
+    def fail(problem: str, remedy: str, kind: type[InputError] = InputError) -> InputError:
+        return kind(problem + of, file=file, remedy=remedy)
 
     rows = _rows(file, fail)
     if rows and "image" in rows[0][1]:
@@ -174,6 +182,7 @@ def _as_pair(
         raise fail(
             f"no point is measured in {images[0]} or {images[1]}",
             "measure some, or leave column gcps empty",
+            NoPoints,
         )
     return list(found.values())
 

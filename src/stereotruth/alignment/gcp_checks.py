@@ -15,7 +15,7 @@ from ..epipolar.rpc_files import read_rpc, rpc_file
 from ..errors import InputError, in_number
 from ..numerics.degrees import metres_per_degree
 from ..products.ungeoreferenced import open_raster
-from .control_points import ControlPoints
+from .control_points import ControlPoints, TooFewPoints
 from .robust_fit import MINIMAL, System
 
 Floats = NDArray[np.float64]
@@ -303,7 +303,7 @@ def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: s
         return
     out = [points.ids[i] for i in view.index[~used]]
     rest = f" after {_some(out)} were left out" if out else ""
-    raise InputError(
+    raise TooFewPoints(
         f"{_where(view)}: {defect}{rest}{of}",
         file=points.file,
         remedy=_remedy(model, view.predicted[used]),

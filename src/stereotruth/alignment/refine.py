@@ -41,6 +41,7 @@ from .adjustment import (
     epipolar_model,
     estimate,
     linearised_at,
+    pair_equations,
     prior_of,
     pull_of,
     with_corrections,
@@ -55,12 +56,11 @@ from .lidar_checks import (
     height_by_rpcs,
     pixel_m,
 )
-from .tie_points import Geometry, TiePoints, common_shift, match
+from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 FINE = 6  # px: radius of the first search around every place
@@ -77,11 +77,14 @@ DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, t
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
 
 
-def _spread(values: Floats, ties: TiePoints, size: tuple[int, int]) -> dict[str, float]:
-    """Figures of one component [n] in px; the trend is that of a plane over the left image."""
+def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
+    """Figures of one component [n] in px; the trend is that of a plane over the left image.
+
+    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
+    """
     median, nmad = median_and_nmad(values)
     middle, half = np.array(size) / 2, max(size) / 2
-    design = np.column_stack([(ties.left - middle) / half, np.ones(len(values))])
+    design = np.column_stack([(at - middle) / half, np.ones(len(values))])
     plane = np.linalg.lstsq(design, values, rcond=None)[0]
     figures = {
         "median": median,
@@ -120,7 +123,7 @@ def _record(
     size = alignment.left_fit.size
     spreads = {
         word: {
-            name: _spread(values[used, k], _subset(ties, used), size)
+            name: spread_of(values[used, k], ties.left[used], size)
             for k, name in enumerate(("disparity", "y_parallax"))
         }
         for word, values in (("before", observations.before), ("after", observations.after))
@@ -144,10 +147,6 @@ def _record(
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
         "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
     }
-
-
-def _subset(ties: TiePoints, which: Bools) -> TiePoints:
-    return TiePoints(**{name: values[which] for name, values in vars(ties).items()})
 
 
 def _chance(found: Estimate) -> float:
@@ -203,6 +202,9 @@ def _search(
         found = estimate(equations, prior, places.guard.common_px)
         change = float(np.abs(design @ (found.parameters - parameters)).max())
         log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
+        of_images = pair_equations(
+            alignment, current, model, ties, len(places), places.guard.common_px
+        )
         last, parameters = parameters, found.parameters
         current = with_corrections(alignment, parameters)
         if change < SETTLED and radius == FINEST:
@@ -214,6 +216,7 @@ def _search(
         observed + design @ last,
         observed + design @ (last - parameters),
         found.weights > 0.0,
+        of_images,
     )
     scatter = max(
         robust_sigma(observations.after[found.weights > 0.0, k], LEAST_SIGMA) for k in (0, 1)
@@ -280,6 +283,7 @@ def refine(
     masks: tuple[str | Path | None, str | Path | None] = (None, None),
     bands: Bands | None = None,
     strict: bool = False,
+    alone: bool = True,
     provenance: Mapping[str, Any] | None = None,
 ) -> tuple[Alignment, Observations | None]:
     """Refine an alignment by tie points between LiDAR and both images.
@@ -288,9 +292,9 @@ def refine(
     observations. It is the one that came, affines and all, if the tie points do not contradict
     it or are too few. Reads a fixed number of places, whatever the scene's size. ``masks``: of
     both images, see :class:`.image_reader.Source`; ``bands``: which are looked at. ``strict`` makes
-    warnings errors.
+    warnings errors. ``alone``: no other pair shares an image, whose tie points could help.
 
-    Raises InputError if there are neither GCPs nor usable tie points.
+    Raises InputError if there are neither GCPs nor usable tie points, and the pair is ``alone``.
     """
     of = f" (scene {alignment.scene})" if alignment.scene else ""
     with open_pair(left_image, right_image, *masks, bands=bands) as (left, right):
@@ -306,7 +310,7 @@ def refine(
         result = _search(alignment, (left, right), stores, prior)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
-        if not gcps:
+        if not gcps and alone:
             raise InputError(
                 f"no alignment without ground control points: {'; '.join([result, *doubts])}{of}",
                 file=left_image,

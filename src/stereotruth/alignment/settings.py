@@ -23,8 +23,11 @@ class Settings:
     `results/refine/<city>/<scene>/` says what was seen and changed, and doubts heights of the LiDAR
     that do not fit the control points, the images or the RPCs; with false nothing checks them"""
 
-    fixed: Annotated[dict[str, FilePath], Unit("scene: path")] = field(default_factory=dict)
+    fixed: Annotated[dict[str, FilePath], Unit("scene or image: path")] = field(
+        default_factory=dict
+    )
     """an `alignment.json` that a scene is made with as it is (a published one, or
     `results/refine/<city>/<scene>/alignment.json` put aside): neither control points nor LiDAR have
     a say any more, so that one more LiDAR file leaves all labels that it does not touch as they
-    are, to the bit"""
+    are, to the bit. Or an image of the images sheet and a copy of `results/adjust/<city>.json`: its
+    correction stays as it is there, and images that came later are adjusted to it"""

@@ -9,6 +9,7 @@ from ..configuration import Configuration
 from ..dataset.windows import cell_step
 from ..errors import InputError
 from ..project import (
+    adjusted_scenes,
     check_fixed,
     configured,
     is_synthetic,
@@ -70,7 +71,8 @@ def check_project(
     with project.of("sheets"):
         cities, every_scene = read_scenes(settings)
         rows = sheet(settings, "scenes")
-        check_fixed(settings, every_scene)
+        images = read_images(settings, cities)
+        check_fixed(settings, every_scene, images)
         found = chosen(names, every_scene, cities, rows)
         if not found:
             raise InputError(
@@ -85,14 +87,16 @@ def check_project(
             f"looking at {len(scenes)} scenes, about {duration(SCENE_SECONDS * len(scenes))}; "
             "stereotruth check SCENE … looks at some"
         )
-    images = read_images(settings, cities)
+    in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
+    adjusted = adjusted_scenes(settings, every_scene, in_sheet)
     every, facts = [project], []
     for name, scene in scenes.items():
         found = Findings(name)
         if is_synthetic(scene):
             found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
         else:
-            facts.append(check_scene(scene, settings, found, names_in_pair(scene, images)))
+            alone = name not in adjusted
+            facts.append(check_scene(scene, settings, found, in_sheet[name], alone=alone))
         every.append(found)
     if settings.images:
         towns = sorted({scene.city for scene in scenes.values()})

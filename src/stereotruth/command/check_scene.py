@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rasterio.errors import RasterioError
 
 from ..alignment.align import align, from_rpcs
 from ..alignment.aligned_pair import Alignment
-from ..alignment.control_points import ControlPoints, read_gcps
+from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..configuration import Configuration
 from ..disparity.overlap_check import Box, apart, refuse_apart
@@ -49,18 +50,24 @@ class SceneFacts:
 
 
 def check_scene(
-    scene: Scene, settings: Configuration, found: Findings, names: tuple[str, str] = ("", "")
+    scene: Scene,
+    settings: Configuration,
+    found: Findings,
+    names: tuple[str, str] = ("", ""),
+    *,
+    alone: bool = True,
 ) -> SceneFacts:
     """Add what is found of a scene to ``found``; what one part refuses keeps no other from it.
 
-    ``names`` of its images in the images sheet, where they stand in it.
+    ``names`` of its images in the images sheet, where they stand in it. ``alone``: the images are
+    not adjusted with those of other scenes, which may have the control points that it lacks.
     """
     facts = SceneFacts(scene.scene)
     files: dict[str, Path] = {}
     with found.of("files"):
         files = lidar_of(scene, settings)
     images = _check_images(scene, found)
-    alignment, gcps = _check_alignment(scene, settings, images, names, found)
+    alignment, gcps = _check_alignment(scene, settings, images, names, alone, found)
     model = None
     if alignment is not None:
         with found.of("images"):
@@ -150,21 +157,33 @@ def _is_sampled(dataset: rasterio.DatasetReader) -> bool:
     return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
 
 
+@contextmanager
+def _or_of_others(alone: bool, found: Findings) -> Iterator[None]:
+    """Too few control points are a fact where images are adjusted with those of other scenes."""
+    try:
+        yield
+    except TooFewPoints as error:
+        if alone:
+            raise
+        found.say("GCPs", Level.FACT, f"{error.problem}: placed by other images and tie points")
+
+
 def _check_alignment(
     scene: Scene,
     settings: Configuration,
     images: bool,
     names: tuple[str, str],
+    alone: bool,
     found: Findings,
 ) -> tuple[Alignment | None, ControlPoints | None]:
     """The alignment as rule align makes it, and the control points, if they can be read."""
     alignment = gcps = None
     if scene.gcps and Path(scene.gcps).is_file():
-        with found.of("GCPs"):
+        with found.of("GCPs"), _or_of_others(alone, found):
             gcps = read_gcps(scene.gcps, scene.scene, names)
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
-    with found.of("GCPs"):
+    with found.of("GCPs"), _or_of_others(alone, found):
         if name in settings.alignment.fixed:
             alignment = Alignment.load(settings.alignment.fixed[name])
         elif images and gcps is not None:

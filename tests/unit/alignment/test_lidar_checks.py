@@ -167,7 +167,7 @@ def sure() -> Estimate:
     nothing = np.zeros(12)
     return Estimate(
         nothing, np.eye(12) * 1e-4, nothing, nothing, nothing, nothing, 0.0, 12, 0.0, 12,
-        np.eye(12), np.eye(12), nothing,
+        np.eye(12), np.eye(12), nothing, np.zeros((0, 2)),
     )  # fmt: skip
 
 

@@ -1,0 +1,449 @@
+"""The adjustment of a site's images as files: figures by image and pair, and pairs' alignments."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.rpc import RPC, SensorModel
+from ..errors import InputError
+from ..numerics.robust import median_and_nmad
+from ..products.files import atomic_file, read_record, sealed
+from .adjustment import over_the_image
+from .align import LARGE_SHIFT
+from .aligned_pair import Alignment, GcpResidual, ViewFit
+from .control_points import NoPoints, read_gcps
+from .refine import MIN_USED, spread_of
+from .robust_fit import BLUNDER_SIGMAS
+from .site_fit import (
+    LEAST_POINTS,
+    FixedImages,
+    ImageToFit,
+    PairFit,
+    PairToFit,
+    PointsOfImage,
+    SiteFit,
+    fit_site,
+    residual_figures,
+)
+from .tie_equations import read_equations
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+
+
+WHAT = "corrections of the RPCs of a site's images, adjusted together"
+UNITS = {
+    "parameters": "px, (a_u, a_v, a_1, b_u, b_v, b_1): the correction of the RPC's (col, row) is "
+    "(a_u u + a_v v + a_1, b_u u + b_v v + b_1), (u, v) = ((col, row)_rpc - origin) / scale",
+    "correction": "px: col and row in the middle of the image, largest over the image",
+    "sigma": "px of a coordinate, rms over the image, of its place against the ground",
+    "gcps": "px: rms length of measured minus projected by the RPC alone, after the correction, "
+    "and by the adjustment without the point",
+    "ties, pairs": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
+    "of the images, and y-parallax, by the adjusted corrections",
+    "matched": "share of the places compared that became tie points without a blunder",
+    "misfit": "of a pair against all, in the standard deviations that its tie points show",
+    "weight": "0 to 1, of a pair in the adjustment",
+    "covariance": "px^2 of all parameters, images in ascending order of their names",
+}
+LEAST_SPREAD_PX = 0.5  # of corrections over images: less does not make one of them stand out
+HEAVY = 0.1  # weight of a pair that is left out, or nearly so
+
+
+@dataclass(frozen=True)
+class ScenePair:
+    """A scene and the names of its images, its refined alignment, equations and control points."""
+
+    scene: str
+    left: str
+    right: str
+    alignment: Path
+    equations: Path
+    gcps: Path | None = None
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of both images."""
+        return self.left, self.right
+
+
+def _rpc_alone(fit: ViewFit) -> ViewFit:
+    return over_the_image(replace(fit, affine=np.eye(2, 3), gcps=()))
+
+
+def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int]) -> PointsOfImage:
+    """Control points of an image in ascending order, without those that lie elsewhere."""
+    ordered = sorted(rows)
+    values = np.array([row[1:] for row in ordered], dtype=float).reshape(-1, 5)
+    predicted = np.stack(rpc.project(*values[:, :3].T), axis=1)
+    near = ((predicted > -LARGE_SHIFT) & (predicted < np.array(size) + LARGE_SHIFT)).all(axis=1)
+    return PointsOfImage(
+        tuple(row[0] for row, here in zip(ordered, near) if here),
+        *values[near, :3].T,
+        values[near, 3:],
+        predicted[near],
+    )
+
+
+def _images(
+    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment]
+) -> dict[str, ImageToFit]:
+    """All images by name, with the control points that any pair's file has of them."""
+    starts: dict[str, tuple[ViewFit, RPC]] = {}
+    rows: dict[str, dict[tuple[Any, ...], None]] = {}
+    for pair in pairs:
+        alignment = alignments[pair.scene]
+        for name, fit, sensor in zip(pair.names, alignment.fits, (alignment.left, alignment.right)):
+            starts.setdefault(name, (_rpc_alone(fit), sensor.rpc))
+            rows.setdefault(name, {})
+        if pair.gcps is None:
+            continue
+        try:
+            points = read_gcps(pair.gcps, pair.scene, pair.names)
+        except NoPoints:
+            continue
+        for name, at in zip(pair.names, (points.left, points.right)):
+            for k in np.flatnonzero(np.isfinite(at[:, 0])):
+                ground = float(points.lon[k]), float(points.lat[k]), float(points.height[k])
+                rows[name][(points.ids[k], *ground, *at[k].tolist())] = None
+    return {
+        name: ImageToFit(name, fit, _points(rows[name], rpc, fit.size))
+        for name, (fit, rpc) in starts.items()
+    }
+
+
+def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
+    """Corrections of images by name from files of :func:`adjust_site` that were put aside.
+
+    Raises InputError for a file without the image.
+    """
+    if not files:
+        return None
+    parameters: dict[str, Floats] = {}
+    blocks = []
+    for file in sorted({Path(path) for path in files.values()}):
+        names = sorted(name for name, path in files.items() if Path(path) == file)
+        values = read_site(file)
+        for name in names:
+            if name not in values["images"]:
+                raise InputError(
+                    f"alignment.fixed: {name}: the file has no image of this name",
+                    file=file,
+                    remedy="name a copy of results/adjust/<city>.json that has it",
+                )
+            parameters[name] = np.array(values["images"][name]["parameters"])
+        order = values["covariance"]["images"]
+        index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
+        blocks.append(np.array(values["covariance"]["values"])[np.ix_(index, index)])
+    covariance = np.zeros((6 * len(parameters),) * 2)
+    start = 0
+    for block in blocks:
+        end = start + len(block)
+        covariance[start:end, start:end] = block
+        start = end
+    return FixedImages(parameters, covariance)
+
+
+def read_site(path: str | Path) -> dict[str, Any]:
+    """What :func:`write_site` wrote. Raises InputError if it is damaged or something else."""
+
+    def checked(values: dict[str, Any]) -> dict[str, Any]:
+        return values | {name: values[name] for name in ("images", "pairs", "covariance")}
+
+    return read_record(path, checked, what="adjusted images", stage="adjust")
+
+
+def adjust_site(
+    city: str,
+    scenes: Sequence[ScenePair],
+    *,
+    fixed: Mapping[str, str | Path] | None = None,
+    strict: bool = False,
+    provenance: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Adjust the images of a city's pairs that share images; JSON-ready figures and corrections.
+
+    ``fixed``: files of earlier adjustments by name of an image, whose corrections stay as they are.
+    An image that hurts is named in ``doubts``; one that neither tie points nor control points
+    place has the sentence in ``refused``. ``strict`` makes doubts errors.
+
+    Raises InputError for unreadable input.
+    """
+    scenes = sorted(scenes, key=lambda pair: pair.scene)
+    alignments = {pair.scene: Alignment.load(pair.alignment) for pair in scenes}
+    images = _images(scenes, alignments)
+    pairs = [
+        PairToFit(pair.scene, pair.left, pair.right, *read_equations(pair.equations))
+        for pair in scenes
+    ]
+    held = read_fixed({k: v for k, v in (fixed or {}).items() if k in images})
+    fit = fit_site(list(images.values()), pairs, held)
+    by_pair = {pair.scene: _pair_figures(pair, fit.pairs.get(pair.scene)) for pair in pairs}
+    by_image = {
+        name: _image_figures(images[name], pairs, fit, held is not None and name in held.parameters)
+        for name in fit.names
+    }
+    for name, doubts in _doubts(by_image, by_pair).items():
+        by_image[name]["doubts"] = doubts
+        for text in doubts:
+            log.warning("warning: image %s: %s", name, text)
+    hurting = [name for name in fit.names if by_image[name]["doubts"]]
+    if strict and hurting:
+        raise InputError(
+            f"image {hurting[0]} of {city}: {by_image[hurting[0]]['doubts'][0]}",
+            remedy="remove the image's pairs, correct its RPC or control points, or set strict to "
+            "false",
+        )
+    return {
+        "what": WHAT,
+        "units": UNITS,
+        "city": city,
+        "images": by_image,
+        "pairs": by_pair,
+        "gcp_sigma_px": round(fit.point_sigma, 4),
+        "scatter_of_pairs": round(fit.scatter, 4),
+        "covariance": {"images": list(fit.names), "values": fit.covariance.tolist()},
+        "provenance": dict(provenance or {}),
+    }
+
+
+def write_site(values: Mapping[str, Any], path: str | Path) -> None:
+    """Write what :func:`adjust_site` found, as JSON."""
+    with atomic_file(path) as scratch:
+        scratch.write_text(sealed(values), encoding="utf-8")
+
+
+def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
+    figures: dict[str, Any] = {"left": pair.left, "right": pair.right, "reason": pair.reason}
+    if pair.ties is None or fit is None:
+        return figures | {"places": 0, "tie_points": 0, "used": 0, "matched": 0.0}
+    used = int(fit.used.sum())
+    return figures | {
+        "places": pair.ties.places,
+        "tie_points": len(fit.used),
+        "used": used,
+        "matched": round(used / pair.ties.places, 3),
+        "misfit": round(fit.misfit, 3),
+        "weight": round(fit.weight, 3),
+        **residual_figures(fit.residuals[fit.used]),
+    }
+
+
+def _rms(lengths: Floats) -> float | None:
+    known = lengths[np.isfinite(lengths)]
+    return round(float(np.sqrt(np.mean(known**2))), 4) if len(known) else None
+
+
+def _nodes(fit: ViewFit) -> Floats:
+    """[81, 2, 6]: change of places all over an image with its parameters."""
+    axes = (np.linspace(0, n - 1, 9) for n in fit.size)
+    return fit.design(*(axis.ravel() for axis in np.meshgrid(*axes)))
+
+
+def _image_figures(
+    image: ImageToFit, pairs: Sequence[PairToFit], fit: SiteFit, is_fixed: bool
+) -> dict[str, Any]:
+    name, points = image.name, image.points
+    parameters, covariance = fit.parameters[name], fit.covariance_of(name)
+    nodes, used = _nodes(image.start), fit.used[name]
+    own = [pair for pair in pairs if name in (pair.left, pair.right)]
+    fits = {pair.scene: fit.pairs[pair.scene] for pair in own if pair.scene in fit.pairs}
+    residuals = [one.residuals[one.used] for one in fits.values() if one.weight > HEAVY]
+    heavy = sum(one.weight > HEAVY for one in fits.values())
+    refused = ""
+    if not is_fixed and not heavy and used.sum() < LEAST_POINTS:
+        reasons = sorted({pair.reason for pair in own if pair.reason})
+        refused = f"neither tie points nor control points ({int(used.sum())}) place it: " + (
+            "; ".join(reasons) or "its tie points contradict those of all other pairs"
+        )
+    variance = np.einsum("nap,pq,naq->na", nodes, covariance, nodes)
+    return {
+        "file": image.start.image,
+        "size": list(image.start.size),
+        "origin": list(image.start.origin),
+        "scale": image.start.scale,
+        "fixed": is_fixed,
+        "parameters": parameters.tolist(),
+        "affine": image.start.moved(parameters).tolist(),
+        "correction": {
+            "col": round(float(parameters[2]), 4),
+            "row": round(float(parameters[5]), 4),
+            "largest": round(float(np.hypot(*(nodes @ parameters).T).max()), 4),
+        },
+        "sigma": round(float(np.sqrt(variance.mean())), 4),
+        "gcps": {
+            "count": len(points.ids),
+            "used": int(used.sum()),
+            "left_out": [points.ids[k] for k in np.flatnonzero(~used)],
+            "before": _rms(np.hypot(*(points.measured - points.predicted)[used].T)),
+            "after": _rms(np.hypot(*fit.residuals[name][used].T)),
+            "leave_one_out": _rms(np.hypot(*fit.leave_one_out[name][used].T)),
+            "points": _table(points, fit, name),
+        },
+        "ties": {
+            "pairs": len(own),
+            "pairs_with_ties": heavy,
+            "used": sum(int(one.used.sum()) for one in fits.values()),
+            **residual_figures(np.concatenate([np.zeros((0, 2)), *residuals])),
+        },
+        "refused": refused,
+        "doubts": [],
+    }
+
+
+def _doubts(
+    images: Mapping[str, Mapping[str, Any]], pairs: Mapping[str, Mapping[str, Any]]
+) -> dict[str, list[str]]:
+    """What is odd about each image beside the others of its site."""
+    lengths = {
+        name: float(np.hypot(image["correction"]["col"], image["correction"]["row"]))
+        for name, image in images.items()
+    }
+    usual, scatter = median_and_nmad(np.array(list(lengths.values())))
+    limit = usual + BLUNDER_SIGMAS * max(scatter, LEAST_SPREAD_PX)
+    own = {
+        name: [pair for pair in pairs.values() if name in (pair["left"], pair["right"])]
+        for name in images
+    }
+    shares = {name: float(np.median([pair["matched"] for pair in own[name]])) for name in images}
+    usual_share = float(np.median(list(shares.values())))
+    found: dict[str, list[str]] = {}
+    for name, image in images.items():
+        told = found.setdefault(name, [])
+        gcps, count = image["gcps"], len(own[name])
+        if image["refused"]:
+            told.append(image["refused"])
+            continue
+        if lengths[name] > limit and not image["fixed"]:
+            told.append(
+                f"its RPC is off by {lengths[name]:.1f} px, where {usual:.1f} px are usual here; "
+                "corrected"
+            )
+        without = [pair for pair in own[name] if not pair["tie_points"]]
+        if len(without) == count:
+            reasons = "; ".join(sorted({pair["reason"] for pair in without}))
+            told.append(f"no tie points in any of its pairs ({count}): {reasons}")
+        elif shares[name] < MIN_USED * usual_share:
+            told.append(
+                f"of the places compared in its pairs {100 * shares[name]:.0f} % match, where "
+                f"{100 * usual_share:.0f} % are usual here: clouds, or another ground?"
+            )
+        light = sum(pair.get("weight", 1.0) < HEAVY for pair in own[name])
+        if light > count / 2:
+            told.append(
+                f"the tie points of {light} of its {count} pairs contradict the other images"
+            )
+        if gcps["left_out"]:
+            told.append(
+                f"control points left out, which fit no correction: {', '.join(gcps['left_out'])}"
+            )
+    return found
+
+
+def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
+    """alignment.json of a pair by its images' adjusted corrections, JSON-ready.
+
+    Of a pair whose image is refused it has the sentence ``refused`` alone, which
+    :meth:`.Alignment.load` raises.
+    """
+    figures = [site["images"][name] for name in scene.names]
+    for name, image in zip(scene.names, figures):
+        if image["refused"]:
+            return {"refused": f"scene {scene.scene}: image {name}: {image['refused']}"}
+    base = Alignment.load(scene.alignment)
+    order = site["covariance"]["images"]
+    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in scene.names])
+    covariance = np.array(site["covariance"]["values"])[np.ix_(index, index)]
+    fits, sensors, warnings = [], [], list(base.warnings)
+    for k, (name, image, fit, sensor) in enumerate(
+        zip(scene.names, figures, base.fits, (base.left, base.right))
+    ):
+        own = slice(6 * k, 6 * k + 6)
+        start = _rpc_alone(fit)
+        affine = start.moved(np.array(image["parameters"]))
+        gcps = tuple(
+            GcpResidual(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
+            for row in image["gcps"]["points"]
+        )
+        fits.append(
+            replace(
+                start,
+                affine=affine,
+                gcps=gcps,
+                sigma0=site["gcp_sigma_px"] if gcps else np.nan,
+                redundancy=2 * sum(g.used for g in gcps),
+                covariance=covariance[own, own],
+            )
+        )
+        sensors.append(SensorModel(sensor.rpc, affine))
+        warnings += [f"image {name}: {text}" for text in image["doubts"]]
+    return replace(
+        base,
+        left=sensors[0],
+        right=sensors[1],
+        left_fit=fits[0],
+        right_fit=fits[1],
+        cross_covariance=covariance[:6, 6:],
+        warnings=tuple(warnings),
+        refinement=_refinement(site, scene),
+    ).to_dict()
+
+
+def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any]]:
+    """The control points of an image with their residuals, px, JSON-ready."""
+    rows = zip(fit.residuals[name], fit.leave_one_out[name], fit.used[name])
+    return [
+        {
+            "id": points.ids[k],
+            "lon": float(points.lon[k]),
+            "lat": float(points.lat[k]),
+            "height": float(points.height[k]),
+            "measured": points.measured[k].tolist(),
+            "predicted": points.predicted[k].tolist(),
+            "before": (points.measured[k] - points.predicted[k]).tolist(),
+            "after": after.tolist(),
+            "leave_one_out": one_out.tolist(),
+            "used": bool(used),
+            "reason": "" if used else f"{np.hypot(*after):.1f} px off the site's adjustment",
+        }
+        for k, (after, one_out, used) in enumerate(rows)
+    ]
+
+
+def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
+    """The record of the refinement: the pair's tie points before and after the adjustment."""
+    pair = site["pairs"][scene.scene]
+    record = {
+        "applied": True,
+        "reason": "",
+        "adjusted_with": [name for name in site["images"] if name not in scene.names],
+        "tie_points": pair["tie_points"],
+        "used": pair["used"],
+    }
+    ties, reason = read_equations(scene.equations)
+    if ties is None:
+        return record | {"without_own_tie_points": reason}
+    equations = ties.equations
+    images = [np.array(site["images"][name]["parameters"]) for name in scene.names]
+    size = tuple(site["images"][scene.left]["size"])
+    spreads = {}
+    for word, parameters in (("before", ties.start), ("after", np.concatenate(images))):
+        values = equations.observed - equations.design @ parameters
+        spreads[word] = {
+            name: spread_of(values[:, k], equations.at, size)
+            for k, name in enumerate(("disparity", "y_parallax"))
+        }
+    return record | {
+        "sites": int(np.unique(equations.site).size),
+        **spreads,
+        "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
+        "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
+        "of all images of the site",
+    }

@@ -1,0 +1,33 @@
+"""The images of a city whose pairs share images, corrected together."""
+
+from pathlib import Path
+
+from stereotruth.alignment.site_adjustment import ScenePair, adjust_site, write_site
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.provenance import checksums, describe, file_sha256
+
+if __name__ == "__main__":
+    city, given = snakemake.wildcards.city, snakemake.input
+    with (
+        job(snakemake.log[0], f"adjust {city}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        pairs = [
+            ScenePair(scene, left, right, Path(alignment), Path(equations), gcps or None)
+            for (scene, (left, right, gcps)), alignment, equations in zip(
+                snakemake.params.pairs.items(), given.alignments, given.equations
+            )
+        ]
+        inputs = checksums([*given.gcps, *given.fixed])
+        for pair in pairs:
+            inputs[f"{pair.scene}/alignment.json"] = file_sha256(pair.alignment)
+            inputs[f"{pair.scene}/equations.json"] = file_sha256(pair.equations)
+        values = adjust_site(
+            city,
+            pairs,
+            fixed=snakemake.params.fixed,
+            strict=snakemake.params.strict,
+            provenance=describe(inputs, {}, snakemake.params.code),
+        )
+        write_site(values, snakemake.output[0])

@@ -1,0 +1,30 @@
+"""The alignment of one pair by the corrections of its images."""
+
+from pathlib import Path
+
+from stereotruth.alignment.site_adjustment import (
+    ScenePair,
+    pair_alignment,
+    read_site,
+    write_site,
+)
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.provenance import checksums, describe, digest
+
+if __name__ == "__main__":
+    scene, given = snakemake.wildcards.scene, snakemake.input
+    with (
+        job(snakemake.log[0], f"adjusted alignment {scene}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        site = read_site(given.site)
+        pair = ScenePair(
+            scene, *snakemake.params.images, Path(given.alignment), Path(given.equations)
+        )
+        values = pair_alignment(site, pair)
+        # Not of the whole site's figures: what other images change leaves the alignment as it is.
+        inputs = checksums([given.alignment, given.equations])
+        inputs |= {name: digest(site["images"][name]) for name in pair.names}
+        values["provenance"] = describe(inputs, {}, snakemake.params.code)
+        write_site(values, snakemake.output[0])
