@@ -1,0 +1,377 @@
+"""COPC files made here, and a web server on the loopback that counts what it sends and fails."""
+
+from __future__ import annotations
+
+import io
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
+from threading import Lock, Thread
+
+import laspy
+import lazrs
+import numpy as np
+import pyproj
+from laspy.vlrs.known import LasZipVlr
+
+UTM = pyproj.CRS("EPSG:32650").to_3d()
+CORNER = np.array([500_000.0, 3_300_000.0, -900.0])
+ENTRY = struct.Struct("<4iQii")
+INFO_AT = 375 + 54
+
+
+@dataclass
+class MadeCopc:
+    """A COPC file in memory; ``entries`` of its hierarchy: (level, x, y, z, start, bytes, n)."""
+
+    content: bytes
+    entries: list[tuple[int, ...]]
+    hierarchy_at: int
+    header_count_at: int = 247  # LAS 1.4: number of point records
+
+
+def make_copc(
+    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, paged: bool = True
+) -> MadeCopc:
+    """A surface of random points in an octree of so many levels, with pages below level 1.
+
+    A point stays at a level with a probability of 4**level, as in a thinned surface.
+    """
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(0, side, (points, 3))
+    xyz[:, 2] = 900 + 40 * np.sin(xyz[:, 0] / 90) + 30 * np.cos(xyz[:, 1] / 70)
+    xyz = np.round(xyz, 2)
+    shares = 4.0 ** np.arange(levels)
+    level = rng.choice(levels, points, p=shares / shares.sum())
+    place = np.minimum(xyz / (side / 2.0**level)[:, None], (2.0**level - 1)[:, None]).astype(int)
+    key = np.column_stack([level, place])
+    order = np.lexsort(key.T[::-1])
+    key, xyz = key[order], xyz[order]
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [0.01] * 3, CORNER
+    header.are_points_compressed, header.point_count = True, points
+    header.mins, header.maxs = CORNER + xyz.min(axis=0), CORNER + xyz.max(axis=0)
+    header.global_encoding.wkt = True
+    header.number_of_points_by_return = np.array([points, *[0] * 14], np.uint32)
+    packing = lazrs.LazVlr.new_for_compression(6, 0, True)
+    wkt = UTM.to_wkt().encode() + b"\0"
+    header.vlrs = [
+        laspy.VLR("copc", 1, "", bytes(160)),
+        LasZipVlr(packing.record_data()),
+        laspy.VLR("LASF_Projection", 2112, "", wkt),
+    ]
+    record = laspy.ScaleAwarePointRecord.zeros(points, header=header)
+    for axis, values in zip("XYZ", xyz.T):
+        record.array[axis] = np.round(values * 100)
+    one = np.ones(points, np.uint8)
+    record["classification"], record["return_number"] = rng.integers(2, 7, points), one
+    record["number_of_returns"], record["gps_time"] = one, np.arange(points, dtype=float)
+    stream = io.BytesIO()
+    header.write_to(stream)
+    entries = _compressed(stream, packing, record.array, key)
+    hierarchy_at = stream.seek(0, 2) + 60
+    pages = _pages(entries, hierarchy_at, paged)
+    stream.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(pages[0]), b"") + pages[0])
+    content = bytearray(stream.getvalue())
+    struct.pack_into("<QI", content, 235, hierarchy_at - 60, 1)
+    middle = CORNER + side / 2
+    info = struct.pack("<5d2Q2d", *middle, side / 2, 10.0, hierarchy_at, pages[1], 0, points)
+    content[INFO_AT : INFO_AT + len(info)] = info
+    return MadeCopc(bytes(content), entries, hierarchy_at)
+
+
+def _compressed(stream, packing, array, key) -> list[tuple[int, ...]]:
+    """Write each node as a chunk; the entries of the hierarchy."""
+    bounds = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1), True])
+    compressor = lazrs.LasZipCompressor(stream, packing)
+    first = stream.tell()
+    for start, end in pairwise(bounds):
+        compressor.compress_many(np.frombuffer(array[start:end].tobytes(), np.uint8))
+        if end < len(array):  # the last is finished by done()
+            compressor.finish_current_chunk()
+    compressor.done()
+    stream.seek(first)
+    sizes = lazrs.read_chunk_table(stream, packing)
+    entries, at = [], first + 8
+    for start, (n, size) in zip(bounds, sizes):
+        entries.append((*map(int, key[start]), at, int(size), int(n)))
+        at += size
+    return entries
+
+
+def _pages(entries, at, paged) -> tuple[bytes, int]:
+    """The hierarchy, and the bytes of its first page."""
+    root = [e for e in entries if e[0] < 2 or not paged]
+    if not paged:
+        return b"".join(ENTRY.pack(*e) for e in root), ENTRY.size * len(root)
+    below: dict[tuple, list] = {}
+    for e in entries:
+        if e[0] >= 2:
+            up = e[0] - 2
+            below.setdefault((2, *(v >> up for v in e[1:4])), []).append(e)
+    start, later = at + ENTRY.size * (len(root) + len(below)), b""
+    for key, held in below.items():
+        page = b"".join(ENTRY.pack(*e) for e in held)
+        root.append((*key, start + len(later), len(page), -1))
+        later += page
+    first = b"".join(ENTRY.pack(*e) for e in root)
+    return first + later, len(first)
+
+
+# What a server does wrong, and whether asking again gets the points all the same.
+SERVER_FAULTS = {
+    "short body": True,
+    "short range": True,
+    "shifted range": True,
+    "longer body": True,
+    "no Content-Range": True,
+    "garbled Content-Range": True,
+    "429 with seconds": True,
+    "429 with a date": True,
+    "503": True,
+    "500": True,
+    "reset": True,
+    "stall": True,
+    "redirect to itself once": True,
+    "503 for ever": False,
+    "429 for an hour": False,
+    "stall for ever": False,
+    "drip": False,
+    "no ranges": False,
+    "replaced: ETag": False,
+    "replaced: size": False,
+    "gone": False,
+    "forbidden": False,
+    "unsatisfiable": False,
+    "encoded": False,
+    "redirect loop": False,
+    "redirect to file:": False,
+    "redirect to another host": False,
+}
+
+
+@dataclass
+class Server:
+    """What a server holds and does wrong: ``fault`` at request ``when`` (from 0), or from then."""
+
+    content: bytes
+    fault: str = ""
+    when: int = 0
+    sent: int = 0
+    requests: list[str] = field(default_factory=list)
+    url: str = ""
+    target: str = "http://other.invalid/x?sig=secret"  # of redirects to another host
+    lock: Lock = field(default_factory=Lock)
+
+
+@contextmanager
+def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
+    """A server on the loopback."""
+    state = Server(content, fault, when)
+
+    class Answer(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_GET(self):
+            with state.lock:
+                number = len(state.requests)
+                state.requests.append(f"{self.path} {self.headers.get('Range')}")
+            lasting = not SERVER_FAULTS.get(state.fault, True)
+            faulty = number >= state.when if lasting else number == state.when
+            try:
+                self.answer(state.fault if faulty else "")
+            except OSError:
+                self.close_connection = True
+
+        def answer(self, fault):
+            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
+            size = len(state.content)
+            last = min(last, size - 1)
+            if fault in STATUS:
+                return self.plain(*STATUS[fault](state))
+            if fault == "reset":
+                self.close_connection = True
+                return None
+            if fault.startswith("stall"):
+                time.sleep(0.6)
+            if fault == "no ranges":
+                return self.plain(200, {}, state.content)
+            shift = 1 if fault == "shifted range" and first > 0 else 0
+            if fault == "short range":
+                last = (first + last) // 2
+            body = state.content[first - shift : last + 1 - shift]
+            length = len(body)
+            if fault == "longer body":
+                body += b"more"
+                length += 4
+            if fault == "short body":
+                body = body[: length // 2]
+            told = size + 1 if fault == "replaced: size" else size
+            span = f"bytes {first - shift}-{last - shift}/{told}"
+            headers = {
+                "ETag": '"two"' if fault == "replaced: ETag" and state.when else '"one"',
+                "Content-Range": "bytes x-y/z" if fault == "garbled Content-Range" else span,
+                "Content-Length": str(length),
+            }
+            if fault == "no Content-Range":
+                del headers["Content-Range"]
+            if fault == "encoded":
+                headers["Content-Encoding"] = "gzip"
+            return self.plain(206, headers, body, drip=fault == "drip")
+
+        def plain(self, status, headers, body=b"", drip=False):
+            self.send_response(status)
+            for name, value in ({"Content-Length": str(len(body))} | headers).items():
+                self.send_header(name, value)
+            self.end_headers()
+            step = 1 if drip else 1 << 16
+            for at in range(0, len(body), step):
+                self.wfile.write(body[at : at + step])
+                with state.lock:
+                    state.sent += len(body[at : at + step])
+                if drip:
+                    time.sleep(0.05)
+            if int(headers.get("Content-Length", len(body))) != len(body):
+                self.close_connection = True
+
+        def log_message(self, *_):
+            pass
+
+    class Quiet(ThreadingHTTPServer):
+        daemon_threads = True
+
+        def handle_error(self, *_):
+            pass  # a client that has lost its patience
+
+    server = Quiet(("127.0.0.1", 0), Answer)
+    state.url = f"http://127.0.0.1:{server.server_port}/tile.copc.laz"
+    Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    try:
+        yield state
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+STATUS = {
+    "429 with seconds": lambda s: (429, {"Retry-After": "1"}),
+    "429 with a date": lambda s: (429, {"Retry-After": formatdate(time.time() + 1, usegmt=True)}),
+    "503": lambda s: (503, {}),
+    "500": lambda s: (500, {}),
+    "503 for ever": lambda s: (503, {}),
+    "429 for an hour": lambda s: (429, {"Retry-After": "3600"}),
+    "gone": lambda s: (404, {}),
+    "forbidden": lambda s: (403, {}),
+    "unsatisfiable": lambda s: (416, {}),
+    "redirect to itself once": lambda s: (302, {"Location": s.url}),
+    "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
+    "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
+    "redirect to another host": lambda s: (302, {"Location": s.target}),
+}
+
+
+def _entry(made: MadeCopc, content: bytearray, rng: np.random.Generator) -> tuple[int, list]:
+    """A random entry of a node in the hierarchy: its place, its values."""
+    while True:
+        span = (len(content) - made.hierarchy_at) // ENTRY.size
+        at = made.hierarchy_at + ENTRY.size * int(rng.integers(span))
+        values = list(ENTRY.unpack_from(content, at))
+        if values[6] > 0:
+            return at, values
+
+
+# What is wrong with a file, and whether all points come all the same; None: they do, or it is
+# refused, but for a node swapped with one of its own descendants (see lidar/octree_nodes.py).
+FILE_FAULTS = {
+    "header bounds": True,
+    "header bounds in z": True,
+    "header bounds not filled in": True,
+    "header count": False,
+    "count of a node": False,
+    "place of a node": False,
+    "key of a node": False,
+    "node left out": False,
+    "node made empty": False,
+    "node doubled": False,
+    "page loop": False,
+    "root page cut": False,
+    "hierarchy out of the file": False,
+    "cube too small": False,
+    "cube too large": False,
+    "cube shifted": False,
+    "cube not a number": False,
+    "file cut": False,
+    "chunk table": False,
+    "points of a chunk": False,
+    "layers of a chunk": False,
+    "two nodes swapped": None,
+    "no info record": False,
+}
+
+
+def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
+    """The content of a file with a fault."""
+    content = bytearray(made.content)
+    at, entry = _entry(made, content, rng)
+    info = list(struct.unpack_from("<5d2Q", content, INFO_AT))
+    if fault == "header bounds":
+        struct.pack_into("<4d", content, 179, *rng.uniform(4e5, 5e5, 4))
+    elif fault == "header bounds in z":
+        struct.pack_into("<2d", content, 211, 9e3, 8e3)
+    elif fault == "header bounds not filled in":
+        struct.pack_into("<6d", content, 179, *[0.0] * 6)
+    elif fault == "header count":
+        struct.pack_into("<Q", content, made.header_count_at, int(rng.integers(1, 10**6)))
+    elif fault in ("count of a node", "place of a node", "key of a node", "node made empty"):
+        if fault == "count of a node":
+            entry[6] += int(rng.integers(1, 9))
+        elif fault == "place of a node":
+            entry[4] += int(rng.integers(1, 99))
+        elif fault == "node made empty":
+            entry[4:] = 0, 0, 0
+        else:
+            entry[1] = 2 ** entry[0] + int(rng.integers(0, 9))
+        ENTRY.pack_into(content, at, *entry)
+    elif fault in ("node left out", "node doubled"):
+        other = _entry(made, content, rng)[1]
+        while other == entry:
+            other = _entry(made, content, rng)[1]
+        ENTRY.pack_into(content, at, *(other if fault == "node doubled" else [3, 0, 0, 7, 0, 0, 0]))
+    elif fault == "page loop":
+        ENTRY.pack_into(content, at, *entry[:4], info[5], info[6], -1)
+    elif fault == "root page cut":
+        info[6] -= int(rng.integers(1, info[6]))
+    elif fault == "hierarchy out of the file":
+        info[5] = len(content) - int(rng.integers(0, 30))
+    elif fault == "cube too small":
+        info[3] *= rng.uniform(0.3, 0.9)
+    elif fault == "cube too large":
+        info[3] *= rng.uniform(1.1, 3)
+    elif fault == "cube shifted":
+        info[int(rng.integers(2))] += float(rng.choice([-1, 1]) * rng.uniform(50, 900))
+    elif fault == "cube not a number":
+        info[3] = float(rng.choice([np.nan, np.inf, -1, 0]))
+    elif fault == "file cut":
+        del content[int(rng.integers(600, len(content))) :]
+    elif fault == "chunk table":
+        content[made.hierarchy_at - 60 - int(rng.integers(1, 20))] ^= 1 << int(rng.integers(8))
+    elif fault == "points of a chunk":
+        struct.pack_into("<I", content, made.entries[0][4] + 30, int(rng.integers(1, 2**31)))
+    elif fault == "layers of a chunk":
+        struct.pack_into("<I", content, made.entries[0][4] + 34, int(rng.integers(1, 2**31)))
+    elif fault == "two nodes swapped":
+        other_at, other = _entry(made, content, rng)
+        while other == entry:
+            other_at, other = _entry(made, content, rng)
+        ENTRY.pack_into(content, at, *entry[:4], *other[4:])
+        ENTRY.pack_into(content, other_at, *other[:4], *entry[4:])
+    elif fault == "no info record":
+        content[INFO_AT - 52 : INFO_AT - 48] = b"none"
+    if not fault.startswith("file cut"):
+        struct.pack_into("<5d2Q", content, INFO_AT, *info)
+    return bytes(content)
