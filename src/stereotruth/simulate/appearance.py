@@ -61,6 +61,26 @@ def zone_at(s, x, y):
 
 
 @inlined
+def _is_resurfaced(s, i, j, along_q):
+    """Whether a stretch of a street along block (i, j) has the texture of a new surface."""
+    return s.resurfaced > 0.0 and _hash(int(i), int(j), 23 + int(along_q)) < s.resurfaced
+
+
+@inlined
+def resurfaced_at(s, x, y):
+    """Whether the ground at a plan position is a street with the texture of a new surface."""
+    n = zone_at(s, x, y)
+    if s.zones[n, 7] >= 5:
+        return False
+    p = x * s.zones[n, 2] + y * s.zones[n, 3]
+    q = y * s.zones[n, 2] - x * s.zones[n, 3]
+    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
+    pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
+    pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
+    return min(pe, qe) < s.zones[n, 6] and _is_resurfaced(s, i, j, pe < qe)
+
+
+@inlined
 def _ground(s, x, y, slope2):
     """Reflectance of the ground; ``slope2``: its slope squared."""
     fine = _sample(s.fine, 4.0 * x, 4.0 * y)
@@ -84,6 +104,9 @@ def _ground(s, x, y, slope2):
             value = 0.155 + 0.02 * s.zones[n, 8] + 0.016 * fine + 0.022 * mid + 0.012 * broad
             if s.zones[n, 6] > 3.5 and edge < 0.22 and along - 8 * math.floor(along / 8) < 4:
                 value = 0.42
+            if _is_resurfaced(s, i, j, pe < qe):
+                value = 0.1 + 0.016 * _sample(s.fine, 4.0 * x + 311.0, 4.0 * y + 173.0)
+                value += 0.022 * _sample(s.fine, 1.13 * x + 517.0, 1.13 * y - 91.0)
             # vehicles: parked and moving ones stand still for the seconds between the views
             slot = math.floor(along / 9.0)
             lane = s.zones[n, 6] - 2.6

@@ -46,6 +46,35 @@ class ViewSpec:
 
 
 @dataclass(frozen=True)
+class Dates:
+    """When both images and the LiDAR were taken, and what changed from the first to the last date.
+
+    ``left``, ``right``, ``lidar``: days. Shares in [0, 1] of what changes, each thing at a moment
+    of its own: ``built``, ``demolished``, ``raised`` of the buildings; ``felled``, ``grown`` of the
+    trees; ``crops`` of the blocks of fields, to another height; ``resurfaced`` of the streets,
+    which changes their texture alone. ``water_m``: rise of the water, m.
+    """
+
+    left: float
+    right: float
+    lidar: float
+    built: float = 0.0
+    demolished: float = 0.0
+    raised: float = 0.0
+    felled: float = 0.0
+    grown: float = 0.0
+    crops: float = 0.0
+    resurfaced: float = 0.0
+    water_m: float = 0.0
+
+    def passed(self, world: str) -> float:
+        """Share of the time that has passed in a ``world``: left, right or lidar."""
+        days = self.left, self.right, self.lidar
+        first, last = min(days), max(days)
+        return (getattr(self, world) - first) / (last - first) if last > first else 0.0
+
+
+@dataclass(frozen=True)
 class Canopy:
     """Crowns with rough tops, besides the trees that the land use has.
 
@@ -105,7 +134,8 @@ class CitySpec:
     ``lon``, ``lat`` in degrees; ``epsg``: the UTM zone of its LiDAR; ``base_height_m``: ellipsoidal
     height of its lowest ground; ``world_seed`` draws everything that is built.
     ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
-    the images have of their own.
+    the images have of their own. ``dates``: of images and LiDAR, each of which has a world of its
+    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone.
     """
 
     name: str
@@ -123,6 +153,7 @@ class CitySpec:
     single_box: tuple[float, float, float, float, float] | None = field(default=None)
     left: ViewSpec = ViewSpec()
     right: ViewSpec = ViewSpec()
+    dates: Dates | None = None
 
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""

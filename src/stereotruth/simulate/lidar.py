@@ -17,6 +17,7 @@ from ..kernels import inlined, kernel
 from ..products.files import atomic_file
 from .built_city import surfaces_of
 from .cities import CitySpec, SceneSpec, lidar_files, tile_index
+from .dated_worlds import world_of
 from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
@@ -267,7 +268,7 @@ def simulate_lidar_tile(
         spacing_m = Settings.lidar_spacing_m
     if not 0.1 <= spacing_m <= 5:
         raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
-    s: Surfaces = surfaces_of(city, built)
+    s: Surfaces = world_of(city, surfaces_of(city, built), "lidar")
     frame = frame_of(city)
     cover = coverage(city, scene)
     box = tile_box(city, scene, tile_index(scene, tile_name))

@@ -20,6 +20,7 @@ from .appearance import reflectance
 from .built_city import surfaces_of
 from .camera import Pass, aim, direction, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
+from .dated_worlds import world_of
 from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
@@ -124,7 +125,7 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
         flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
         cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
         rpc = biased_rpc(cam, frame, relief, (cols, rows), (scene.pose_seed, view))
-        own = by_sun_of(surfaces, getattr(city, view).sun_deg)
+        own = by_sun_of(world_of(city, surfaces, view), getattr(city, view).sun_deg)
         cameras.append(
             Camera(
                 view, cam, cols, rows, rpc, horizon_of(cam, cols, rows, surfaces), own,

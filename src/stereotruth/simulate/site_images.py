@@ -12,6 +12,7 @@ from ..products.files import write_table
 from .built_city import surfaces_of
 from .camera import Pass, aim, drift_of_attitude
 from .control_points import GCP_COUNT, GCP_NOISE_PX, roof_corners, spread_out, visible_in
+from .dated_worlds import world_of
 from .layout import frame_of
 from .lidar_coverage import coverage
 from .render import (
@@ -48,7 +49,7 @@ def camera_of(site: SiteSpec, image: ImageSpec) -> Camera:
     size = image.cols, image.rows
     drawn = image.pose_seed, "left"
     rpc = biased_rpc(cam, frame, relief, size, drawn, margin_m=RPC_MARGIN_M)
-    own = by_sun_of(surfaces, image.sun_deg)
+    own = by_sun_of(world_of(city, surfaces, image.state), image.sun_deg)
     return Camera(
         image.name, cam, *size, rpc, horizon_of(cam, *size, surfaces), own,
         SHOWN[image.state], LEFT_COLLAR, image.radiometry, image.pose_seed,
@@ -68,7 +69,8 @@ def pair_truth(
     """The layers of :data:`.truth.LAYERS` at positions of the left of any two images, px."""
     cameras = camera_of(site, left), camera_of(site, right)
     cover = coverage(site.city, site.area)
-    return truth_between(cameras, frame_of(site.city), cover, col, row)
+    scanned = world_of(site.city, surfaces_of(site.city), "lidar")
+    return truth_between(cameras, scanned, frame_of(site.city), cover, col, row)
 
 
 def image_truth(

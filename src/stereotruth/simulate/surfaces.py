@@ -39,7 +39,8 @@ class Surfaces(NamedTuple):
     ``ground_look`` float64[2]: factors on the ground's reflectance and on its contrast.
     ``*_first``/``*_list``: objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object
     in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
-    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`.
+    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`. ``resurfaced``: share
+    of the streets that have another texture.
     """
 
     x0: float
@@ -67,6 +68,7 @@ class Surfaces(NamedTuple):
     fine: np.ndarray
     broad: np.ndarray
     sun: np.ndarray
+    resurfaced: float
 
 
 def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:

@@ -15,10 +15,11 @@ from ..kernels import inlined, kernel
 from ..products.grids import PlainStore, atomic_store
 from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
+from .dated_worlds import world_of
 from .geodesy import LocalFrame, world_to_geodetic_point
 from .lidar_coverage import coverage, covered
 from .render import Camera, in_collar, prepare
-from .surfaces import IN_LIDAR, NONE, above_ground, cast, stands_in
+from .surfaces import GROUND, IN_LIDAR, NONE, WATER, Surfaces, cast, stands_in, terrain_at
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -84,9 +85,20 @@ def seen_from(s, above, x, y, z, line, view, tolerance):
     return kind != NONE and hit <= z + tolerance
 
 
+@inlined
+def _lies_lower(s, kind, x, y, z):
+    """Whether ground or water of a world lies lower than a point of another world's."""
+    if kind != GROUND and kind != WATER:
+        return False
+    ground, _, _ = terrain_at(s, x, y)
+    return max(ground, s.water) < z - SEEN_TOLERANCE_M
+
+
 @kernel
-def _truth_points(s, views, frame, cover, image_col, image_row, real, flags):
+def _truth_points(s, other_s, scanned_s, views, frame, cover, image_col, image_row, real, flags):
     """The truth at positions [n] of the first of two ``views``; neighbours follow each other.
+
+    ``s``, ``other_s``, ``scanned_s``: the worlds of the first image, the second, and the LiDAR.
 
     real[5, n] and flags[6, n]: values of LAYERS in their order. Positions outside the first
     frame, in its collar, or NaN get NaN and 0.
@@ -115,7 +127,7 @@ def _truth_points(s, views, frame, cover, image_col, image_row, real, flags):
         x, y = ax + bx * z, ay + by * z
         lon, lat, height = world_to_geodetic_point(frame, x, y, z)
         col, right_row = project_point(right, x, y, z, right_row, other)
-        free = seen_from(s, above_right, x, y, z, other, shown_there, SEEN_TOLERANCE_M)
+        free = seen_from(other_s, above_right, x, y, z, other, shown_there, SEEN_TOLERANCE_M)
         inside = (
             col >= 0
             and right_row >= 0
@@ -124,7 +136,10 @@ def _truth_points(s, views, frame, cover, image_col, image_row, real, flags):
             and not in_collar(collar_there, col, right_row, size[2], size[3])
         )
         there = inside and stands_in(s, kind, index, shown_there)
-        scanned, _, _, _ = above_ground(s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground)
+        there = there and not _lies_lower(other_s, kind, x, y, z)
+        scanned, _, _, _, _, _, _ = cast(
+            scanned_s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground
+        )
         changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
         real[0, k], real[1, k], real[2, k] = lon, lat, height
         real[3, k], real[4, k] = col, right_row
@@ -135,7 +150,8 @@ def _truth_points(s, views, frame, cover, image_col, image_row, real, flags):
         flags[4, k] = (
             changed == 0
             and inside
-            and seen_from(s, above_right, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M) != free
+            and seen_from(scanned_s, above_right, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M)
+            != free
         )
         flags[5, k] = covered(cover, x, y)
 
@@ -151,11 +167,13 @@ def truth_at(
     """
     ready = prepare(city, scene)
     cameras = (ready.left, ready.right) if view == "left" else (ready.right, ready.left)
-    return truth_between(cameras, ready.frame, coverage(city, scene), col, row)
+    scanned = world_of(city, ready.surfaces, "lidar")
+    return truth_between(cameras, scanned, ready.frame, coverage(city, scene), col, row)
 
 
 def truth_between(
     cameras: tuple[Camera, Camera],
+    scanned: Surfaces,
     frame: LocalFrame,
     cover: np.ndarray,
     col: np.ndarray,
@@ -163,7 +181,8 @@ def truth_between(
 ) -> dict[str, np.ndarray]:
     """The layers of LAYERS at positions (col, row) of the first of two images of one city.
 
-    What is called right is the second image. ``cover``: of :func:`.lidar_coverage.coverage`.
+    What is called right is the second image. ``scanned``: the LiDAR's world. ``cover``: of
+    :func:`.lidar_coverage.coverage`.
     """
     first, second = cameras
     size = np.array([first.cols, first.rows, second.cols, second.rows], dtype=np.float64)
@@ -181,7 +200,8 @@ def truth_between(
         second.collar,
         size,
     )
-    _truth_points(first.surfaces, views, frame.packed(), cover, *at, real, flags)
+    worlds = first.surfaces, second.surfaces, scanned
+    _truth_points(*worlds, views, frame.packed(), cover, *at, real, flags)
     return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
 
 

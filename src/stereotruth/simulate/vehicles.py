@@ -53,6 +53,9 @@ def place_vehicles(city: CitySpec, s: Surfaces, sites: cKDTree) -> Placed:
     way = rng.choice([-1.0, 1.0], count) * rng.uniform(*SLOW_M, count)
     state = np.searchsorted(np.cumsum([PARKED, SLOW, LEAVING, COMING]), rng.random(count))
     views = np.array([IN_IMAGES, IN_LEFT, IN_LEFT, IN_RIGHT, IN_LIDAR], np.uint8)[state]
+    if city.dates is not None and city.dates.left != city.dates.right:
+        # no vehicle waits from one image to the other
+        views = np.where(views == IN_IMAGES, IN_LEFT << (np.arange(count) % 2), views)
     slow = np.flatnonzero(state == 1)
     street = (zone[:, 7] < len(BUILT)) & (zone[:, 6] > NARROWEST_M)
     street[cKDTree(xy).query_pairs(APART_M, output_type="ndarray").max(axis=1, initial=-1)] = False

@@ -14,6 +14,7 @@ from ..kernels import kernel
 from .buildings import FLAT, choose_changed, place_buildings
 from .canopy import place_canopy
 from .cities import CitySpec
+from .dated_worlds import dated_buildings, dated_trees
 from .layout import extent
 from .surfaces import (
     CELL_M,
@@ -94,7 +95,7 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         zones=np.zeros((0, 9)),
         zone_cells=np.zeros((0, 0), np.int32),
         zone_near=np.zeros((0, 0), np.int32), fine=fine.astype(np.float32),
-        broad=broad.astype(np.float32), sun=sun,
+        broad=broad.astype(np.float32), sun=sun, resurfaced=0.0,
     )  # fmt: skip
     zones, zone_cells, zone_near, sites = draw_zones(city, rng, s)
     s = s._replace(zones=zones, zone_cells=zone_cells, zone_near=zone_near)
@@ -109,13 +110,16 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         build = place_buildings(city, rng, s, sites)
         boxes = np.array(build.boxes, dtype=np.float64).reshape(-1, 8)
         style = np.array(build.style, dtype=np.float64).reshape(-1, 4)
-        view = choose_changed(city, rng, build, boxes)
+        if city.dates is None:
+            view = choose_changed(city, rng, build, boxes)
+        else:
+            boxes, style, view = dated_buildings(city, np.array(build.group), boxes, style)
         trees = place_trees(city, rng, s, sites, boxes)
         vehicles = place_vehicles(city, s, sites)
         boxes = np.concatenate([boxes, vehicles.boxes])
         style = np.concatenate([style, vehicles.style])
         view = np.concatenate([view, vehicles.view])
-    tree_view = np.full(len(trees), IN_IMAGES | IN_LIDAR, np.uint8)
+    trees, tree_view = dated_trees(city, trees)
     tree_style = np.tile([1.0, 0.0], (len(trees), 1))
     if city.character.canopy is not None:
         canopy = place_canopy(city, city.character.canopy, s, sites, boxes)

@@ -1,0 +1,270 @@
+"""What changed between LiDAR and images: who notices, what is lost, which reason is told.
+
+python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
+
+Cities are drawn by seed, one for each kind of change, and each of them is made under two
+conditions: both images of one day three years after the LiDAR; or the right image a year after the
+left one, under another sun. Truth is exact: a ray through each pixel meets the worlds of both
+images and of the LiDAR.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from synthetic_pairs import gain, noise, rectify_by
+
+from stereotruth.alignment.align import align
+from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.disparity.settings import Settings
+from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.evaluation.epipolar_truth import truth_window
+from stereotruth.lidar.ingest import ingest
+from stereotruth.matching.image_faults import as_images
+from stereotruth.products.files import atomic_folder
+from stereotruth.products.grids import require_complete
+from stereotruth.products.ungeoreferenced import open_raster
+from stereotruth.simulate.changes import REASONS, changes_at
+from stereotruth.simulate.cities import Canopy, CitySpec, Dates, ViewSpec, lidar_files
+from stereotruth.simulate.control_points import simulate_points
+from stereotruth.simulate.lidar import simulate_lidar_tile
+from stereotruth.simulate.render import simulate_image
+from stereotruth.simulate.surfaces import TREE, WATER
+from stereotruth.simulate.training_cities import training_city
+
+FIRST_CITY = 4000  # of the numbers of cities
+SIDE_PX = 800
+CHANGED_M = 1.0  # of height
+YEAR = 365.0
+VIEWS = ("left", "right")
+TOWN = {"slabs": 1.0, "lowrise": 2.0, "village": 1.5, "park": 1.0, "fields": 1.0}
+SHARES = {
+    "built": {"built": 0.25},
+    "demolished": {"demolished": 0.25},
+    "raised": {"raised": 0.25},
+    "felled": {"felled": 0.25},
+    "grown": {"grown": 0.25},
+    "moved": {},
+    "water": {"water_m": 1.6},
+    "crops": {"crops": 0.5},
+    "texture": {"resurfaced": 0.6},
+    "nothing": {},
+    "noise": {},
+    "sun": {},
+    "leaves": {},
+}
+CONDITIONS = ("one day", "a year apart")
+ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
+LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²."""
+
+    kind: str
+    condition: str
+    seed: int
+    density: float
+
+    @property
+    def apart(self) -> bool:
+        """Whether the images are a year apart."""
+        return self.condition == CONDITIONS[1]
+
+    @cached_property
+    def city(self) -> CitySpec:
+        """The city, with its one scene."""
+        number = FIRST_CITY + list(SHARES).index(self.kind)
+        drawn = training_city(number, self.seed, SIDE_PX)
+        is_open = self.kind in ("crops", "noise")
+        water = self.kind == "water"
+        character = replace(
+            drawn.character, relief_m=8.0, valley=0.3, wavelength_m=700.0, max_slope_deg=15.0,
+            river_m=70.0 if water else 0.0, lakes=0.0, zone_m=200.0, towers_m=(20.0, 45.0),
+            zones={"fields": 4.0, "village": 1.0, "park": 0.5} if is_open else TOWN,
+            vehicles=8.0 if self.kind == "moved" else 0.0,
+            canopy=Canopy(ground_m2=150.0) if self.kind == "leaves" else None,
+            ground_look=(1.0, 0.3) if self.kind == "noise" else (1.0, 1.0),
+        )  # fmt: skip
+        dates = Dates(3 * YEAR, (4 if self.apart else 3) * YEAR, 0.0, **SHARES[self.kind])
+        sun = None
+        if self.apart and self.kind != "texture":
+            azimuth, elevation = LATER_SUN_DEG
+            sun = (
+                drawn.sun_azimuth_deg + azimuth, max(drawn.sun_elevation_deg + elevation, 30.0)
+            )  # fmt: skip
+        return replace(
+            drawn, name="Dated", character=character, dates=dates,
+            scenes=(replace(drawn.scenes[0], name="Dated", lidar_grid=(1, 1)),),
+            right=ViewSpec(sun, bare=self.kind == "leaves"),
+        )  # fmt: skip
+
+    def make(self, folder: Path) -> None:
+        """Images, points and exact control points, aligned and rectified, into a folder."""
+        city, (spec,) = self.city, self.city.scenes
+        images = [folder / f"{view}.tif" for view in VIEWS]
+        for view, image in zip(VIEWS, images):
+            simulate_image(city, spec, view, image, seed=self.seed)
+        if self.kind == "noise":
+            _spoil(images, self.seed)
+        tables = [folder / f"{name}.csv" for name in ("measured", "exact", "checkpoints")]
+        simulate_points(city, spec, *tables, seed=self.seed)
+        for file in lidar_files(city, spec):
+            simulate_lidar_tile(city, spec, file, folder / file,
+                                spacing_m=self.density**-0.5, seed=self.seed)  # fmt: skip
+            ingest(folder / file, folder / f"{Path(file).stem}.points")
+            (folder / file).unlink()
+        rectify_by(align(*images, tables[1], provenance={}), images, folder)
+
+    def made(self, folder: Path) -> Path:
+        """The folder of :meth:`make`, made once."""
+        name = "-".join(f"{v}" for v in asdict(self).values()).replace(" ", "_")
+        path = folder / name
+        if not path.is_dir():
+            with atomic_folder(path) as scratch:
+                self.make(scratch)
+        return path
+
+
+def _spoil(images: list[Path], seed: int) -> None:
+    rng = np.random.default_rng([seed, 9])
+    for image in images:
+        with open_raster(image) as source:
+            profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
+        changed = gain(noise(pixels.astype(np.float32), rng), rng)
+        (changed,) = as_images([changed], [pixels])
+        with open_raster(image, "w", **profile, rpcs=rpcs) as target:
+            target.write(changed, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """The layers of a case's labels, and what is true there, [y, x] of the left grid."""
+
+    layers: dict[str, NDArray]
+    truth: dict[str, NDArray]
+    changes: dict[str, NDArray]
+
+    @classmethod
+    def of(cls, case: Case, folder: Path) -> Labelled:
+        """Labels made anew; truth kept beside the images."""
+        made = case.made(folder)
+        model = EpipolarModel.load(made / "epipolar.json")
+        rows, cols = (slice(0, side) for side in model.shape)
+        kept = made.parent / f"{made.name}.npz"
+        if not kept.is_file():
+            y, x = np.mgrid[rows, cols].astype(np.float64)
+            city, (spec,) = case.city, case.city.scenes
+            truth = truth_window(model, city, spec, rows, cols)
+            changes = changes_at(city, spec, *model.epipolar_to_left(x, y))
+            np.savez(kept, **truth, **changes)
+        with np.load(kept) as file:
+            arrays = {name: file[name] for name in file}
+        changes = {n: arrays.pop(n) for n in ("height", "height_other", "height_lidar", "reason")}
+        inputs = SceneInputs.of(
+            *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
+            settings_of(case), alignment=made / "alignment.json",
+        )  # fmt: skip
+        out = made.parent / f"{made.name}.zarr"
+        project_scene(inputs, out, code="bench", workers=2)
+        grid = require_complete(out)
+        return cls({name: grid[name][:] for name in grid.array_keys()}, arrays, changes)
+
+
+def settings_of(case: Case) -> Settings:
+    """How points become labels."""
+    del case
+    return Settings()
+
+
+@dataclass
+class Row:
+    """Counts of pixels: changed, without a label; visible and unchanged, lost to `changed`; found,
+    of the right reason; errors (px) of labels of what is unchanged."""
+
+    changed: int = 0
+    unlabelled: int = 0
+    kept: int = 0
+    lost: int = 0
+    found: int = 0
+    right: int = 0
+    error: float = 0.0
+    labels: int = 0
+
+    def add(self, case: Case, of: Labelled) -> None:
+        """Count the pixels of a case."""
+        status, truth, changes = of.layers["status"], of.truth, of.changes
+        z, rise = changes["height"], np.abs(changes["height"] - changes["height_lidar"])
+        with np.errstate(invalid="ignore"):
+            differs = np.fmax(rise, np.abs(z - changes["height_other"])) > CHANGED_M
+            same = np.fmax(rise, np.abs(z - changes["height_other"])) < 0.01
+        inside = (truth["covered"] == 1) & (status != Status.OUT_OF_FRAME) & np.isfinite(z)
+        dry = truth["surface"] != WATER
+        known = is_labelled(status)
+        changed = inside & differs
+        if case.kind == "leaves":
+            changed &= truth["surface"] == TREE
+        self.changed += int(changed.sum())
+        self.unlabelled += int((changed & ~known).sum())
+        seen = inside & same & dry & (truth["visible"] == 1) & (truth["changed_right"] == 0)
+        if case.kind == "texture":
+            seen &= changes["reason"] == REASONS.split().index("texture")
+        self.kept += int(seen.sum())
+        self.lost += int((seen & (status == Status.CHANGED)).sum())
+        found = changed & (status == Status.CHANGED)
+        self.found += int(found.sum())
+        if "change" in of.layers:
+            self.right += int((found & (of.layers["change"] == changes["reason"])).sum())
+        labels = seen & known
+        self.labels += int(labels.sum())
+        error = np.abs(of.layers["disparity"][labels] - truth["disparity"][labels])
+        self.error += float(error.sum(dtype=np.float64))
+
+    def cells(self) -> list[str]:
+        """Of the table."""
+
+        def share(part: int, of: int) -> str:
+            return f"{100.0 * part / of:.1f}" if of else "–"
+
+        return [
+            f"{self.changed / 1e3:.0f}", share(self.unlabelled, self.changed),
+            share(self.found, self.changed), share(self.right, self.found),
+            share(self.lost, self.kept), f"{self.error / max(self.labels, 1):.3f}",
+        ]  # fmt: skip
+
+
+HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these `changed`, %",
+          "right reason, %", "unchanged lost, %", "error, px"]  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--folder", type=Path, default=Path("results/changes"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--kinds", nargs="+", default=list(SHARES), choices=list(SHARES))
+    parser.add_argument("--density", type=float, default=4.0)
+    given = parser.parse_args()
+    print("| " + " | ".join(HEADER) + " |")
+    print("|---" * len(HEADER) + "|")
+    for kind in given.kinds:
+        for condition in CONDITIONS:
+            if ALONE.get(kind, condition) != condition:
+                continue
+            row = Row()
+            for seed in given.seeds:
+                case = Case(kind, condition, seed, given.density)
+                row.add(case, Labelled.of(case, given.folder))
+            print("| " + " | ".join([kind, condition, *row.cells()]) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
