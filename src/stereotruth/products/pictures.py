@@ -27,6 +27,9 @@ Picture = NDArray[np.uint8]
 
 DISPARITIES, DIFFERENCES, ERRORS = "viridis", "RdBu", "inferno"
 NO_VALUE = (226, 229, 233)
+SUN = (
+    np.array([-1.0, -1.0, math.sqrt(2.0)]) / 2.0
+)  # of a hillshade: from the top left, 45 degrees high
 # Of methods, kinds and the like: apart for all eyes, on white as on black, and by lightness
 SERIES = ("#0259cb", "#bc6e19", "#5db6f9", "#f9be00", "#2a643c", "#914f8b")
 
@@ -129,3 +132,19 @@ def gradient(cmap: str, stops: int = 13) -> str:
     """The colours of a matplotlib map as a CSS gradient, left to right."""
     rgb = (colormaps[cmap](np.linspace(0, 1, stops))[:, :3] * 255 + 0.5).astype(int)
     return f"linear-gradient(90deg,{','.join(f'rgb({r},{g},{b})' for r, g, b in rgb)})"
+
+
+def hillshade(disparity: NDArray[np.floating], base_to_height: float) -> Picture:
+    """Lambert's shading uint8[h, w, 3] of disparity[h, w] in px as heights in px of the ground.
+
+    The sun stands at the top left, 45 degrees high. Light grey where a slope is not known.
+    """
+    height = np.asarray(disparity, np.float64) / base_to_height
+    down, right = np.gradient(height)
+    normal = np.stack([-right, -down, np.ones_like(height)])
+    light = np.tensordot(SUN, normal, 1) / np.linalg.norm(normal, axis=0)
+    known = np.isfinite(light) & np.isfinite(height)
+    grey = np.rint(255 * np.clip(np.where(known, light, 0.0), 0.0, 1.0)).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    picture[~known] = NO_VALUE
+    return picture

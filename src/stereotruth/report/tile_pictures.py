@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ..dataset.warped_tile import warp_tile
 from ..products import pictures
-from ..products.pictures import Picture, encode
+from ..products.pictures import Picture, encode, hillshade
 from ..products.rasters import read_flags, read_image, read_tile
-from .relief import Relief, hillshade
+from .relief import Relief
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference

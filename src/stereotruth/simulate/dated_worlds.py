@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from .cities import CitySpec
 from .surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT, Surfaces
-from .zones import ZONE_KINDS
 
 WORLDS = {"left": IN_LEFT, "right": IN_RIGHT, "lidar": IN_LIDAR}
 STOREYS_M = (3.0, 15.0)  # least and greatest height by which a building is raised
@@ -102,6 +100,10 @@ def world_of(city: CitySpec, s: Surfaces, world: str) -> Surfaces:
 
 def _crops(city: CitySpec, s: Surfaces, passed: float) -> np.ndarray:
     """By how much the terrain's coefficients [ny, nx] stand higher under crops, m."""
+    from scipy.spatial import cKDTree  # slow to import, and most cities have one date
+
+    from .zones import ZONE_KINDS
+
     ny, nx = s.terrain.shape
     x, y = np.meshgrid(s.x0 + s.step * np.arange(nx), s.y0 + s.step * np.arange(ny))
     number = cKDTree(s.zones[:, :2]).query(np.column_stack([x.ravel(), y.ravel()]))[1]

@@ -7,8 +7,8 @@ import base64
 import numpy as np
 import pytest
 
-from stereotruth.products.pictures import NO_VALUE
-from stereotruth.report.relief import Relief, hillshade
+from stereotruth.products.pictures import NO_VALUE, hillshade
+from stereotruth.report.relief import Relief
 
 
 def test_planes_are_shaded_as_lambert_says():

@@ -18,10 +18,10 @@ from ...products.pictures import (
     encode,
     encode_file,
     gradient,
+    hillshade,
     save_figure,
     shrink,
 )
-from ...report.relief import hillshade
 from .edges import HIGH, LOW, SHARP, S
 from .height_errors import OPEN
 from .height_raster import HeightRaster
