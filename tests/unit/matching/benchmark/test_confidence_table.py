@@ -80,5 +80,5 @@ def test_the_curves_are_drawn(tmp_path):
 
 def test_pages_of_methods_without_uncertainties_have_no_curves(compared):
     text = (compared / "compared/index.html").read_text()
-    assert NONE in text and 'id="sparsification"' not in text
+    assert NONE not in text and 'id="sparsification"' not in text
     assert (compared / "compared/confidence.png").exists()
