@@ -1,9 +1,11 @@
 """One scene's images to its ground control points."""
 
 import logging
+from contextlib import suppress
 
 from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.align_report import write_alignment
+from stereotruth.alignment.control_points import TooFewPoints, read_gcps
 from stereotruth.errors import InputError
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
@@ -19,6 +21,9 @@ if __name__ == "__main__":
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
         alignment = None
+        if snakemake.input.gcps and not snakemake.params.alone:
+            with suppress(TooFewPoints):  # faults of the sheet itself are errors here, too
+                read_gcps(snakemake.input.gcps, scene, snakemake.params.names)
         if snakemake.input.gcps:
             try:
                 alignment = align(
