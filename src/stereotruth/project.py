@@ -217,16 +217,24 @@ def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
     for column, cell in cells.items():
         if not is_remote(cell):
             continue
-        place = place_of(cell)
-        if ask or not (place.exists() or any(FOLDER.glob(str(place.relative_to(FOLDER))))):
-            if column == "lidar":
-                place = bring_files(cell, sheets.LIDAR_SUFFIXES)
-            elif column == "gcps":
-                place = bring_table(cell)
-            else:
-                place = bring_image(cell) if column.endswith("image") else stand_in(cell)
-        found[column] = str(place)
+        parts = cell.split(sheets.LIDAR_SEPARATOR) if column == "lidar" else [cell]
+        found[column] = sheets.LIDAR_SEPARATOR.join(
+            str(_place(part.strip(), column, ask=ask)) if is_remote(part) else part
+            for part in parts
+        )
     return replace(scene, **found)
+
+
+def _place(url: str, column: str, *, ask: bool) -> Path:
+    """Where the stand-in or the copy of a URL lies; its server is asked, or has been before."""
+    place = place_of(url)
+    if not ask and (place.exists() or any(FOLDER.glob(str(place.relative_to(FOLDER))))):
+        return place
+    if column == "lidar":
+        return bring_files(url, sheets.LIDAR_SUFFIXES + sheets.RASTER_SUFFIXES)
+    if column == "gcps":
+        return bring_table(url)
+    return bring_image(url) if column.endswith("image") else stand_in(url)
 
 
 @in_words()

@@ -37,6 +37,8 @@ from .settings_text import check
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
 MOST_BYTES = 20_000_000  # of a sheet
 LIDAR_SUFFIXES = (".las", ".laz")
+RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
+LIDAR_SEPARATOR = ";"
 
 
 Count = Annotated[Whole, Field(ge=0)]
@@ -84,7 +86,9 @@ class Scene:
     """forward view (target), likewise"""
 
     lidar: Given
-    """a folder or a glob of `.las`, `.laz`, `.copc.laz` files; of web servers, one file"""
+    """a folder, a glob or a file of points (`.las`, `.laz`, `.copc.laz`) or of surface models
+    (GeoTIFF, COG), or several of these with `;` between them; of a folder that has both kinds, the
+    points are read; of web servers, files. See docs/how-to/national_lidar.md"""
 
     lidar_crs: Text
     """EPSG code or WKT (compound allowed) for files that carry none; else empty"""
@@ -417,13 +421,27 @@ def _too_long(path: str) -> bool:
     )
 
 
-def lidar_files(pattern: str) -> list[Path]:
-    """The LAS/LAZ files of a folder or a glob, sorted. Raises InputError if there is none."""
+def lidar_files(cell: str) -> list[Path]:
+    """The files of points of folders, globs and paths with ``;`` between them, sorted.
+
+    Of a folder, these are its LAS and LAZ files, or, if it has none, its GeoTIFFs. Raises
+    InputError for a part of the cell that names no file.
+    """
+    parts = [part.strip() for part in cell.split(LIDAR_SEPARATOR)]
+    found = {file for part in parts if part for file in _files_of(part)}
+    if not found:
+        raise InputError("no LiDAR file is named", remedy="name a folder, a glob or files")
+    return sorted(found)
+
+
+def _files_of(pattern: str) -> list[Path]:
+    """The files of one folder, glob or path. Raises InputError if there is none."""
     path = Path(pattern)
     if _too_long(pattern):
         found = []
     elif path.is_dir():
-        found = [f for f in path.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES]
+        kinds = [f for f in path.iterdir() if f.suffix.lower() in LIDAR_SUFFIXES + RASTER_SUFFIXES]
+        found = [f for f in kinds if f.suffix.lower() in LIDAR_SUFFIXES] or kinds
     elif path.is_file():
         found = [path]
     else:
@@ -432,7 +450,8 @@ def lidar_files(pattern: str) -> list[Path]:
     if not found:
         raise InputError(
             f"no LiDAR file at {pattern!r}",
-            remedy="lidar is a folder that holds .las or .laz files, or a glob that matches some",
+            remedy="lidar is a folder that holds .las or .laz files or GeoTIFFs of heights, a glob "
+            "that matches some, or several of these with ';' between them",
         )
     if gone := [file for file in found if not file.is_file()]:
         raise InputError(
@@ -446,11 +465,11 @@ def lidar_files(pattern: str) -> list[Path]:
             file=patterns[0],
             remedy="rename it",
         )
-    return sorted(found)
+    return found
 
 
 def find_lidar(scene: Scene, sheet: str | Path) -> list[Path]:
-    """The LAS/LAZ files of a scene's ``lidar`` cell, sorted. Raises InputError if there is none."""
+    """The files of a scene's ``lidar`` cell, sorted. Raises InputError if there is none."""
     try:
         return lidar_files(scene.lidar)
     except InputError as error:
@@ -466,7 +485,7 @@ def store_names(files: Iterable[Path]) -> dict[str, Path]:
     """
 
     def stem(file: Path) -> str:
-        name = re.sub(r"(\.copc)?\.(las|laz)$", "", file.name, flags=re.IGNORECASE)
+        name = re.sub(r"(\.copc)?\.(las|laz|tiff?)$", "", file.name, flags=re.IGNORECASE)
         return re.sub(r"[^A-Za-z0-9._-]", "_", name)
 
     files = list(files)

@@ -234,6 +234,27 @@ def test_lidar_is_found_by_folder_glob_and_file(tmp_path):
     assert sheets.store_names(found).keys() == {"a", "b", "c"}
 
 
+def test_surface_models_are_found_where_there_are_no_points(tmp_path):
+    for name in ("a/b.tif", "a/B.TIFF", "a/notes.txt", "c/d.las", "c/orthophoto.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = sheets.lidar_files(str(tmp_path / "a"))
+    assert [f.name for f in found] == ["B.TIFF", "b.tif"]
+    assert sheets.store_names([*found, tmp_path / "c.tif"]).keys() == {"B", "b", "c"}
+    assert [f.name for f in sheets.lidar_files(str(tmp_path / "c"))] == ["d.las"]
+
+
+def test_lidar_may_be_a_list(tmp_path):
+    for name in ("a.las", "b.laz", "c.tif"):
+        (tmp_path / name).touch()
+    cell = f"{tmp_path / 'c.tif'}; {tmp_path / '*.la?'};{tmp_path / 'a.las'};"
+    assert [f.name for f in sheets.lidar_files(cell)] == ["a.las", "b.laz", "c.tif"]
+    with pytest.raises(InputError, match="no LiDAR file at 'none'"):
+        sheets.lidar_files(f"{tmp_path / 'a.las'};none")
+    with pytest.raises(InputError, match="no LiDAR file is named"):
+        sheets.lidar_files(" ; ")
+
+
 def test_no_lidar_is_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r"Qichun-1.*no LiDAR file"):
         sheets.find_lidar(scene_with_lidar(tmp_path / "none" / "*.laz"), "s.tsv")

@@ -100,7 +100,9 @@ def scene_add(
     delivery: Annotated[
         list[Path], typer.Argument(help="Folder of the delivery, or left and right image.")
     ],
-    lidar: Annotated[str, typer.Option(help="Folder or glob of LAS, LAZ, COPC files.")],
+    lidar: Annotated[
+        str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
+    ],
     gcps: Annotated[str, typer.Option(help="CSV of ground control points, if there are any.")] = "",
     city: Annotated[str, typer.Option(help="City, made if new; else the delivery's name.")] = "",
     scene: Annotated[str, typer.Option("--name", help="Of the scene; else City-1, City-2 …")] = "",
@@ -310,7 +312,9 @@ def status(
 def score_surface_model(
     model: Annotated[Path, typer.Argument(help="GeoTIFF of heights, north-up, in metres.")],
     to: Annotated[Path, typer.Option(help="Folder to be written: scores.json, index.html.")],
-    lidar: Annotated[str, typer.Option(help="Folder or glob of LAS, LAZ, COPC files.")] = "",
+    lidar: Annotated[
+        str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
+    ] = "",
     reference: Annotated[Path | None, typer.Option(help="Or a raster of true heights.")] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid, if the model's heights are orthometric.")

@@ -19,7 +19,6 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
-import laspy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,8 +27,9 @@ from ..job import progress
 from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
 from .cell_sort import SCRATCH_POINTS, SortedRuns
-from .las_files import PointTally, read_ahead, read_chunks, read_header, surplus_of
+from .las_files import PointTally, read_ahead
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
+from .point_files import PointFile, open_points
 from .point_store import ARRAYS, ATTRIBUTES, FORMAT, WORDS
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
@@ -40,16 +40,22 @@ Integers = NDArray[np.int64]
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
 COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
+COARSEST_CELL_M = 30.0  # of a surface model
 FARTHEST_M = 2e5  # heights beyond are no heights
 
 
-def _refuse_coarse(header: laspy.LasHeader, transform: ToWGS84, file: Path) -> None:
-    step = float(max(header.scales[:2])) * transform.system.horizontal_unit_m
-    if step > COARSEST_STEP_M:
+def _refuse_coarse(points: PointFile, transform: ToWGS84) -> None:
+    step, unit_m = float(max(points.header.scales[:2])), transform.system.horizontal_unit_m
+    if points.cell * unit_m > COARSEST_CELL_M:
         raise InputError(
-            f"coordinates are stored in steps of {max(header.scales[:2]):g}, "
-            f"{step:.4g} m on the ground",
-            file=file,
+            f"a surface model of cells of {points.cell * unit_m:.4g} m",
+            file=points.path,
+            remedy=f"give one of cells of {COARSEST_CELL_M:g} m at most; 1 m and less are good",
+        )
+    if not points.cell and step * unit_m > COARSEST_STEP_M:
+        raise InputError(
+            f"coordinates are stored in steps of {step:g}, {step * unit_m:.4g} m on the ground",
+            file=points.path,
             remedy="write the file again with a finer scale (0.01 m, or 1e-7 degree)",
         )
 
@@ -115,7 +121,10 @@ def ingest(
     chunk_points: int = 100_000,
     workers: int = 1,
 ) -> dict[str, Any]:
-    """Bring one LAS, LAZ or COPC file (1.0 to 1.4, any point format) into a point store.
+    """Bring one file of points into a point store.
+
+    LAS, LAZ and COPC (1.0 to 1.4, any point format), or a surface model as a GeoTIFF
+    (:mod:`.raster_points`).
 
     Memory is that of a reading chunk and :data:`SCRATCH_POINTS`, whatever the size of the file;
     where it has more points, the others pass through a scratch file without a name, 12 bytes each,
@@ -141,24 +150,20 @@ def ingest(
 
         drop_classes = Settings.drop_classes
     file = Path(lidar_file)
-    header = read_header(file)
+    points = open_points(file)
+    header = points.header
 
     def transform_of(extent: Floats | None) -> ToWGS84:
         return to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, extent=extent)
 
     transform = transform_of(None)
-    _refuse_coarse(header, transform, file)
+    _refuse_coarse(points, transform)
     with (
         atomic_folder(store) as unfinished,
         TemporaryFile(dir=unfinished.parent) as disk,
     ):
         reading = (drop_classes, chunk_points, workers, disk)
-        tally, runs = _read(file, header, transform, *reading)
-        own = tally.extent(header)
-        if transform.area != area_of(transform.system.horizontal, own):
-            operation, transform = transform.operation, transform_of(own)
-            if transform.operation != operation:  # the header's box led elsewhere
-                tally, runs = _read(file, header, transform, *reading)
+        tally, runs = _read(points, transform, *reading)
         dropped = tally.dropped(drop_classes)
         if runs.written == 0:
             raise InputError(
@@ -166,9 +171,14 @@ def ingest(
                 file=file,
                 remedy="remove the file, or drop fewer classes",
             )
+        own = tally.extent(header)
+        if transform.area != area_of(transform.system.horizontal, own):
+            operation, transform = transform.operation, transform_of(own)
+            if transform.operation != operation:  # the header's box led elsewhere
+                tally, runs = _read(points, transform, *reading)
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits)
-        notes = _notes(file, header, transform, tally, bounds)
+        notes = _notes(points, transform, tally, bounds)
         cells_crc32 = runs.write(unfinished)
         summary = {
             "points": {
@@ -199,17 +209,17 @@ def ingest(
 
 
 def _notes(
-    file: Path,
-    header: laspy.LasHeader,
+    points: PointFile,
     transform: ToWGS84,
     tally: PointTally,
     bounds: Sequence[float],
 ) -> list[str]:
     """Remarks for the user on a file whose points have been read; they lie within ``bounds``."""
+    file, header = points.path, points.header
     units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
     lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
     remarks = (
-        surplus_of(header, file),
+        points.remark,
         tally.compare_bounds(header, units_m, file),
         tally.compare_returns(header, file),
         check_area(transform.system, lon, lat, file),
@@ -242,8 +252,7 @@ def _write_attributes(
 
 
 def _read(
-    file: Path,
-    header: laspy.LasHeader,
+    points: PointFile,
     transform: ToWGS84,
     drop_classes: Sequence[int],
     chunk_points: int,
@@ -251,18 +260,19 @@ def _read(
     disk: BinaryIO,
 ) -> tuple[PointTally, SortedRuns]:
     """All points of a file, in runs sorted by cell; ``disk`` is scratch for them."""
+    file, header = points.path, points.header
     disk.seek(0)
     disk.truncate()
     tally = PointTally()
     room = min(SCRATCH_POINTS, header.point_count)
     runs = SortedRuns(np.empty((room, WORDS), "<u4"), disk)
     units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
-    chunks = read_chunks(file, header, chunk_points)
+    chunks = points.chunks(chunk_points)
     if workers > 1:
         chunks = read_ahead(chunks)
     total = -(-header.point_count // chunk_points)
-    for points in progress(chunks, total, f"{file.name}: chunks of points read"):
-        xyz, attributes = tally.take(points, header, drop_classes)
+    for chunk in progress(chunks, total, f"{file.name}: chunks of points read"):
+        xyz, attributes = tally.take(chunk, header, drop_classes)
         tally.compare_bounds(header, units_m, file)
         lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
         tally.look(lattice)

@@ -1,4 +1,4 @@
-"""What the headers of LiDAR files say, without their points: how many, where, in which system."""
+"""What the headers of LiDAR files say without their points: how many, where, in which system."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..numerics.degrees import DEGREE_M
 from .ingest import _bounds, _refuse_coarse, _to_lattice
-from .las_files import read_header, surplus_of
+from .point_files import open_points
 from .to_wgs84 import check_area, to_wgs84
 
 Box = tuple[float, float, float, float]
@@ -52,13 +52,15 @@ def survey(
     or far outside the area of the system; coordinates quantised too coarsely.
     """
     file = Path(file)
-    header = read_header(file)
+    points = open_points(file)
+    header = points.header
     transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
-    _refuse_coarse(header, transform, file)
+    _refuse_coarse(points, transform)
     notes = list(transform.notes)
-    if remark := surplus_of(header, file):
+    if remark := points.remark:
         notes.append(remark)
-    mins, maxs = np.asarray(header.mins), np.asarray(header.maxs)
+    low, high = points.heights or (np.nan, np.nan)
+    mins, maxs = np.array([*header.mins[:2], low]), np.array([*header.maxs[:2], high])
     box = heights = None
     if np.isfinite([mins, maxs]).all() and (maxs >= mins).all() and (maxs > mins).any():
         limits = np.array([[np.iinfo(np.int64).max] * 3, [np.iinfo(np.int64).min] * 3])

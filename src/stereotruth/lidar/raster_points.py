@@ -1,0 +1,199 @@
+"""Surface models as rasters (GeoTIFF, COG): each cell that has a height becomes a point.
+
+The point lies in the middle of its cell, has the class 1 (unclassified) and is the only return of
+its pulse. A raster cannot tell more: what lies under crowns and roofs, which cells are ground,
+trees or water, how many points a cell was made of, and where between two cells a wall stands.
+
+Cells are handed on as points of LAS format 6, so that units, coordinate systems, limits and counts
+are held to what they are held to in LAS files. Heights are those of the band, with its scale and
+offset; cells are read by the blocks of the file, whose order is that of the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pyproj
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
+
+from ..errors import InputError, in_number
+from ..products.ungeoreferenced import open_raster
+from .declared_crs import LINEAR_UNITS
+
+Floats = NDArray[np.float64]
+
+FORMATS = ("GTiff",)
+PARTS = 64  # of a cell, that the points' coordinates are stored in: exact, as a power of two
+HEIGHT_STEP = 1e-4  # of the unit of the heights
+LOWEST, HIGHEST = -4000.0, 30000.0  # heights on Earth, in metres or in feet
+MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
+MOST_BLOCK_CELLS = 1 << 26  # of a block, which GDAL reads as a whole
+SAMPLES = 64  # cells along each side that say how high a surface lies
+UNCLASSIFIED = 1
+UNITS = {  # of GDAL's bands
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 9001),
+    **dict.fromkeys(("ft", "foot", "feet", "international feet"), 9002),
+    **dict.fromkeys(("us-ft", "ftus", "us survey foot", "us survey feet", "sft"), 9003),
+}
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[rasterio.DatasetReader]:
+    """A raster of heights. Raises InputError if it cannot be read or is no such raster."""
+    try:
+        # vertical parts of systems are not told otherwise
+        with rasterio.Env(GTIFF_REPORT_COMPD_CS=True), open_raster(file, formats=FORMATS) as raster:
+            _refuse_other(raster, file)
+            yield raster
+    except RasterioError as error:
+        raise InputError(
+            f"no GeoTIFF that can be read ({error})",
+            file=file,
+            remedy="check or replace the file; lidar takes LAS, LAZ, COPC, and GeoTIFFs of heights",
+        ) from None
+
+
+def _refuse_other(raster: rasterio.DatasetReader, file: Path) -> None:
+    colours = [colour.name for colour in raster.colorinterp]
+    if raster.count - colours.count("alpha") != 1 or np.dtype(raster.dtypes[0]).kind not in "iuf":
+        raise InputError(
+            f"{in_number(raster.count, 'band')} of {raster.dtypes[0]} are no surface model",
+            file=file,
+            remedy="give a raster of one band of heights (gdal_translate -b N takes one out)",
+        )
+    at = raster.transform
+    if at.b or at.d or not (at.a > 0 > at.e) or at == rasterio.Affine.identity():
+        raise InputError(
+            "its cells are not on a grid with north up, or it has no place on the ground",
+            file=file,
+            remedy="gdalwarp it to its own coordinate system, or give its world file's content "
+            "with gdal_translate -a_ullr",
+        )
+    rows, cols = raster.block_shapes[0]
+    if rows * cols > MOST_BLOCK_CELLS or max(raster.shape) * PARTS > np.iinfo(np.int32).max:
+        raise InputError(
+            f"its blocks of {rows} x {cols} cells, or its {raster.height} x {raster.width} cells, "
+            "are too many to be read by parts",
+            file=file,
+            remedy="write it again in tiles (gdal_translate -of COG), or cut it into several files",
+        )
+
+
+def _system(raster: rasterio.DatasetReader, file: Path) -> str:
+    """WKT of the file's system, with the unit of its band's heights where only this tells it."""
+    if raster.crs is None:
+        return ""
+    system = pyproj.CRS.from_wkt(raster.crs.to_wkt())
+    unit = (raster.units[0] or "").strip()
+    if not unit or system.is_compound or len(system.axis_info) == 3:
+        return system.to_wkt()
+    if unit.lower() not in UNITS:
+        raise InputError(
+            f"its heights are in {unit!r}, which is no known unit",
+            file=file,
+            remedy="write the unit again: gdal_edit.py -units metre, or foot, or 'US survey foot'",
+        )
+    name, metres = LINEAR_UNITS[UNITS[unit.lower()]]
+    return (
+        f'COMPOUNDCRS["unknown",{system.to_wkt()},VERTCRS["unknown",VDATUM["unknown"],'
+        f'CS[vertical,1],AXIS["up",up],LENGTHUNIT["{name}",{metres!r}]]]'
+    )
+
+
+def raster_header(file: Path) -> laspy.LasHeader:
+    """The header that a LAS file of the cells would have.
+
+    ``point_count`` is the number of all cells; the lowest and highest height are NaN, since only
+    the cells tell them. Raises InputError: missing, unreadable, no raster of heights.
+    """
+    if not file.is_file():
+        raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
+    with _opened(file) as raster:
+        at, (rows, cols) = raster.transform, raster.shape
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales = np.array([at.a / PARTS, -at.e / PARTS, HEIGHT_STEP])
+        header.offsets = np.array([at.c, at.f + rows * at.e, 0.0])
+        half = np.array([at.a, -at.e]) / 2
+        size = np.array([cols * at.a, rows * -at.e])
+        header.mins = np.array([*(header.offsets[:2] + half), np.nan])
+        header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
+        header.point_count = rows * cols
+        if wkt := _system(raster, file):
+            record = laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0")
+            header.vlrs.append(record)
+            header.global_encoding.wkt = True
+    return header
+
+
+def remark_on(header: laspy.LasHeader) -> str:
+    """What users are to know of a raster's points."""
+    return (
+        f"a surface model of cells of {header.scales[0] * PARTS:g}: its points have no class and "
+        "no returns; nothing is known of what lies under crowns"
+    )
+
+
+def sampled_heights(file: Path) -> tuple[float, float] | None:
+    """Lowest and highest of some cells all over the raster, in its unit; None where all lack."""
+    with _opened(file) as raster:
+        shape = min(raster.height, SAMPLES), min(raster.width, SAMPLES)
+        heights = _heights(raster, Window(0, 0, raster.width, raster.height), file, shape)
+    held = heights[np.isfinite(heights)]
+    return (float(held.min()), float(held.max())) if held.size else None
+
+
+def _heights(raster: Any, window: Window, file: Path, shape: tuple[int, int]) -> Floats:
+    """Heights of a window's cells, resampled to ``shape`` by the nearest; NaN where none."""
+    raw = raster.read(1, window=window, out_shape=shape)
+    there = raster.read_masks(1, window=window, out_shape=shape) != 0
+    heights = np.where(there, raw * raster.scales[0] + raster.offsets[0], np.nan)
+    with np.errstate(invalid="ignore"):
+        wrong = (heights < LOWEST) | (heights > HIGHEST)
+    if wrong.any():
+        tagged = "no nodata value" if raster.nodata is None else f"nodata {raster.nodata:g}"
+        raise InputError(
+            f"{in_number(int(wrong.sum()), 'cell')} of {float(raw[wrong][0]):g}, which is no "
+            f"height on Earth; the file declares {tagged}",
+            file=file,
+            remedy="declare it as nodata (gdal_edit.py -a_nodata), or correct the band's scale",
+        )
+    return heights
+
+
+def _windows(raster: rasterio.DatasetReader) -> Iterator[Window]:
+    """The blocks of a raster, row by row; several of them where they are as wide as it is."""
+    (rows, cols), (height, width) = raster.block_shapes[0], raster.shape
+    if cols >= width:
+        rows *= max(1, MOST_CELLS // (rows * width))
+    for row in range(0, height, rows):
+        for col in range(0, width, cols):
+            yield Window(col, row, min(cols, width - col), min(rows, height - row))
+
+
+def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """The points of all cells that have a height, window by window of the file's blocks.
+
+    Raises InputError for values that are no heights, and for a raster that became unreadable.
+    """
+    with _opened(file) as raster:
+        for window in _windows(raster):
+            shape = int(window.height), int(window.width)
+            heights = _heights(raster, window, file, shape)
+            row, col = np.nonzero(np.isfinite(heights))
+            points = laspy.ScaleAwarePointRecord.zeros(row.size, header=header)
+            points.array["X"] = (2 * (col + int(window.col_off)) + 1) * (PARTS // 2)
+            up = raster.height - 1 - (row + int(window.row_off))
+            points.array["Y"] = (2 * up + 1) * (PARTS // 2)
+            points.array["Z"] = np.rint(heights[row, col] / HEIGHT_STEP)
+            points["return_number"] = points["number_of_returns"] = np.ones(row.size, np.uint8)
+            points["classification"] = np.full(row.size, UNCLASSIFIED, np.uint8)
+            if row.size:
+                yield points

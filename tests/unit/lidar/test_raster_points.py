@@ -1,0 +1,148 @@
+"""Surface models as rasters: cells against the points that they must become."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from rasterio.transform import Affine, from_origin
+
+from stereotruth.errors import InputError
+from stereotruth.lidar import raster_points
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.survey import survey
+
+from ...synthetic.las import FT, SOUTH, US_FT, WEST, everything, refused, write_gtx
+from ...synthetic.stores import tree_digest
+
+UTM = "EPSG:32650"
+
+
+def write_raster(file: Path, heights: np.ndarray, cell: float = 0.5, **profile) -> Path:
+    """A GeoTIFF of heights [rows, cols], its upper left corner 100 m north of SOUTH."""
+    options = {
+        "driver": "GTiff",
+        "height": heights.shape[-2],
+        "width": heights.shape[-1],
+        "count": 1,
+        "dtype": heights.dtype,
+        "crs": UTM,
+        "transform": from_origin(WEST, SOUTH + 100, cell, cell),
+        "nodata": -9999,
+    } | profile
+    units, scales = options.pop("units", None), options.pop("scales", None)
+    with rasterio.open(file, "w", **options) as raster:
+        if units:
+            raster.units = (units,)
+        if scales:
+            raster.scales, raster.offsets = ((value,) for value in scales)
+        raster.write(heights if heights.ndim == 3 else heights[None])
+    return file
+
+
+def surface(rows: int = 90, cols: int = 70) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    heights = rng.permutation(np.linspace(20, 60, rows * cols, dtype=np.float32))
+    heights = heights.reshape(rows, cols)  # of which each tells its cell
+    heights[rng.random((rows, cols)) < 0.2] = -9999
+    heights[3, 4] = np.nan
+    return heights
+
+
+def expected(heights: np.ndarray, cell: float = 0.5) -> np.ndarray:
+    """Longitude, latitude, height [n, 3] of the middles of the cells that have a height."""
+    row, col = np.nonzero(heights > -1000)
+    truth = pyproj.Transformer.from_crs(UTM, 4326, always_xy=True)
+    lon, lat = truth.transform(WEST + (col + 0.5) * cell, SOUTH + 100 - (row + 0.5) * cell)
+    return np.column_stack([lon, lat, heights[row, col].astype(float)])
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [{}, {"tiled": True, "blockxsize": 16, "blockysize": 32}, {"compress": "deflate"}],
+)
+def test_cells_become_points_in_their_middles(tmp_path, profile):
+    heights = surface()
+    file = write_raster(tmp_path / "a.tif", heights, **profile)
+    found = ingest(file, tmp_path / "a.points")
+    got = everything(PointStore(tmp_path / "a.points"))
+    truth = expected(heights)
+    assert found["points"]["kept"] == len(truth) == found["points"]["read"]
+    got_points = np.column_stack([got.lon, got.lat, got.height])[np.argsort(got.h_q)]
+    truth = truth[np.argsort(truth[:, 2])]
+    np.testing.assert_allclose(got_points[:, :2], truth[:, :2], rtol=0, atol=2.1e-9)
+    np.testing.assert_allclose(got_points[:, 2], truth[:, 2], rtol=0, atol=1.1e-4)
+    assert set(got.classification) == set(got.return_number) == set(got.number_of_returns) == {1}
+    assert any("surface model of cells of 0.5" in note for note in found["notes"])
+
+
+def test_the_store_does_not_depend_on_what_is_read_at_once(tmp_path, monkeypatch):
+    file = write_raster(tmp_path / "a.tif", surface())
+    digests = set()
+    for cells in (1, 1000, 1 << 20):
+        monkeypatch.setattr(raster_points, "MOST_CELLS", cells)
+        ingest(file, tmp_path / "a.points")
+        digests.add(tree_digest(tmp_path / "a.points"))
+    assert len(digests) == 1
+
+
+def test_scale_offset_and_integers(tmp_path):
+    raw = np.array([[100, 200], [-32768, 300]], np.int16)
+    write_raster(tmp_path / "a.tif", raw, nodata=-32768, scales=(0.1, 5.0))
+    ingest(tmp_path / "a.tif", tmp_path / "a.points")
+    assert sorted(everything(PointStore(tmp_path / "a.points")).height) == [15.0, 25.0, 35.0]
+
+
+@pytest.mark.parametrize(
+    ("units", "metres"), [("", 1.0), ("metre", 1.0), ("ft", FT), ("US survey foot", US_FT)]
+)
+def test_the_unit_of_the_band_counts(tmp_path, units, metres):
+    write_raster(tmp_path / "a.tif", np.full((2, 2), 100, np.float32), units=units)
+    ingest(tmp_path / "a.tif", tmp_path / "a.points")
+    height = everything(PointStore(tmp_path / "a.points")).height
+    np.testing.assert_allclose(height, 100 * metres, atol=2e-4)
+
+
+def test_a_compound_system_asks_for_its_geoid(tmp_path):
+    file = write_raster(tmp_path / "a.tif", surface(), crs="EPSG:32650+5773")
+    refused(file, r"heights are orthometric \('EGM96 height'\)")
+    grid = write_gtx(tmp_path / "egm96.gtx", np.full((5, 5), 10.0), 116, 29, 0.5)
+    found = ingest(file, tmp_path / "a.points", geoid=grid)
+    assert found["crs"]["heights"].startswith("orthometric (EGM96 height)")
+    plain = write_raster(tmp_path / "b.tif", surface())
+    by_sheet = ingest(plain, tmp_path / "b.points", geoid=grid, lidar_crs="EPSG:32650+5773")
+    assert by_sheet["bounds"] == found["bounds"]
+    assert by_sheet["bounds"][5] == pytest.approx(70, abs=0.1)
+
+
+def test_rasters_that_are_no_surface_models_are_refused(tmp_path):
+    good, file = surface(), tmp_path / "a.tif"
+    colours = np.zeros((3, 9, 9), np.uint8)
+    refused(write_raster(file, colours, count=3, nodata=None), "3 bands of uint8")
+    refused(write_raster(file, good, crs=None), "no coordinate reference system")
+    turned = Affine(0.5, 0.1, WEST, 0.1, -0.5, SOUTH)
+    refused(write_raster(file, good, transform=turned), "north up")
+    refused(write_raster(file, good, nodata=None), r"of -9999, which is no height.*no nodata value")
+    refused(write_raster(file, good, nodata=0), "which is no height.*declares nodata 0")
+    refused(write_raster(file, np.full((9, 9), -9999, np.float32)), "no point is left of 0")
+    refused(write_raster(file, good, cell=90.0), "surface model of cells of 90 m")
+    refused(write_raster(file, good, units="fathom"), "'fathom', which is no known unit")
+    write_raster(file, good)
+    file.write_bytes(file.read_bytes()[:3000])
+    refused(file, "GeoTIFF that can be read")
+
+
+def test_a_raster_is_surveyed_without_its_cells(tmp_path):
+    file = write_raster(tmp_path / "a.tif", surface())
+    found, read = survey(file), ingest(file, tmp_path / "a.points")
+    np.testing.assert_allclose(found.box, read["bounds"][:4], atol=1e-5)
+    assert found.heights[0] == pytest.approx(20, abs=1) and found.heights[1] <= 60
+    assert list(found.notes) == read["notes"]
+    empty = write_raster(tmp_path / "b.tif", np.full((9, 9), -9999, np.float32))
+    assert survey(empty).heights is None
+    with pytest.raises(InputError, match="no such LiDAR file"):
+        survey(tmp_path / "none.tif")
