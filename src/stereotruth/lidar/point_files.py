@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import laspy
 
-from ..sheets import RASTER_SUFFIXES
 from . import las_files
+
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # of TIFF 6.0 and of BigTIFF
 
 
 class PointFile:
@@ -82,7 +84,9 @@ class RasterFile(PointFile):
 
 
 def open_points(path: str | Path) -> PointFile:
-    """The file by the ending of its name. Raises InputError if it cannot be read."""
+    """The file by its first bytes. Raises InputError if it cannot be read."""
     path = Path(path)
-    kind = RasterFile if path.suffix.lower() in RASTER_SUFFIXES else PointFile
-    return kind(path)
+    first = b""
+    with suppress(OSError), path.open("rb") as stream:  # which the reader names
+        first = stream.read(4)
+    return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path)
