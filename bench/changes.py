@@ -174,6 +174,7 @@ class Labelled:
             settings_of(case), alignment=made / "alignment.json",
         )  # fmt: skip
         out = made.parent / f"{made.name}.zarr"
+        inputs = inputs.with_surface(made, workers=2)
         project_scene(inputs, out, code="bench", workers=2)
         grid = require_complete(out)
         return cls({name: grid[name][:] for name in grid.array_keys()}, arrays, changes)
@@ -181,8 +182,7 @@ class Labelled:
 
 def settings_of(case: Case) -> Settings:
     """How points become labels."""
-    del case
-    return Settings()
+    return Settings(diachronic=case.apart)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Reading a COPC file by footprint from a web server: points, bytes, time, faults. See README.md.
+"""Reading a COPC file by footprint: points, bytes, time, memory, faults. See README.md.
 
 Files are made (tests/synthetic/copc_server.py) and served on the loopback by a server that counts.
 """
@@ -7,9 +7,16 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
+import multiprocessing
+import os
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import laspy
 import numpy as np
@@ -25,64 +32,122 @@ from tests.synthetic.copc_server import (
 )
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.footprint import CELL_DEG, Footprint
+from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.point_store import PointStore
 
-SIDE = 2048.0
-
-
-def square(share: float) -> Footprint:
-    """A square footprint that covers a share of the made file's ground."""
-    side = SIDE * share**0.5
-    ring = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side + CORNER[:2] + 700
-    return Footprint((ring,))
+DENSITY = 10.0  # points/m²
+LON, LAT = 117.0, 29.83  # of the made files' corner
 
 
-def stored(octree, footprint: Footprint | None, plan=None) -> np.ndarray:
-    """Coordinates, in their order, of what a footprint has."""
-    records = octree.read(plan or octree.plan(footprint))
-    parts = [np.stack([r.array[axis] for axis in "XYZ"]) for r in records]
-    return np.concatenate(parts, axis=1) if parts else np.empty((3, 0), np.int32)
+class Square:
+    """A square of ground in the system of the made file."""
+
+    def __init__(self, side: float) -> None:
+        self.low = CORNER[:2] + 700
+        self.high = self.low + side
+
+    def touches(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        return ((low[:, :2] <= self.high) & (high[:, :2] >= self.low)).all(axis=1)
+
+    def contains(self, xyz: np.ndarray) -> np.ndarray:
+        x = xyz[:2].T
+        return ((x >= self.low) & (x <= self.high)).all(axis=1)
+
+
+def cells_of(share: float, side: float) -> Footprint:
+    """A square of whole cells of a store that covers about a share of the made file's ground."""
+    n = max(round(side * share**0.5 / 110), 1)
+    row, col = (
+        int((LAT + 0.4 * side / 111_000) / CELL_DEG),
+        int((LON + 0.4 * side / 96_600) / CELL_DEG),
+    )
+    return Footprint(row, col, np.ones((n, n), bool))
+
+
+def of_own_process(work: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
+    """Seconds of some work in a process of its own, and the most memory of that (MB)."""
+    context = multiprocessing.get_context("fork")
+    receiving, sending = context.Pipe(duplex=False)
+
+    def measured() -> None:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+        start = time.perf_counter()
+        work(*arguments)
+        seconds = time.perf_counter() - start
+        status = Path("/proc/self/status").read_text()
+        peak = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+        sending.send((seconds, int(peak.split()[1]) / 1e3))
+
+    process = context.Process(target=measured)
+    process.start()
+    seconds, peak = receiving.recv()
+    process.join()
+    return seconds, peak
+
+
+def stand_in(url: str, size: int) -> Path:
+    """What the workflow has in the place of a URL, in the working directory."""
+    parts = urlsplit(url)
+    place = Path("results", "remote", parts.scheme, parts.netloc, parts.path.lstrip("/"))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(json.dumps({"size": size, "content": '"one"'}) + "\n")
+    return place
+
+
+def same_cells(whole: PointStore, part: PointStore) -> bool:
+    """Whether a store has the cells of another one in its footprint, to the byte."""
+    at = np.stack([whole.cell_row - part.footprint.row, whole.cell_col - part.footprint.col])
+    good = ((at >= 0) & (at < np.array([part.footprint.held.shape]).T)).all(axis=0)
+    good[good] = part.footprint.held[tuple(at[:, good])]
+    points = np.load(whole.path / "points.npy", mmap_mode="r")
+    starts = np.append(0, np.cumsum(whole.cell_counts))
+    kept = [points[starts[k] : starts[k + 1]] for k in np.flatnonzero(good)]
+    return np.concatenate(kept).tobytes() == np.load(part.path / "points.npy").tobytes()
 
 
 def measure(points: int, levels: int) -> None:
-    """Bytes and time of 1 % of a file against all of it; each of them from the server."""
-    made = make_copc(points, SIDE, levels)
-    print(f"{points} points, {len(made.content)} bytes, {len(made.entries)} nodes")
-    with serving(made.content) as server:
-        stored(open_octree(server.url), square(0.0001))  # compiles
-        server.sent, server.requests = 0, []
-        start = time.perf_counter()
-        octree = open_octree(server.url)
-        plan = octree.plan(square(0.01))
-        part = stored(octree, None, plan)
-        part_s, sent, requests = time.perf_counter() - start, server.sent, list(server.requests)
-        start = time.perf_counter()
-        octree = open_octree(server.url)
-        whole_s, whole = 0.0, 0
-        inside = []
-        crop = square(0.01)
-        for record in octree.read(octree.plan(None)):
-            whole += len(record)
-            seconds = time.perf_counter()
-            xyz = np.stack([record.array[axis] for axis in "XYZ"])
-            world = xyz * octree.header.scales[:, None] + octree.header.offsets[:, None]
-            inside.append(xyz[:, crop.contains(world)])
-            start += time.perf_counter() - seconds
-        whole_s = time.perf_counter() - start
-    same = np.array_equal(np.concatenate(inside, axis=1), part)
-    print("requests: " + "; ".join(text.split("=")[1] for text in requests))
-    print(f"1 %: {part.shape[1]} points of {len(plan.nodes)} nodes ({plan.touched} touched)")
-    print(f"bytes sent {sent}, of the nodes {plan.bytes}: {sent / plan.bytes:.3f} (1.2 asked)")
-    print(f"same as the whole file's {whole}, cropped: {same}")
-    print(f"time {part_s:.3f} s of {whole_s:.3f} s: {part_s / whole_s:.4f} (0.05 asked)")
+    """Bytes, time and memory of 1 % of a file against all of it."""
+    side = (points / DENSITY) ** 0.5
+    file = Path("tile.copc.laz")
+    made = make_copc(points, side, levels)
+    file.write_bytes(made.content)
+    nodes, size = len(made.entries), len(made.content)
+    print(f"{points} points, {size} bytes, {nodes} nodes, {side:.0f} m")
+    del made
+    footprint = cells_of(0.01, side)
+    print(f"footprint of {footprint.area_m2 / side**2:.2%} of the ground")
+    ingest(file, "warm.points", footprint=footprint)  # compiles
+    part_s, part_mb = of_own_process(ingest_part, file, "part.points", footprint)
+    whole_s, whole_mb = of_own_process(ingest, file, "whole.points")
+    part, whole = PointStore("part.points"), PointStore("whole.points")
+    read = part.attrs["nodes"][0]
+    print(f"1 %: {part.count} points of {part.attrs['points']['read']} in {read} nodes")
+    print(f"store equals the whole file's, cropped: {same_cells(whole, part)}")
+    print(f"time {part_s:.2f} s of {whole_s:.2f} s: {part_s / whole_s:.4f} (0.05 asked)")
+    print(f"memory {part_mb:.0f} MB, of the whole file as LAZ {whole_mb:.0f} MB")
+    with serving(file.read_bytes()) as server:
+        place = stand_in(server.url, size)
+        ingest(place, "web.points", footprint=footprint)
+        nodes_bytes = PointStore("web.points").attrs["bytes"][0]
+        print("requests: " + "; ".join(text.split("=")[1] for text in server.requests))
+        print(
+            f"bytes sent {server.sent}, of the nodes {nodes_bytes}: {server.sent / nodes_bytes:.3f}"
+        )
+        print(f"store equals that of the disk: {same_cells(part, PointStore('web.points'))}")
+
+
+def ingest_part(file: Path, store: str, footprint: Footprint) -> None:
+    """:func:`.ingest` with its keyword."""
+    ingest(file, store, footprint=footprint)
 
 
 def plant(rounds: int) -> None:
     """Faults of servers and files, each ``rounds`` times: overcome, refused, or lost silently."""
-    made, patience_s, footprint = make_copc(), 3.0, square(0.05)
+    made, patience_s, ground = make_copc(), 3.0, Square(2048 * 0.05**0.5)
     las = laspy.read(io.BytesIO(made.content))
-    kept = footprint.contains(np.stack([las.x, las.y, las.z]))
+    kept = ground.contains(np.stack([las.x, las.y]))
     truth = np.stack([np.asarray(las[axis])[kept] for axis in "XYZ"])
     totals = {"right": 0, "refused": 0, "silent": 0, "traceback": 0}
     longest = 0.0
@@ -94,8 +159,12 @@ def plant(rounds: int) -> None:
             start = time.perf_counter()
             with serving(content, "" if in_file else fault, int(rng.integers(0, 6))) as server:
                 try:
-                    got = stored(open_octree(server.url, patience_s=patience_s), footprint)
-                    outcome = "right" if np.array_equal(got, truth) else "silent"
+                    octree = open_octree(server.url, patience_s=patience_s)
+                    records = list(octree.read(octree.plan(ground.touches)))
+                    got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
+                    world = got.T * octree.header.scales + octree.header.offsets
+                    right = np.array_equal(got[:, ground.contains(world.T)], truth)
+                    outcome = "right" if right else "silent"
                 except InputError:
                     outcome = "refused"
                 except Exception as error:
@@ -116,8 +185,10 @@ def main() -> None:
     parser.add_argument("--levels", type=int, default=6)
     parser.add_argument("--rounds", type=int, default=4)
     options = parser.parse_args()
-    measure(options.points, options.levels)
-    plant(options.rounds)
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        measure(options.points, options.levels)
+        plant(options.rounds)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,7 @@ def labelled(scene: Scene, gcps: int, refined: bool) -> SceneStores:
                     *opened, model, made / "epipolar.json", *stores, workers=1, left_attrs=attrs
                 )
             inputs = SceneInputs.of(*stores, scene.stores, Settings())
+            inputs = inputs.with_surface(made)
             project_scene(inputs, made / "disparity.zarr", code="", workers=1)
     files = [folder / f"{kind}.zarr" for kind in ("disparity", *VIEWS)]
     return open_stores(SceneFiles("Wooded", *files))

@@ -103,7 +103,7 @@ class Block:
         job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)
         share = min((points_per_m2 or self.density) / self.density, 1.0)
         job.__dict__["stores"] = tuple(Thinned(path, share) for path in self.pair.points)
-        return job
+        return job.with_surface(self.rectified / f"surface_{share:.9f}", workers=2)
 
     def compile(self, job: SceneInputs) -> None:
         """Label a corner, so that what follows is compiled."""

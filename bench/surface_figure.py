@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from stereotruth.disparity.pixel_scale import PixelScale
-from stereotruth.disparity.rays import Rays
 from stereotruth.lidar.lattice import LATTICE_M
 from stereotruth.products.pictures import save_figure
+from stereotruth.surface.scale import SurfaceScale
 from stereotruth.surface.surface import GroundSurface, ground_surface
 from stereotruth.surface.vertices import VertexBuilder
 
@@ -27,7 +26,6 @@ Floats = NDArray[np.float64]
 
 CELL, CELL_M = (3000, 3000), 0.33  # lattice steps at the equator
 SPACING_M, SIDE_M, NOISE_M = 1.0, 32.0, 0.03
-PX_PER_M = 1.0
 TURN = np.radians(22.0)
 ROOF, OPEN, PRISM = "#b5651d", "#f4c7c3", "#b3261e"
 RAY = "#1f5a99"
@@ -50,8 +48,7 @@ def surface_of_points() -> tuple[GroundSurface, Floats]:
     x, y = np.mgrid[0:SIDE_M:SPACING_M, 0:SIDE_M:SPACING_M].reshape(2, -1)
     x, y = (c + rng.uniform(-0.35, 0.35, c.size) * SPACING_M + 1.0 for c in (x, y))
     h = heights(x, y) + rng.normal(0.0, NOISE_M, x.size)
-    rays = Rays(np.zeros((2, 2, 3)), CELL, PX_PER_M)
-    scale = PixelScale.of(SPACING_M**-2, rays).surface
+    scale = SurfaceScale.of(SPACING_M**-2, CELL)
     builder = VertexBuilder(scale, (0, 0), (400_000, 400_000))
     lon, lat = (np.rint(c / CELL_M * CELL[0]).astype(np.int64) for c in (x, y))
     ground, first = np.full(x.size, 2, np.uint8), np.ones(x.size, np.uint8)

@@ -156,6 +156,7 @@ def label_by(
     code = source_digest("disparity.project")
     alignment_file = folder / "alignment.json"
     inputs = SceneInputs.of(*rectified, stores, settings, alignment=alignment_file)
+    inputs = inputs.with_surface(folder, workers)
     project_scene(inputs, made, workers=workers, code=code)
     return made
 
@@ -245,5 +246,5 @@ def fresh_pair(number: int, folder: Path) -> Pair:
         with atomic_folder(stores) as scratch:
             for file in lidar_files(city, pair.spec):
                 store = scratch / f"{Path(file).stem}.points"
-                ingest(pair.data / "lidar" / file, store, scene=name)
+                ingest(pair.data / "lidar" / file, store)
     return pair

@@ -64,6 +64,7 @@ def main() -> None:
             images = (pair / f"{view}.zarr" for view in VIEWS)
             settings, alignment = Settings(recipe=recipe), pair / "alignment.json"
             inputs = SceneInputs.of(*images, stores, settings, alignment=alignment)
+            inputs = inputs.with_surface(pair)
             project_scene(inputs, store, code=source_digest("disparity.project"))
             f = evaluate_checkpoints(store, options.scene / "checkpoints.csv")
             share = 100.0 * f["labelled"] / f["points"]

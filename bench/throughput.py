@@ -72,7 +72,7 @@ with job(log, "ingest"):
     ingest(lidar, store, provenance=describe([lidar], {}, ""))
 """
 PROJECT_JOB = """
-import json, sys
+import json, os, sys
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
@@ -81,6 +81,7 @@ left, right, points, out, log, alignment, settings, options = sys.argv[1:]
 points, settings = json.loads(points), Settings(**json.loads(settings))
 inputs = SceneInputs.of(left, right, points, settings, alignment=alignment)
 with job(log, "project"):
+    inputs = inputs.with_surface(os.path.dirname(out), json.loads(options).get("workers", 1))
     project_scene(inputs, out, **json.loads(options))
 """
 BOUNDS = {  # part of a profile: what its time goes into
@@ -294,7 +295,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     def inputs(points: Sequence[Path]) -> SceneInputs:
         return SceneInputs.of(left, right, points, Settings(**settings), alignment=alignment)
 
-    project_scene(inputs([smallest_store]), out, **options)
+    project_scene(inputs([smallest_store]).with_surface(out.parent), out, **options)
 
     print("T0, ingest, project", flush=True)
     count = decode(files)  # into the page cache
@@ -341,7 +342,9 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         shutil.rmtree(made)
         shutil.rmtree(out.parent)
         times = profiled(
-            lambda: project_scene(inputs(stores), out, scheduler="synchronous", **options)
+            lambda: project_scene(
+                inputs(stores).with_surface(out.parent), out, scheduler="synchronous", **options
+            )
         )
         profiles["project"] = parts(times, count)
 

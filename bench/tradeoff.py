@@ -75,6 +75,7 @@ def measure(
             inputs = SceneInputs.of(
                 made.left, made.right, made.points, Settings(**settings), alignment=alignment
             )
+            inputs = inputs.with_surface(made.exact, workers)
             code = source_digest("disparity.project")
             project_scene(inputs, out, workers=workers, code=code)
         store = open_grid(out)

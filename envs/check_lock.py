@@ -12,7 +12,7 @@ from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-NOT_LOCKED = {"networks"}  # which build of PyTorch fits depends on the machine
+NOT_LOCKED = {"mccnn", "networks"}  # which build of PyTorch fits depends on the machine
 ROOT = Path(__file__).parents[1]
 
 

@@ -135,6 +135,7 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"results/evaluate/(?:[^/]+/)?([^/]+)/truth\.json": _against_truth,
     r"results/evaluate/([^/]+)/table4\.csv": _look,
     r"results/report/([^/]+)/index\.html": _look,
+    r"results/site/([^/]+)/index\.html": _look,
     r"dataset": _look,
     r"results/train/([^/]+)/([^/]+)/training\.json": _training,
     r"benchmark/([^/]+)/[^/.]+": _scores,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,15 @@ import yaml
 from . import sheets
 from .configuration import Configuration
 from .errors import InputError, in_words, told_by_system
+from .lidar.catalogue_list import (
+    EPT,
+    days_of_list,
+    files_of_list,
+    is_catalogue,
+    is_list,
+    remarks_on,
+    unlisted_m2,
+)
 from .products.remote_files import (
     FOLDER,
     bring_files,
@@ -27,6 +37,7 @@ from .settings import merged
 from .simulate.cities import CITIES as SYNTHETIC
 from .simulate.cities import lidar_files
 
+log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parent
 # Snakefile, workflow/, config/, profiles/ and envs/: of the clone, or what setup.py put into the
 # wheel.
@@ -183,14 +194,18 @@ def read_scenes(
     """
     cities = sheets.read_cities(sheet(settings, "cities"))
     images = read_images(settings, cities)
-    scenes = sheets.read_scenes(
+    rows = sheets.read_scenes(
         sheet(settings, "scenes"), cities, images, cities_sheet=sheet(settings, "cities")
     )
-    for name, scene in scenes.items():
+    scenes = dict(rows)
+    for name, scene in rows.items():
         if is_synthetic(scene):
             scenes[name] = replace(scene, gcps=here_or_shipped(scene.gcps))
         else:
-            scenes[name] = _with_stand_ins(scene, ask=ask)
+            scenes[name] = with_stand_ins(scene, ask=ask)
+    if ask:
+        for remark in dict.fromkeys(_remarks_on_lists(rows, scenes, settings)):
+            log.warning("%s", remark)
     return cities, scenes
 
 
@@ -199,6 +214,11 @@ def read_images(
 ) -> dict[str, sheets.Image]:
     """The images of sites by name; none if the project has no such sheet."""
     return sheets.read_images(settings.images, cities) if settings.images else {}
+
+
+def file_of_image(image: sheets.Image) -> str:
+    """Path of an image of the sheet; of one named by a URL, that of its stand-in."""
+    return str(_place(image.file, "left_image", ask=False)) if is_remote(image.file) else image.file
 
 
 def names_in_pair(scene: sheets.Scene, images: Mapping[str, sheets.Image]) -> tuple[str, str]:
@@ -211,18 +231,58 @@ def names_in_pair(scene: sheets.Scene, images: Mapping[str, sheets.Image]) -> tu
     return by_file.get(key(scene.left_image), ""), by_file.get(key(scene.right_image), "")
 
 
-def _with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
+def _remarks_on_lists(
+    rows: Mapping[str, sheets.Scene], scenes: Mapping[str, sheets.Scene], settings: Configuration
+) -> Iterator[str]:
+    """What users are to know of the lists of tiles that rows name; ``scenes`` have the files."""
+    for name, row in rows.items():
+        files = [part for part in _lidar_parts(row) if is_list(part)]
+        for file in files:
+            yield from remarks_on(file)
+        if not files or len(files) < len(_lidar_parts(row)):
+            continue
+        from .alignment.pair_ground import footprint_of  # for few projects
+
+        images = scenes[name].left_image, scenes[name].right_image
+        ground = footprint_of([images], settings.ingest.margin_m or 0.0)
+        if ground is not None and (unlisted := unlisted_m2(files, ground)):
+            yield (
+                f"{', '.join(files)}: written for other scenes or a smaller ingest.margin_m, has "
+                f"nothing of {unlisted / 1e6:.4g} km² of the ground of scene {name}: write it again"
+            )
+
+
+def _lidar_parts(scene: sheets.Scene) -> list[str]:
+    return [part.strip() for part in scene.lidar.split(sheets.LIDAR_SEPARATOR)]
+
+
+def with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
+    """A row with paths in the place of URLs and of lists of tiles; see :func:`read_scenes`."""
     cells = {column: getattr(scene, column) for column in (*sheets.FILES, "lidar")}
     found = {}
     for column, cell in cells.items():
-        if not is_remote(cell):
-            continue
-        parts = cell.split(sheets.LIDAR_SEPARATOR) if column == "lidar" else [cell]
-        found[column] = sheets.LIDAR_SEPARATOR.join(
-            str(_place(part.strip(), column, ask=ask)) if is_remote(part) else part
-            for part in parts
-        )
+        if column == "lidar":
+            parts = _lidar_parts(scene)
+            files = [file for part in parts for file in _lidar_part(part, ask=ask)]
+            if files != parts:
+                found[column] = sheets.LIDAR_SEPARATOR.join(files)
+        elif is_remote(cell):
+            found[column] = str(_place(cell, column, ask=ask))
     return replace(scene, **found)
+
+
+def _lidar_part(part: str, *, ask: bool) -> list[str]:
+    """Paths that a part of a scene's cell ``lidar`` names: itself, or what stands for it."""
+    if is_list(part):
+        return files_of_list(part)
+    if is_catalogue(part):
+        raise InputError(
+            "a catalogue, which a run does not look into",
+            file=part,
+            remedy="have its tiles listed (stereotruth lidar CATALOGUE --to lidar/NAME.tsv), and "
+            "name the list",
+        )
+    return [str(_place(part, "lidar", ask=ask))] if is_remote(part) else [part]
 
 
 def _place(url: str, column: str, *, ask: bool) -> Path:
@@ -231,10 +291,17 @@ def _place(url: str, column: str, *, ask: bool) -> Path:
     if not ask and (place.exists() or any(FOLDER.glob(str(place.relative_to(FOLDER))))):
         return place
     if column == "lidar":
-        return bring_files(url, sheets.LIDAR_SUFFIXES + sheets.RASTER_SUFFIXES)
+        return bring_files(url, (*sheets.LIDAR_SUFFIXES, *sheets.RASTER_SUFFIXES, EPT))
     if column == "gcps":
         return bring_table(url)
     return bring_image(url) if column.endswith("image") else stand_in(url)
+
+
+def lidar_days(settings: Configuration, cities: Mapping[str, sheets.City]) -> dict[str, list[str]]:
+    """First and last day (ISO) of LiDAR files by path, of those whose lists of tiles say them."""
+    rows = sheets.read_scenes(sheet(settings, "scenes"), cities, read_images(settings, cities))
+    lists = {part for row in rows.values() for part in _lidar_parts(row) if is_list(part)}
+    return {file: days for part in sorted(lists) for file, days in days_of_list(part).items()}
 
 
 @in_words()
@@ -277,6 +344,15 @@ def stores_of(
             for store, file in lidar[name].items()
         ]
     return found
+
+
+def surfaces_of(stores: Mapping[str, Sequence[tuple[str, str]]]) -> dict[str, str]:
+    """The scene that the surface of each scene is named by: the first in the sheet that takes the
+    same points. ``stores``: see :func:`stores_of`."""
+    first: dict[tuple[tuple[str, str], ...], str] = {}
+    return {
+        scene: first.setdefault(tuple(sorted(points)), scene) for scene, points in stores.items()
+    }
 
 
 def adjusted_scenes(

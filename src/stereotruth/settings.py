@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, date, datetime
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from pydantic import (
@@ -84,6 +85,18 @@ def no_pattern(value: str) -> str:
     if PATTERN.search(value):
         raise ValueError("has a name in { }, which stands for something else in the workflow")
     return value
+
+
+def acquisition_time(text: str) -> datetime | date:
+    """The time, UTC, or the date that a cell ``acquired`` names. ValueError says what is wrong."""
+    if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
+        return date.fromisoformat(text)
+    if not re.match(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", text):
+        raise ValueError("is not of the form 2020-10-25T03:12:45Z")
+    time = datetime.fromisoformat(text)
+    if time.tzinfo is None:
+        raise ValueError("has no time zone: Z of UTC, or an offset such as +08:00")
+    return time.astimezone(UTC)
 
 
 def name_of(characters: str) -> Any:

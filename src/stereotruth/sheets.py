@@ -14,9 +14,9 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields
-from datetime import UTC, date, datetime
+from datetime import date, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
@@ -29,6 +29,7 @@ from .settings import (
     Number,
     Text,
     Whole,
+    acquisition_time,
     name_of,
     settings,
 )
@@ -39,6 +40,7 @@ MOST_BYTES = 20_000_000  # of a sheet
 LIDAR_SUFFIXES = (".las", ".laz")
 RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
 LIDAR_SEPARATOR = ";"
+DIACHRONIC_DAYS = 30.0  # more than these, as in DiachronicStereo (2026)
 
 
 Count = Annotated[Whole, Field(ge=0)]
@@ -86,9 +88,10 @@ class Scene:
     """forward view (target), likewise"""
 
     lidar: Given
-    """a folder, a glob or a file of points (`.las`, `.laz`, `.copc.laz`) or of surface models
-    (GeoTIFF, COG), or several of these with `;` between them; of a folder that has both kinds, the
-    points are read; of web servers, files. See docs/how-to/national_lidar.md"""
+    """a folder, a glob or a file of points (`.las`, `.laz`, `.copc.laz`, `ept.json`) or of surface
+    models (GeoTIFF, COG), a list of tiles that `stereotruth lidar` has written from a catalogue
+    (`.tsv`), or several of these with `;` between them; of a folder that has both kinds, the points
+    are read; of web servers, files. See docs/how-to/national_lidar.md"""
 
     lidar_crs: Text
     """EPSG code or WKT (compound allowed) for files that carry none; else empty"""
@@ -112,6 +115,11 @@ class Scene:
 
     right_mask: FilePath = ""
     """likewise, of the right image"""
+
+    diachronic: Literal["", "true", "false"] = ""
+    """optional: whether both images were taken under different suns or in different seasons, see
+    `project.diachronic`; empty: true if the images sheet knows both dates and they are more than 30
+    days apart, else as `project.diachronic` says"""
 
 
 @settings
@@ -237,18 +245,6 @@ def read_cities(path: str | Path) -> dict[str, City]:
     return cities
 
 
-def acquisition_time(text: str) -> datetime | date:
-    """The time, UTC, or the date that a cell ``acquired`` names. ValueError says what is wrong."""
-    if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
-        return date.fromisoformat(text)
-    if not re.match(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", text):
-        raise ValueError("is not of the form 2020-10-25T03:12:45Z")
-    time = datetime.fromisoformat(text)
-    if time.tzinfo is None:
-        raise ValueError("has no time zone: Z of UTC, or an offset such as +08:00")
-    return time.astimezone(UTC)
-
-
 def read_images(
     path: str | Path, cities: Mapping[str, City], cities_sheet: str | Path = "the cities sheet"
 ) -> dict[str, Image]:
@@ -338,6 +334,7 @@ def with_images(
     """
     by_file = {file_key(image.file): image for image in images.values()}
     found = dict(cells)
+    dates: list[date | None] = []
     for view in ("left", "right"):
         cell = cells[f"{view}_image"]
         image = images.get(cell) or by_file.get(file_key(cell))
@@ -359,7 +356,17 @@ def with_images(
             )
         found[f"{view}_image"] = image.file
         found[f"{view}_mask"] = cells[f"{view}_mask"] or image.mask
+        dates.append(_day(image.acquired))
+    if len(dates) == 2 and not cells["diachronic"] and None not in dates:
+        apart = abs((dates[0] - dates[1]).days)
+        found["diachronic"] = "true" if apart > DIACHRONIC_DAYS else ""
     return found
+
+
+def _day(acquired: str) -> date | None:
+    """Of a cell ``acquired``; None where it is empty."""
+    time = acquisition_time(acquired) if acquired else None
+    return time.date() if isinstance(time, datetime) else time
 
 
 def read_scenes(

@@ -208,8 +208,10 @@ def test_dask_workers_come_and_go_while_project_runs(
     images = [made / f"rectify/East/East-1/{view}.zarr" for view in ("left", "right")]
     points = sorted((made / "ingest/East/East-1").glob("*.points"))
 
+    surface = made / "surface/East/East-1.surface"
+
     def label(out: Path, **how: object) -> None:
-        inputs = SceneInputs.of(*images, points, Settings())
+        inputs = SceneInputs.of(*images, points, Settings(), surface=surface)
         project.project_scene(inputs, out, code="the same", **how)
 
     label(tmp_path / "threads.zarr", workers=2)

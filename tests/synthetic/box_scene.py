@@ -141,6 +141,8 @@ def project_with(left: Path, right: Path, stores: list[Path], out: Path, **optio
     run = {name: options.pop(name) for name in RUN if name in options}
     pair = {name: options.pop(name) for name in ("view", "alignment") if name in options}
     inputs = SceneInputs.of(left, right, stores, Settings(**options), **pair)
+    if inputs.point_stores:
+        inputs = inputs.with_surface(out.parent / "surfaces")
     return project_scene(inputs, out, **{"code": "test", **run})
 
 
@@ -160,6 +162,11 @@ class Scene:
         east, north, height = self.surface
         xy = self.model.ground_to_epipolar(LON + east / METRES[0], LAT + north / METRES[1], height)
         self.truth = (xy[0] - xy[2]).reshape(self.model.shape)
+
+    def inputs(self, settings: Settings, view: str = "left") -> SceneInputs:
+        """What the scene's labels are made of."""
+        inputs = SceneInputs.of(*self.images, [self.store], settings, view)
+        return inputs.with_surface(self.folder / "surfaces")
 
     def project(self, name: str = "out.zarr", stores: list[Path] | None = None, **options):
         out = self.folder / name

@@ -286,7 +286,7 @@ def _entry(made: MadeCopc, content: bytearray, rng: np.random.Generator) -> tupl
 
 
 # What is wrong with a file, and whether all points come all the same; None: they do, or it is
-# refused, but for a node swapped with one of its own descendants (see lidar/octree_nodes.py).
+# refused.
 FILE_FAULTS = {
     "header bounds": True,
     "header bounds in z": True,

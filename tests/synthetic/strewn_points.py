@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereotruth.disparity.pixel_scale import PixelScale
-from stereotruth.disparity.rays import Rays
 from stereotruth.lidar.lattice import LATTICE_M
 from stereotruth.surface.scale import SurfaceScale
 from stereotruth.surface.surface import GroundSurface, ground_surface
@@ -30,8 +28,8 @@ class Parts(NamedTuple):
 
 
 def scale_of(points_per_m2: float, cell: tuple[int, int] = CELL) -> SurfaceScale:
-    """Of points of a density; 1 px of disparity per m."""
-    return PixelScale.of(points_per_m2, Rays(np.zeros((2, 2, 3)), cell, 1.0)).surface
+    """Of points of a density; a px of disparity is 1.1 m of height."""
+    return SurfaceScale.of(points_per_m2, cell)
 
 
 def parts(surface: GroundSurface, corner: Array) -> Parts:
@@ -48,7 +46,7 @@ def surface_of(
     side: float = 40.0,
     within: tuple[float, float, float, float] | None = None,
 ) -> GroundSurface:
-    """The surface of points on a jittered grid over x, y (m); 1 px of disparity per m.
+    """The surface of points on a jittered grid over x, y (m).
 
     ``within``: of the points in a box (x, y from, x, y to) alone, with the places of all.
     """

@@ -18,7 +18,7 @@ MOST_LINES = 520
 MOST_FUNCTION_LINES, MOST_PARAMETERS = 100, 10  # ``self`` and ``cls`` apart
 # Functions beyond, to be emptied: (lines, parameters).
 LONG_FUNCTIONS = {
-    "command.main.pairs": (52, 13),  # the options of a command are its parameters
+    "command.main.pairs": (44, 12),  # the options of a command are its parameters
 }
 # The rooms that are held to the glossary of CONTRIBUTING.md, and words that no variable, argument
 # or function has as a part of its name there.

@@ -9,6 +9,7 @@ import pytest
 from stereotruth import sheets
 from stereotruth.configuration import REPLACED, Configuration, defaults_text, with_tables
 from stereotruth.errors import InputError
+from stereotruth.settings import acquisition_time
 
 ROOT = Path(__file__).parents[2]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"
@@ -351,7 +352,7 @@ def test_columns_of_an_image_that_is_not_known_may_be_left_out(tmp_path):
     ],
 )
 def test_times_of_images(text, time):
-    assert sheets.acquisition_time(text) == time
+    assert acquisition_time(text) == time
 
 
 @pytest.mark.parametrize(
@@ -418,3 +419,25 @@ def test_scenes_of_images_that_are_no_pair_are_refused(tmp_path, cells, words):
     with pytest.raises(InputError) as caught:
         sheets.read_scenes(write(tmp_path / "s.tsv", scenes_text(row)), cities, images)
     assert all(w in str(caught.value) for w in (*words, "line 2: scene 'Qichun-1'", "s.tsv"))
+
+
+@pytest.mark.parametrize(
+    "first, second, cell, expected",
+    [
+        ("2020-01-01", "2020-03-01", "", "true"),
+        ("2020-01-01", "2020-01-20", "", ""),
+        ("2020-01-01T03:00:00Z", "2020-03-01", "false", "false"),
+        ("", "2020-03-01", "", ""),
+        ("", "", "true", "true"),
+    ],
+)
+def test_images_more_than_a_month_apart_share_no_light(
+    first: str, second: str, cell: str, expected: str
+) -> None:
+    images = {
+        name: sheets.Image(image=name, city="A", file=f"{name}.tif", acquired=acquired)
+        for name, acquired in (("l", first), ("r", second))
+    }
+    cells = dict.fromkeys(("left_mask", "right_mask"), "") | {"city": "A", "diachronic": cell}
+    row = cells | {"left_image": "l", "right_image": "r"}
+    assert sheets.with_images(row, images, "line 2", Path("s.tsv"))["diachronic"] == expected

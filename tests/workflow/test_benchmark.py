@@ -128,5 +128,7 @@ def test_a_wrong_name_ends_before_any_work(project, target, words):
     )
     run = project.snakemake("--dry-run", target, "--configfile", "far.yaml")
     assert run.status != 0
+    *_, heading, message = run.text.rstrip().splitlines()
+    assert heading == "Refused:"
     for word in words:
-        assert word in run.text
+        assert word in message

@@ -29,6 +29,7 @@ REACH = {
     "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
+    "surface": {"surface", "epipolar", "lidar", "products"},
     "project": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
     "project_right": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
     "project_strip": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
@@ -41,6 +42,7 @@ REACH = {
     "evaluate_truth_city": {"evaluation", "dataset", "products"},
     "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
     "report_city": {"report", "dataset", "epipolar", "products"},
+    "report_site": {"report", "alignment", "epipolar", "products"},
     "audit": {"evaluation", "alignment", "dataset", "epipolar", "products"},
     "training_city": {
         "evaluation",

@@ -8,6 +8,7 @@ import re
 import pytest
 import snakemake.cli  # noqa: F401  first: the others import in a circle
 from snakemake.dag import DAG
+from snakemake.exceptions import InputFunctionException
 from snakemake.io import _IOFile
 from snakemake.jobs import Job
 from snakemake.persistence import PersistenceBase
@@ -30,6 +31,10 @@ REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the ve
         (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
         (PersistenceBase.started, ["self", "job", "external_jobid"]),
         (PersistenceBase.save_iocache, ["self"]),
+        (
+            InputFunctionException.__init__,
+            ["self", "msg", "wildcards", "lineno", "snakefile", "rule"],
+        ),
     ],
 )
 def test_a_function_that_is_replaced_is_there(function, arguments):

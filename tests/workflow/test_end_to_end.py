@@ -102,7 +102,8 @@ EDITED = {
     "epipolar/rectify": {"rectify", "project", "export"},
     "epipolar/image_reader": {"refine", "rectify", "project", "export"},
     "alignment/align": STAGES,
-    "lidar/ingest": STAGES - {"align"} | {"ingest"},
+    "surface/facets": {"surface", "project", "export"},
+    "lidar/ingest": STAGES - {"align"} | {"ingest", "surface"},
     "sheets": set(),
     "simulate/render": set(),
 }
@@ -138,7 +139,7 @@ def test_a_new_lidar_file_is_the_only_one_read(made, tmp_path):
     other = made.copy(tmp_path / "other")
     new = other.folder / "in/lidar/new.laz"
     shutil.copy(next((other.folder / "in/lidar").glob("*_0_1.laz")), new)
-    after = {"refine": 1, "rectify": 1, "project": 1, "export": 1}
+    after = {"surface": 1, "refine": 1, "rectify": 1, "project": 1, "export": 1}
     assert plan(other) == {"ingest": 1, **after}
 
 
@@ -374,7 +375,7 @@ def run_stages(row: dict[str, str], good: Project, folder: Path) -> None:
             outputs = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
             rectify(left, right, model, *outputs, provenance={})
     sides = (rectified / "left.zarr", rectified / "right.zarr")
-    inputs = SceneInputs.of(*sides, stores, ProjectSettings())
+    inputs = SceneInputs.of(*sides, stores, ProjectSettings()).with_surface(folder)
     project_scene(inputs, folder / "labels.zarr", code="")
 
 

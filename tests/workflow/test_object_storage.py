@@ -118,7 +118,8 @@ def test_a_fresh_checkout_plans_nothing_and_then_what_an_edit_touches(stored, da
     points = fresh.folder / "in/gcps.csv"
     lines = points.read_text().splitlines(keepends=True)
     points.write_text("".join(lines[:-1]))
-    assert set(fresh.plan(*CALL, *STORED)) == {"align", "refine", "rectify", "project", "export"}
+    due = {"align", "refine", "rectify", "project", "export"}
+    assert set(fresh.plan(*CALL, *STORED)) == due
 
 
 def test_a_mark_of_a_killed_upload_has_the_product_made_again(server, stored, data, tmp_path):
@@ -211,7 +212,13 @@ def test_an_input_replaced_on_its_server_is_seen(server, data, from_urls):
     server.put("in/lidar/Tiny-1_0_0.laz", file.read_bytes())
     assert from_urls.plan(*call) == {}  # the same content
     server.put("in/lidar/Tiny-1_0_0.laz", file.read_bytes() + b"\0")
-    assert from_urls.plan(*call) == {"ingest": 1, "refine": 1, "rectify": 1, "project": 1}
+    assert from_urls.plan(*call) == {
+        "ingest": 1,
+        "surface": 1,
+        "refine": 1,
+        "rectify": 1,
+        "project": 1,
+    }
     server.put("in/lidar/Tiny-1_0_0.laz", file.read_bytes())
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from stereotruth.command.example_city import SITE
 from stereotruth.dataset.verify import defects
@@ -40,7 +44,9 @@ def site(tmp_path_factory) -> Path:
     given = "--lidar", "data/lidar", "--gcps", "gcps/Stack.csv"
     call(folder, "pairs", "Stack", "--most", "2", *given)
     assert "0 errors, 0 doubts" in call(folder, "check")
-    call(folder, "run", "heights", "tiles/Stack", "--cores", "2")
+    with (folder / "config.yaml").open("a", encoding="utf-8") as config:
+        config.write("dataset: {original_heights: true}\n")
+    call(folder, "run", "heights", "originals/Stack", "report", "--cores", "2")
     return folder
 
 
@@ -52,6 +58,21 @@ def test_the_tiles_of_both_pairs_are_made_and_each_lidar_file_is_read_once(site)
 @pytest.mark.slow
 def test_heights_are_the_truth_and_their_uncertainty_explains_their_errors(site):
     check_heights(site)
+
+
+@pytest.mark.slow
+def test_crops_of_originals_have_the_heights_beside_them(site):
+    check_crops(site)
+
+
+@pytest.mark.slow
+def test_the_order_of_the_sheets_rows_plays_no_part(site, tmp_path):
+    check_order(site, tmp_path / "turned")
+
+
+@pytest.mark.slow
+def test_the_site_has_a_page_that_leads_to_its_pairs(site):
+    check_page(site)
 
 
 @pytest.mark.slow
@@ -95,3 +116,62 @@ def check_heights(site: Path) -> None:
         assert np.median(error) < 0.02 and (error > 1.0).mean() < 0.001
         assert 0.6 < (error < sigma).mean() < 0.78
         assert 0.9 < (error < 2 * sigma).mean() < 0.98
+
+
+def check_crops(site: Path) -> None:
+    folder = site / "originals/Stack"
+    assert defects(folder) == []
+    names = [path.parent.name for path in (site / "results/adjust/Stack").glob("*/alignment.json")]
+    with (folder / "manifest.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["scene"] for row in rows} == set(names)
+    for row in rows:
+        alignment = json.loads(
+            (site / f"results/adjust/Stack/{row['scene']}/alignment.json").read_text()
+        )
+        for view in ("left", "right"):
+            image = SITE.image(Path(alignment[view]["image"]).stem)
+            with rasterio.open(folder / row[f"{view}_height"]) as crop:
+                height = crop.read(1, masked=True)
+            first = int(row[f"{view}_row0"]), int(row[f"{view}_col0"])
+            at = (axis + start for axis, start in zip(np.indices(height.shape), first))
+            line, col = (axis.astype(float) for axis in at)
+            truth = image_truth(SITE, image, col, line)
+            usable = (truth["surface"] > 0) & (truth["covered"] > 0) & (truth["changed"] == 0)
+            measured = usable & ~np.ma.getmaskarray(height)
+            assert measured.sum() > 0.9 * usable.sum()
+            error = np.abs(height.filled(np.nan) - truth["height"])[measured]
+            assert np.median(error) < 0.02 and (error > 1.0).mean() < 0.001
+
+
+def check_page(site: Path) -> None:
+    text = (site / "results/site/Stack/index.html").read_text(encoding="utf-8")
+    assert text.count("<polygon") == len(SITE.images)
+    assert re.findall(r'<section id="(\w+)"', text) == ["map", "pairs", "residuals"]
+    links = set(re.findall(r'href="\.\./\.\./report/Stack/index\.html#(scene-[^"]+)"', text))
+    tiles = (site / "results/report/Stack/index.html").read_text(encoding="utf-8")
+    assert len(links) == 2 and all(f'id="{link}"' in tiles for link in links)
+    assert "site/Stack/index.html" in (site / "results/report/index.html").read_text()
+
+
+def check_order(site: Path, other: Path) -> None:
+    """Labels, arrays and all, are the same bytes if images, scenes and points are turned round."""
+    other.mkdir()
+    shutil.copytree(site / "data", other / "data")
+    for name in ("config.yaml", "cities.tsv", "images.tsv", "scenes.tsv", "gcps/Stack.csv"):
+        head, *rows = (site / name).read_text(encoding="utf-8").splitlines()
+        if name != "config.yaml":
+            rows.reverse()
+        (other / name).parent.mkdir(exist_ok=True)
+        (other / name).write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    stores = sorted(path.name for path in (site / "results/project/Stack").glob("*.zarr"))
+    assert len(stores) == 2
+    call(other, "run", *(f"results/project/Stack/{name}" for name in stores), "--cores", "2")
+    for name in stores:
+        arrays = {
+            file.relative_to(site): file.read_bytes()
+            for file in (site / "results/project/Stack" / name).rglob("c/*/*")
+        }
+        assert len(arrays) >= 7  # layers
+        for file, content in arrays.items():
+            assert (other / file).read_bytes() == content, file

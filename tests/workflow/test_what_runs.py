@@ -24,16 +24,16 @@ GRID_TRUTH = {"grid_truth", *OF_TRUTH}
 METHOD = {"match", "score", "submission", "benchmark_tables", *OF_IMAGES}
 FILES: list[tuple[str, set[str]]] = [
     ("in/gcps.csv", {"align", "refine", *RECTIFY}),
-    ("in/left.tif", {"align", "refine", *RECTIFY}),
-    ("in/left.tif.msk", {"align", "refine", *RECTIFY}),  # a new one
-    ("in/lidar/1.laz", {"ingest", "refine", *RECTIFY}),
-    ("in/lidar/3.laz", {"ingest", "refine", *RECTIFY}),  # a new one
-    ("geoid.tif", {"ingest", "refine", *RECTIFY}),
+    ("in/left.tif", {"surface", "align", "refine", *RECTIFY}),
+    ("in/left.tif.msk", {"surface", "align", "refine", *RECTIFY}),  # a new one
+    ("in/lidar/1.laz", {"ingest", "surface", "refine", *RECTIFY}),
+    ("in/lidar/3.laz", {"ingest", "surface", "refine", *RECTIFY}),  # a new one
+    ("geoid.tif", {"ingest", "surface", "refine", *RECTIFY}),
     ("mine.py", METHOD),
     ("helper.py", METHOD),  # which mine.py imports
 ]
 KEYS: list[tuple[str, Any, set[str]]] = [
-    ("ingest.drop_classes", [7], {"ingest", "refine", *RECTIFY, *GRID_TRUTH}),
+    ("ingest.drop_classes", [7], {"ingest", "surface", "refine", *RECTIFY, *GRID_TRUTH}),
     ("alignment.model", "shift", {"align", "refine", *RECTIFY, *GRID_TRUTH}),
     ("alignment.refine", False, {*RECTIFY, *GRID_TRUTH}),
     ("rectify.panchromatic", 1, {"refine", *RECTIFY, *GRID_TRUTH}),

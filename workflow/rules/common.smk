@@ -11,12 +11,15 @@ from stereotruth.project import (
     FILES,
     adjusted_scenes,
     check_fixed,
+    file_of_image,
     is_synthetic,
+    lidar_days,
     lidar_of,
     names_in_pair,
     read_images,
     read_scenes,
     stores_of,
+    surfaces_of,
 )
 
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
@@ -32,11 +35,13 @@ def synthetic_scenes(city):
 try:
     SETTINGS = Configuration.of(config)
     CITIES, SCENES = read_scenes(SETTINGS, ask=workflow.is_main_process)
-    images = read_images(SETTINGS, CITIES)
-    IMAGE_NAMES = {name: names_in_pair(scene, images) for name, scene in SCENES.items()}
+    IMAGES = read_images(SETTINGS, CITIES)
+    IMAGE_NAMES = {name: names_in_pair(scene, IMAGES) for name, scene in SCENES.items()}
+    ACQUIRED = lidar_days(SETTINGS, CITIES)
     LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
     STORES = stores_of(SCENES, LIDAR)
-    check_fixed(SETTINGS, SCENES, images)
+    SURFACES = surfaces_of(STORES)
+    check_fixed(SETTINGS, SCENES, IMAGES)
     ADJUSTED = adjusted_scenes(SETTINGS, SCENES, IMAGE_NAMES)
 except InputError as error:
     raise Refused(str(error))

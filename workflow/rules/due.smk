@@ -9,6 +9,7 @@ replaced are private: tests/workflow/test_due.py fails where a new version has o
 from contextlib import suppress
 
 from snakemake.dag import DAG
+from snakemake.exceptions import InputFunctionException
 from snakemake.io import _IOFile
 from snakemake.jobs import Job
 from snakemake.logging import logger
@@ -85,6 +86,22 @@ def if_possible(persistence, before=PersistenceBase.save_iocache):
         before(persistence)
 
 
+class RefusedInput(InputFunctionException):
+    """A refusal of an input function, which Snakemake would wrap into ten lines."""
+
+
+RefusedInput.__name__ = Refused.__name__  # what Snakemake prints above the message
+
+
+def wrapped(error, message, *more, before=InputFunctionException.__init__, **named):
+    if isinstance(message, Refused):
+        error.__class__ = RefusedInput
+        WorkflowError.__init__(error, str(message))
+    else:
+        before(error, message, *more, **named)
+
+
+InputFunctionException.__init__ = wrapped
 instead(PersistenceBase, "params_changed", due)
 instead(PersistenceBase, "has_metadata", lambda *_: True)
 instead(PersistenceBase, "has_outdated_metadata", lambda *_: False)

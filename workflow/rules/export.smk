@@ -63,6 +63,7 @@ rule originals:
         tiles="tiles/{city}",
         left=lambda w: [with_files_beside(s, "left")[0] for s in scenes_of(w.city)],
         right=lambda w: [with_files_beside(s, "right")[0] for s in scenes_of(w.city)],
+        heights=lambda w: heights_of(w.city) if SETTINGS.dataset.original_heights else [],
     output:
         directory("originals/{city}"),
     log:
@@ -77,7 +78,7 @@ rule originals:
         runtime=60,
     params:
         script=content_of("../scripts/originals.py"),
-        scenes=lambda w: [s.scene for s in scenes_of(w.city)],
+        images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
         code=source_digest("dataset.originals"),
     message:
         "Cropping the original images of {wildcards.city}"

@@ -5,6 +5,7 @@ rule image_heights:
     input:
         alignment=lambda w: by_scene_of_image(w, alignment_of),
         points=lambda w: by_scene_of_image(w, point_stores),
+        surface=lambda w: by_scene_of_image(w, surface_of),
     output:
         heights=directory("results/heights/{city}/{image}.zarr"),
     log:
@@ -32,8 +33,7 @@ rule image_heights:
 rule heights:
     input:
         [
-            f"results/heights/{scene.city}/{name}.zarr"
-            for scene in SCENES.values()
-            for name in dict.fromkeys(IMAGE_NAMES[scene.scene])
-            if name
+            file
+            for city in dict.fromkeys(s.city for s in SCENES.values())
+            for file in heights_of(city)
         ],

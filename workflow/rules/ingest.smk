@@ -14,10 +14,13 @@ rule ingest:
     resources:
         mem_mb=2000,
         runtime=60,
+        copies_gb=str(SETTINGS.ingest.copies_gb),
     params:
         script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
+        acquired=lambda w: ACQUIRED.get(str(LIDAR[w.scene][w.lidar]), []),
         drop_classes=sorted(SETTINGS.ingest.drop_classes),
+        footprint=lambda w: ground_of_stores(w.scene),
         code=source_digest("lidar.ingest"),
     message:
         "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"

@@ -1,5 +1,7 @@
 """Input functions: which files a stage takes of a scene or a city."""
 
+from functools import cache
+
 from stereotruth.epipolar.image_files import files_beside
 
 
@@ -107,12 +109,56 @@ def lidar_file(wildcards):
     return str(file) if is_synthetic(scene) else given(file)
 
 
+@cache
+def ground_of_stores(scene):
+    """The ground whose points a scene's own stores have: runs of cells, None for all points.
+
+    It is that of all scenes that take points of them. Cities that are made have no images yet when
+    their points are planned.
+    """
+    from stereotruth.alignment.pair_ground import footprint_of  # for few jobs
+
+    margin_m = SETTINGS.ingest.margin_m
+    if margin_m is None or is_synthetic(SCENES[scene]):
+        return None
+    takers = [SCENES[name] for name, stores in STORES.items() if scene in dict(stores)]
+    found = footprint_of([(of.left_image, of.right_image) for of in takers], margin_m)
+    return None if found is None else found.runs
+
+
 def point_stores(wildcards):
     """The points of a scene; files that another scene of the city reads, too, are read once."""
     return [
         f"results/ingest/{wildcards.city}/{scene}/{lidar}.points"
         for scene, lidar in STORES[wildcards.scene]
     ]
+
+
+def images_of_surface(wildcards):
+    """The images that the surface of some points is for, each once."""
+    scenes = [SCENES[scene] for scene, first in SURFACES.items() if first == wildcards.scene]
+    files = (
+        str(image) if is_synthetic(scene) else given(image)
+        for scene in scenes
+        for image in (scene.left_image, scene.right_image)
+    )
+    return list(dict.fromkeys(files))
+
+
+def beside_images_of_surface(wildcards):
+    """What is read with these images, as their RPCs."""
+    files = [file for image in images_of_surface(wildcards) for file in files_beside(image)]
+    return [given(file) for file in dict.fromkeys(files)]
+
+
+def surface_of(wildcards):
+    """The surface of a scene's points, made once for all scenes that take the same points."""
+    return f"results/surface/{wildcards.city}/{SURFACES[wildcards.scene]}.surface"
+
+
+def surface_of_labels(wildcards):
+    """The surface that a scene's labels follow from; the recipe paper needs none."""
+    return surface_of(wildcards) if SETTINGS.project.on_surface else []
 
 
 def adjustment_of(wildcards):
@@ -132,6 +178,40 @@ def scene_of_image(image):
         f"{SETTINGS.scenes}: no scene names image {image!r}, so that it has no correction. "
         "Remedy: stereotruth pairs CITY writes rows of pairs"
     )
+
+
+def sheet_images(city):
+    """The rows of the images sheet that are of a city, by name."""
+    return {name: image for name, image in IMAGES.items() if image.city == city}
+
+
+def files_of_sheet(wildcards):
+    """The original images of a city's images sheet, and all that is read with them."""
+    files = map(file_of_image, sheet_images(wildcards.city).values())
+    return [given(file) for image in files for file in (image, *files_beside(image))]
+
+
+def is_site(city):
+    """Whether scenes of the city are pairs of its images sheet, so that it has a page of a site."""
+    return any(all(IMAGE_NAMES[s.scene]) for s in SCENES.values() if s.city == city)
+
+
+def adjustment_of_site(wildcards):
+    """The city's images adjusted together, if they are."""
+    return [f"results/adjust/{wildcards.city}.json"] if adjusted_pairs(wildcards.city) else []
+
+
+def closure_of(wildcards):
+    """The closure of the city's triplets, if three of its pairs are one."""
+    pairs = {tuple(ADJUSTED[scene]) for scene in adjusted_pairs(wildcards.city)}
+    steps = ((a, c) for a, b in pairs for other, c in pairs if b == other)
+    return [f"results/closure/{wildcards.city}.json"] if pairs & set(steps) else []
+
+
+def heights_of(city):
+    """The heights of a city's original images, of those that have a name in the images sheet."""
+    names = (name for scene in scenes_of(city) for name in IMAGE_NAMES[scene.scene])
+    return [f"results/heights/{city}/{name}.zarr" for name in dict.fromkeys(names) if name]
 
 
 def by_scene_of_image(wildcards, file):
@@ -155,3 +235,9 @@ def cities_of_report():
         "if it was forgotten; or make tiles first (snakemake --cores 2 tiles/<City>), or ask for "
         "all these cities by --configfile config/config.yaml"
     )
+
+
+def diachronic_of(scene):
+    """Whether a scene's images share no light, by its row if that says."""
+    cell = SCENES[scene].diachronic
+    return {"diachronic": cell == "true" if cell else SETTINGS.project.diachronic}

@@ -7,6 +7,7 @@ rule project:
         right=rules.rectify.output.right,
         alignment=alignment_of,
         points=point_stores,
+        surface=surface_of_labels,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}.zarr"),
@@ -24,7 +25,7 @@ rule project:
     params:
         script=content_of("../scripts/project.py"),
         view="left",
-        settings=PROJECTION,
+        settings=lambda w: PROJECTION | diachronic_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
@@ -38,6 +39,7 @@ use rule project as project_right with:
         right=rules.rectify.output.right,
         alignment=alignment_of,
         points=point_stores,
+        surface=surface_of_labels,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_right_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}_right.zarr"),
@@ -48,7 +50,7 @@ use rule project as project_right with:
     params:
         script=content_of("../scripts/project.py"),
         view="right",
-        settings=PROJECTION,
+        settings=lambda w: PROJECTION | diachronic_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
@@ -60,6 +62,7 @@ rule project_strip:
         right=rules.rectify.output.right,
         alignment=alignment_of,
         points=point_stores,
+        surface=surface_of_labels,
     output:
         done=temp("results/project/{city}/strips/{scene}{side}_{strip}.json"),
     log:
@@ -76,7 +79,7 @@ rule project_strip:
         script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
-        settings=PROJECTION,
+        settings=lambda w: PROJECTION | diachronic_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"

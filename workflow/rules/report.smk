@@ -41,9 +41,48 @@ rule report_city:
         "../scripts/report_city.py"
 
 
+rule report_site:
+    input:
+        images=files_of_sheet,
+        adjusted=adjustment_of_site,
+        closure=closure_of,
+        page="results/report/{city}/index.html",
+    output:
+        report(
+            "results/site/{city}/index.html",
+            caption="../report/site.rst",
+            category="Pages",
+            labels={"city": "{city}, its images"},
+        ),
+    log:
+        "logs/report_site/{city}.log",
+    benchmark:
+        "logs/report_site/{city}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=30,
+    params:
+        script=content_of("../scripts/report_site.py"),
+        images=lambda w: {
+            name: [file_of_image(row), row.acquired, row.sun_azimuth, row.sun_elevation]
+            for name, row in sheet_images(w.city).items()
+        },
+        scenes=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
+        code=source_digest("report.site_page", "alignment.site_images"),
+        templates=templates_of("report", "site_page.html.jinja"),
+    message:
+        "Writing the page of the images of {wildcards.city}"
+    script:
+        "../scripts/report_site.py"
+
+
 rule report:
     input:
         lambda w: expand("results/report/{city}/index.html", city=cities_of_report()),
+        lambda w: expand("results/site/{city}/index.html", city=filter(is_site, cities_of_report())),
     message:
         "Pages of all cities"
 

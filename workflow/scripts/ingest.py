@@ -1,12 +1,15 @@
 """One LiDAR file to a point store."""
 
 from stereotruth.job import in_own_process, job
+from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.range_copies import prune
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
+    ground = snakemake.params.footprint
     parameters = {
         "lidar_crs": snakemake.params.lidar_crs,
         "drop_classes": snakemake.params.drop_classes,
@@ -17,13 +20,15 @@ if __name__ == "__main__":
             ingest(
                 snakemake.input.lidar,
                 snakemake.output.store,
+                footprint=None if ground is None else Footprint.of_runs(ground),
                 lidar_crs=parameters["lidar_crs"] or None,
                 geoid=geoid,
+                acquired=snakemake.params.acquired,
                 drop_classes=tuple(parameters["drop_classes"]),
-                scene=scene,
                 provenance=describe(snakemake.input, parameters, snakemake.params.code),
             )
 
     with job(snakemake.log[0], f"ingest {scene}"):
         # some damaged LAZ files crash the decoder
         in_own_process(ingest_file, snakemake.input.lidar)
+        prune(1e9 * float(snakemake.resources.copies_gb))

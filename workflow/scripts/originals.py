@@ -1,4 +1,6 @@
-"""Crops of one city's original images, with corrected RPCs."""
+"""Crops of one city's original images, with corrected RPCs and heights."""
+
+from pathlib import Path
 
 from stereotruth.dataset.originals import write_originals
 from stereotruth.job import job
@@ -10,5 +12,14 @@ if __name__ == "__main__":
         job(snakemake.log[0], f"originals {city}"),
         atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
-        images = dict(zip(snakemake.params.scenes, zip(given.left, given.right)))
-        write_originals(given.tiles, snakemake.output[0], images, workers=snakemake.threads)
+        names = snakemake.params.images
+        images = dict(zip(names, zip(given.left, given.right)))
+        stores = {Path(store).stem: store for store in given.heights}
+        heights = {scene: tuple(map(stores.get, pair)) for scene, pair in names.items()}
+        write_originals(
+            given.tiles,
+            snakemake.output[0],
+            images,
+            heights if stores else None,
+            workers=snakemake.threads,
+        )

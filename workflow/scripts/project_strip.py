@@ -20,6 +20,7 @@ if __name__ == "__main__":
             Settings(**snakemake.params.settings),
             snakemake.params.view,
             snakemake.input.alignment,
+            snakemake.input.surface or None,
         )
         project_scene(
             inputs,

@@ -112,6 +112,10 @@ def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pix
     best = int(np.argmax(counts))
     near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
     shift = float(np.median([np.median(d) for d in near if d.size]))
+    from ..lidar.geoid_candidates import ASSUMED, fits  # PROJ, which few refinements need
+
+    declared = not any(s.attrs["crs"]["heights"].startswith(ASSUMED) for s in stores)
+    place = [float(np.median([getattr(gcp, name) for gcp in gcps])) for name in ("lon", "lat")]
     cause = (
         f"{counts[best]} would if it were {abs(shift):.1f} m "
         f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
@@ -120,10 +124,14 @@ def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pix
         else "at no other height would most of them; check the LiDAR's coordinate system and "
         "height unit"
     )
-    return (
+    text = (
         f"only {here} of {len(around)} ground control points have a LiDAR point within "
         f"{tolerance:.1f} m of their height: {cause}"
     )
+    if declared or 2 * counts[best] <= len(around):
+        return text
+    explained = fits(shift, *place)
+    return f"{text}; {explained}" if explained else text
 
 
 def doubt_by_rpcs(stores: Sequence[PointStore], sensors: Sequence[SensorModel]) -> str:

@@ -167,7 +167,8 @@ def _search(
     current = alignment
     for number in range(ROUNDS):
         if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
-            sites = choose_sites(current.left, current.right, sizes, stores)
+            height = alignment.reference_height
+            sites = choose_sites(current.left, current.right, sizes, stores, height)
             if not sites:
                 return "there is no ground that both images show and the LiDAR covers"
             places = find_places(current.left, current.right, sources[0], stores, sites)

@@ -76,15 +76,15 @@ def _covered(
     right: SensorModel,
     right_size: tuple[int, int],
     stores: Sequence[PointStore],
-    heights: tuple[float, float],
+    height: float,
     col: float,
     row: float,
 ) -> tuple[float, float] | None:
     """Range of heights (m) at a left position that LiDAR and right image cover, else None.
 
-    ``heights``: that of all points.
+    ``height``: about that of the ground.
     """
-    low, high = heights
+    low = high = height
     for _ in range(3):
         lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
         if not np.isfinite(lon):
@@ -102,22 +102,23 @@ def choose_sites(
     right: SensorModel,
     sizes: tuple[tuple[int, int], tuple[int, int]],
     stores: Sequence[PointStore],
+    height: float,
 ) -> list[Site]:
     """(col, row, lowest, highest height in m) of sites: upper-left px in the left image.
 
     Some SITES squares on a regular grid, apart from each other, over what both images and the
-    LiDAR cover.
+    LiDAR cover. ``height``: about that of the ground, ellipsoidal m; points that lie elsewhere have
+    no say.
     """
     cols, rows = sizes[0]
     if min(cols, rows) < SITE:
         return []
-    every = min(s.bounds[4] for s in stores), max(s.bounds[5] for s in stores)
 
     def grid(spacing: float) -> list[Site]:
         found = []
         for row in np.arange(spacing / 2, rows, spacing):
             for col in np.arange(spacing / 2, cols, spacing):
-                heights = _covered(left, right, sizes[1], stores, every, col, row)
+                heights = _covered(left, right, sizes[1], stores, height, col, row)
                 if heights is not None:
                     corner = (
                         min(max(int(at) - SITE // 2, 0), n - SITE)

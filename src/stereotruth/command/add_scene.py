@@ -17,13 +17,15 @@ from ..disparity.overlap_check import apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
+from ..lidar.catalogue_list import is_catalogue, write_list
 from ..products.files import atomic_file
-from ..project import configured, sheet
+from ..project import configured, sheet, with_stand_ins
 from .check_lidar import check_lidar
-from .check_scene import boxes_of
+from .check_scene import boxes_of, ground_of
 from .check_tiles import Nodes, check_frame
 from .deliveries import Image, find_pair
 from .findings import Findings, Level
+from .list_tiles import list_tiles, margin_of
 
 SPLITS = {"training": 6, "validation": 1, "testing": 3}  # weights of a new city
 
@@ -37,11 +39,13 @@ def add_scene(
     name: str = "",
     lidar_crs: str = "",
     geoid: str = "",
+    hosts: Sequence[str] = (),
     configfiles: Sequence[Path] | None = None,
 ) -> list[str]:
     """Append the scene's row to the scenes sheet, and its city's if it is new.
 
-    Returns what was found, line by line. Raises InputError if there is no usable pair, LiDAR or
+    ``lidar`` may be a catalogue: its tiles are listed (:mod:`.list_tiles`), ``hosts`` may be led
+    to. Returns what was found, line by line. Raises InputError if there is no usable pair, LiDAR or
     file, before anything is written.
     """
     settings, _ = configured(configfiles)
@@ -56,6 +60,12 @@ def add_scene(
         raise InputError(
             f"scene {name!r} is there already", file=rows, remedy="take another --name"
         )
+    if is_catalogue(lidar):
+        images = [(str(pair[0].path), str(pair[1].path))]
+        listed, more = list_tiles(lidar, images, margin_of(settings), frozenset(hosts))
+        lidar, lidar_crs = f"lidar/{name}.tsv", lidar_crs or listed.crs
+        write_list(listed, lidar)
+        lines += more
     cells = {
         "scene": name,
         "city": city,
@@ -69,7 +79,9 @@ def add_scene(
     scene = sheets.check(cells, sheets.Scene, f"scene {name}")
     sheets.require_files(scene, rows, sheets.FILES)
     found = Findings(name)
-    surveyed = check_lidar(sheets.find_lidar(scene, rows), scene, found)
+    placed = with_stand_ins(scene, ask=True)
+    footprint = ground_of(placed, settings)
+    surveyed = check_lidar(sheets.find_lidar(placed, rows), scene, found, footprint)
     for finding in found:
         if finding.level is Level.ERROR:
             raise InputError(finding.text, remedy=_as_options(finding.remedy))

@@ -4,30 +4,43 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from ..errors import InputError, in_words
+from ..errors import InputError, in_number, in_words
+from ..lidar.footprint import Footprint
+from ..lidar.geoid_candidates import candidates_at, named
 from ..lidar.survey import SurveyedFile, survey
+from ..products.remote_files import url_of
 from ..sheets import Scene
 from .findings import Findings, Level
 
+AT_ONCE = 8  # files of servers that are looked at
 NO_DATUM = (
     "declares no vertical datum",
     "if they are orthometric, set geoid to a grid of their datum for this scene",
 )
 
 
-def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[SurveyedFile]:
-    """The files that can be read, after what is to be said of all of them was added."""
+def check_lidar(
+    files: Sequence[Path], scene: Scene, found: Findings, footprint: Footprint | None = None
+) -> list[SurveyedFile]:
+    """The files that can be read, after what is to be said of all of them was added.
+
+    ``footprint``: the ground of which a run reads them; None: all.
+    """
+    how = {"lidar_crs": scene.lidar_crs or None, "geoid": scene.geoid or None}
 
     def look(file: Path) -> SurveyedFile | InputError:
         try:
             with in_words():
-                return survey(file, lidar_crs=scene.lidar_crs or None, geoid=scene.geoid or None)
+                return survey(file, footprint=footprint, **how)
         except InputError as error:
             return error
 
-    looked = [look(file) for file in files]
+    remote = any(url_of(file) for file in files)
+    with ThreadPoolExecutor(AT_ONCE if remote else 1) as pool:
+        looked = list(pool.map(look, files))
     surveyed = [item for item in looked if isinstance(item, SurveyedFile)]
     errors = [item for item in looked if isinstance(item, InputError)]
     for problem, (error, count) in _by_text(errors).items():
@@ -37,7 +50,7 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
     notes = Counter(note for file in surveyed for note in file.notes)
     for note, count in notes.items():
         of = "" if count == len(files) == 1 else f"{count} of {len(files)} files: "
-        remedy = NO_DATUM[1] if NO_DATUM[0] in note else ""
+        remedy = _geoids(surveyed) if NO_DATUM[0] in note else ""
         found.say("LiDAR", Level.DOUBT, f"{of}{note}", remedy)
     surfaces = Counter(file.surface for file in surveyed)
     systems = Counter(file.system for file in surveyed)
@@ -60,7 +73,29 @@ def check_lidar(files: Sequence[Path], scene: Scene, found: Findings) -> list[Su
             f"file{'s' * (len(surveyed) > 1)}{dense}, {next(iter(systems))}; heights "
             f"{next(iter(surfaces))}{reach}",
         )
+        if footprint is not None:
+            _say_what_is_read(surveyed, found)
     return surveyed
+
+
+def _geoids(surveyed: Sequence[SurveyedFile]) -> str:
+    """What to do about undeclared heights, with the geoids that there are of the place."""
+    box = next((file.box for file in surveyed if file.box), None)
+    of_place = candidates_at((box[0] + box[2]) / 2, (box[1] + box[3]) / 2) if box else []
+    return NO_DATUM[1] + (f"; of the place PROJ knows {named(of_place)}" if of_place else "")
+
+
+def _say_what_is_read(surveyed: Sequence[SurveyedFile], found: Findings) -> None:
+    """How much of the files a run reads."""
+    touched = sum(file.read[0] > 0 for file in surveyed)
+    points, size = (sum(file.read[k] for file in surveyed) for k in (0, 1))
+    every = sum(file.points for file in surveyed), sum(file.bytes for file in surveyed)
+    found.say(
+        "LiDAR",
+        Level.FACT,
+        f"a run reads {touched} of {in_number(len(surveyed), 'file')}, {points / 1e6:.1f} of "
+        f"{every[0] / 1e6:.1f} M points, {size / 1e6:.1f} of {every[1] / 1e6:.1f} MB",
+    )
 
 
 def _by_text(errors: Sequence[InputError]) -> dict[str, tuple[InputError, int]]:

@@ -16,15 +16,17 @@ from ..alignment.align import align, from_rpcs
 from ..alignment.aligned_pair import Alignment
 from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
+from ..alignment.pair_ground import footprint_of
 from ..configuration import Configuration
-from ..disparity.overlap_check import Box, apart, refuse_apart
+from ..disparity.overlap_check import FAR, Box, apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import MAX_PIXELS, Source
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
+from ..lidar.footprint import Footprint
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
-from ..project import lidar_of
+from ..project import is_synthetic, lidar_of
 from ..sheets import Scene
 from .check_lidar import check_lidar
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
@@ -74,14 +76,23 @@ def check_scene(
             model = _check_pair(alignment, scene, found)
             facts.pixels = int(np.prod(model.shape))
             check_frame(Nodes.of(model), settings, found)
-    surveyed = check_lidar(list(files.values()), scene, found) if files else []
-    facts.points, facts.lidar_files = sum(file.points for file in surveyed), len(surveyed)
+    footprint = ground_of(scene, settings) if files and images else None
+    surveyed = check_lidar(list(files.values()), scene, found, footprint) if files else []
+    facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
         _hold_against_gcps(surveyed, gcps, found)
     if surveyed and alignment is not None and model is not None:
         with found.of("LiDAR"):
             facts.covered = _hold_against_images(surveyed, alignment, model, settings, found)
     return facts
+
+
+def ground_of(scene: Scene, settings: Configuration) -> Footprint | None:
+    """The ground of which a run reads LiDAR for a scene; None: everywhere."""
+    margin_m = settings.ingest.margin_m
+    if margin_m is None or is_synthetic(scene):
+        return None
+    return footprint_of([(scene.left_image, scene.right_image)], margin_m)
 
 
 def _check_images(scene: Scene, found: Findings) -> bool:
@@ -297,14 +308,17 @@ def _hold_against_images(
     whole, images, heights = boxes_of(placed, nodes)
     if apart(whole, images):
         refuse_apart(whole, images, heights, placed[0].path.parent)
-    outside = [file.path.name for file in placed if apart(file.box, images)]
+    outside = [file for file in placed if apart(file.box, images)]
     if outside and len(outside) < len(placed):
+        around = (images[0] - FAR, images[1] - FAR, images[2] + FAR, images[3] + FAR)
+        far = any(apart(file.box, around) for file in outside)
         found.say(
             "LiDAR",
-            Level.DOUBT,
-            f"{len(outside)} of {len(placed)} files lie outside the images ({outside[0]} …): they "
-            "are read in vain",
-            "leave them out, or check their coordinate system",
+            Level.DOUBT if far else Level.FACT,
+            f"{len(outside)} of {len(placed)} files lie outside the images"
+            + (f", by more than {FAR} degrees" * far)
+            + f" ({outside[0].path.name} …)",
+            "leave them out, or check their coordinate system" * far,
         )
     for sensor in (alignment.left, alignment.right):
         low, high = sensor.rpc.ground_box[4:]

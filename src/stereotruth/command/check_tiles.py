@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..configuration import Configuration
+from ..dataset.windows import cell_step
 from ..epipolar.model import EpipolarModel
 from ..errors import in_number
 from ..lidar.survey import SurveyedFile
 from ..numerics.degrees import DEGREE_M
-from ..numerics.summed_area import window_sums
+from ..numerics.summed_area import summed_area, window_sums
 from .estimates import estimates
 from .findings import Findings, Level
 
+SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
@@ -51,7 +54,7 @@ class Nodes:
             place = inverse(x.ravel(), y.ravel())
             for values, side in zip(place, size):
                 values = np.asarray(values).reshape(x.shape)
-                seen &= (values >= 0) & (values <= side - 1)
+                seen &= (values >= SUPPORT_PX) & (values <= side - 1 - SUPPORT_PX)
         return cls(model, step, x, y, seen)
 
     def ground(self, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -63,6 +66,22 @@ class Nodes:
         """Means of values over all squares of ``size`` px, [rows, cols] of their first nodes."""
         n = max(round(size / self.step), 1)
         return window_sums(values, n) / n**2
+
+    def windows_at(self, values: NDArray, size: int, step: int) -> NDArray[np.float64]:
+        """Means of values over all squares of ``size`` px whose origins are multiples of ``step``.
+
+        A square has all nodes whose cells it touches.
+        """
+        origins = [np.arange(0, side - size + 1, step) for side in self.model.shape]
+        (top, left), (bottom, right) = (
+            [((at + more) / self.step).astype(int) + end for at in origins]
+            for more, end in ((0, 0), (size - 1, 1))
+        )
+        bottom, right = (np.minimum(at, n) for at, n in zip((bottom, right), values.shape))
+        table = summed_area(values)
+        sums = table[np.ix_(bottom, right)] - table[np.ix_(top, right)]
+        sums = sums - table[np.ix_(bottom, left)] + table[np.ix_(top, left)]
+        return sums / ((bottom - top)[:, None] * (right - left)[None, :])
 
     def fits(self, size: float) -> bool:
         """Whether a square of that size lies in what both images show."""
@@ -134,22 +153,45 @@ def check_labels(
         f"label (project.recipe: {recipe}), "
         f"in {_tiles_in_words(nodes, covered, expected, settings)}",
     )
+    _say_holes(nodes, density > 0, (lon, lat), found)
     _hold_against_tiles(nodes, covered, per_px, settings, found)
     return share
 
 
+def _say_holes(
+    nodes: Nodes, covered: Bools, ground: tuple[NDArray, NDArray], found: Findings
+) -> None:
+    """Name the ground that both images show and that lies in no file's bounds, with its area."""
+    empty = nodes.seen & ~covered
+    if not empty.any():
+        return
+    _, group, sizes, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
+    largest = group == 1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
+    lon, lat = (float(values[largest].mean()) for values in ground)
+    area = empty.sum() * nodes.step**2 * pixel_m2(nodes.model)
+    found.say(
+        "LiDAR",
+        Level.FACT,
+        f"{area / 1e6:.3f} km² of what both images show lie in no file's bounds and get no label, "
+        f"most of it around longitude {lon:.5f}, latitude {lat:.5f}",
+    )
+
+
 def _tiles_in_words(nodes: Nodes, covered: Bools, expected: float, settings: Configuration) -> str:
-    """About how many tiles there will be, by the best position of their grid."""
+    """About how many tiles there will be, by the best position of their grid, as export has it."""
     size, needed = settings.tiles.size, settings.tiles.min_labelled
-    whole = nodes.windows(nodes.seen, size)
+    stride = settings.tiles.stride or size
+    step = cell_step(size, stride)
+    whole = nodes.windows_at(nodes.seen, size, step)
     if not whole.size:
         return "no tile"
-    enough = (whole > 1 - 1e-9) & (expected * nodes.windows(covered, size) >= needed)
-    every = max(round((settings.tiles.stride or size) / nodes.step), 1)
+    labelled = expected * nodes.windows_at(covered, size, step)
+    enough = (whole > 1 - 1e-9) & (labelled >= needed)
+    every, jump = stride // step, max(size // step // 8, 1)
     counts = [
         int(enough[row::every, col::every].sum())
-        for row in range(min(every, enough.shape[0]))
-        for col in range(min(every, enough.shape[1]))
+        for row in range(0, min(every, enough.shape[0]), jump)
+        for col in range(0, min(every, enough.shape[1]), jump)
     ]
     return f"about {in_number(max(counts), 'tile')} of {size} px"
 

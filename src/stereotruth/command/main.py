@@ -44,6 +44,13 @@ Configured = Annotated[
     typer.Option("--configfile", help="Instead of config.yaml; may be given more than once."),
 ]
 
+AllowedHosts = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Host, beside the catalogue's own, that it may name tiles of; may be given again."
+    ),
+]
+
 
 def _version(wanted: bool) -> None:
     if wanted:
@@ -101,13 +108,17 @@ def scene_add(
         list[Path], typer.Argument(help="Folder of the delivery, or left and right image.")
     ],
     lidar: Annotated[
-        str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
+        str,
+        typer.Option(
+            help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights; or a catalogue."
+        ),
     ],
     gcps: Annotated[str, typer.Option(help="CSV of ground control points, if there are any.")] = "",
     city: Annotated[str, typer.Option(help="City, made if new; else the delivery's name.")] = "",
     scene: Annotated[str, typer.Option("--name", help="Of the scene; else City-1, City-2 …")] = "",
     lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
     geoid: Annotated[str, typer.Option(help="Geoid grid, for orthometric heights.")] = "",
+    allow_host: AllowedHosts = None,
     configfile: Configured = None,
 ) -> None:
     """Find images, RPCs and views in a delivery, look at the LiDAR, and write the scene's row."""
@@ -121,6 +132,7 @@ def scene_add(
         name=scene,
         lidar_crs=lidar_crs,
         geoid=geoid,
+        hosts=allow_host or (),
         configfiles=configfile,
     ):
         typer.echo(line)
@@ -181,6 +193,43 @@ def gcps_import(
 
 
 @app.command(
+    "lidar",
+    epilog=examples(
+        "stereotruth lidar tiles.vpc Marseille --to lidar/Marseille.tsv",
+        "stereotruth lidar https://example.org/index.gpkg --column url --to lidar/all.tsv",
+    ),
+)
+def lidar_tiles(
+    catalogue: Annotated[
+        str, typer.Argument(help="VPC, STAC items, or a tile index (GeoJSON, GeoPackage); or URL.")
+    ],
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scenes or cities whose ground is asked for; all.")
+    ] = None,
+    to: Annotated[str, typer.Option(help="The list to be written, which rows may name.")] = "",
+    allow_host: AllowedHosts = None,
+    column: Annotated[str, typer.Option(help="Of a tile index: the tiles' locations.")] = "",
+    dates: Annotated[
+        tuple[str, str], typer.Option(help="Of a tile index: first and last day of acquisition.")
+    ] = ("", ""),
+    configfile: Configured = None,
+) -> None:
+    """List the tiles of a catalogue that lie on the ground of scenes; rows then name the list."""
+    from .list_tiles import list_of_scenes
+
+    for line in list_of_scenes(
+        catalogue,
+        to,
+        scenes or [],
+        hosts=allow_host or (),
+        column=column,
+        dates=dates if all(dates) else None,
+        configfiles=configfile,
+    ):
+        typer.echo(line)
+
+
+@app.command(
     epilog=examples(
         "stereotruth check", "stereotruth check Marseille-1", "stereotruth check && stereotruth run"
     )
@@ -226,9 +275,6 @@ def pairs(
     gcps: Annotated[str, typer.Option(help="Likewise.")] = "",
     lidar_crs: Annotated[str, typer.Option(help="Likewise.")] = "",
     geoid: Annotated[str, typer.Option(help="Likewise.")] = "",
-    page: Annotated[
-        bool, typer.Option("--page", help="Write the site's page: map, pairs, residuals, closure.")
-    ] = False,
     configfile: Configured = None,
 ) -> None:
     """List the pairs of a site, best first; with a choice, write it to the scenes sheet."""
@@ -246,10 +292,6 @@ def pairs(
     show_pairs(rated)
     for line in lines:
         typer.echo(line)
-    if page:
-        from .site_page import write_page_of_site
-
-        typer.echo(f"Look at {write_page_of_site(city, configfile)}")
 
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}

@@ -11,14 +11,14 @@ from pathlib import Path
 
 from .. import sheets
 from ..configuration import Configuration
-from ..epipolar.pair_quality import Quality, quality_of
-from ..epipolar.site_pairs import SitePair, pairs_of_site
+from ..epipolar.pair_quality import RatedPair, rate
+from ..epipolar.site_pairs import SitePair
 from ..errors import InputError
-from ..project import configured, names_in_pair, read_images, read_scenes, sheet
+from ..project import configured, names_in_pair, read_images, sheet
+from ..sheets import DIACHRONIC_DAYS
 from .add_scene import append_row
 from .site import images_of
 
-DIACHRONIC_DAYS = 30.0  # more than these, as in DiachronicStereo (2026)
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
 OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
@@ -68,27 +68,18 @@ class Choice:
         return chosen
 
 
-@dataclass(frozen=True)
-class RatedPair:
-    """A pair and its predicted quality."""
-
-    pair: SitePair
-    quality: Quality
-
-
 def rated_pairs(city: str, settings: Configuration) -> list[RatedPair]:
     """All pairs of a site, best first; the order of the sheet's rows plays no part."""
     cities = sheets.read_cities(sheet(settings, "cities"))
     opened = images_of(city, read_images(settings, cities), settings)
-    pairs = pairs_of_site([one.image for one in opened])
-    if not pairs:
+    rated = rate([one.image for one in opened])
+    if not rated:
         raise InputError(
             f"no two images of city {city!r} share ground",
             file=settings.images,
             remedy="correct the cities and files of the images",
         )
-    rated = [RatedPair(pair, quality_of(pair)) for pair in pairs]
-    return sorted(rated, key=lambda r: (-r.quality.matched, r.pair.left, r.pair.right))
+    return rated
 
 
 def write_pairs(
@@ -104,8 +95,9 @@ def write_pairs(
     InputError if there is no LiDAR to be named.
     """
     rows = Path(sheet(settings, "scenes"))
-    cities, scenes = read_scenes(settings)
+    cities = sheets.read_cities(sheet(settings, "cities"))
     images = read_images(settings, cities)
+    scenes = sheets.read_scenes(rows, cities, images)  # cells as they stand there
     of_city = [scene for scene in scenes.values() if scene.city == city]
     here = {
         column: given.get(column) or (getattr(of_city[0], column) if of_city else "")

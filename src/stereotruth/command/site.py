@@ -5,24 +5,20 @@ from __future__ import annotations
 import filecmp
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, time, timedelta
 from itertools import combinations
 from pathlib import Path
 
 from ..alignment.control_points import images_measured
-from ..alignment.gcp_checks import open_view
+from ..alignment.site_images import GivenImage, near, open_image
 from ..configuration import Configuration
-from ..epipolar.acquisition import Acquisition, read_acquisition
+from ..epipolar.acquisition import Acquisition
 from ..epipolar.site_pairs import SiteImage, between_suns, pair_of
-from ..epipolar.sun import sun_over
 from ..errors import InputError
 from ..products.remote_files import bring_image, is_remote
 from ..project import sheet
-from ..sheets import Image, Scene, acquisition_time
+from ..sheets import Image, Scene
 from .findings import Findings, Level
 
-NOON = time(12, tzinfo=UTC)  # of an image whose date alone is known
-DATES_APART = timedelta(days=1.5)  # between the sheet and the delivery: another time zone is less
 SUNS_APART_DEG = 5.0
 
 
@@ -36,30 +32,12 @@ class OpenedImage:
     said: Acquisition
 
 
-def open_image(row: Image) -> OpenedImage:
+def open_row(row: Image) -> OpenedImage:
     """An image of the sheet. Raises InputError if it or its RPC cannot be used."""
     file = bring_image(row.file) if is_remote(row.file) else Path(row.file)
-    sensor, size = open_view(f"site's {row.image}", file, "")
-    rpc = sensor.rpc
-    place = float(rpc.long_off), float(rpc.lat_off)
-    said = read_acquisition(file, place)
-    taken, sun = said.time, said.sun
-    if row.acquired:
-        given = acquisition_time(row.acquired)
-        if isinstance(given, datetime):
-            taken, sun = given, sun_over(given, *place)
-            if said.time is not None and said.sun is not None and _near(said.time, given):
-                sun = said.sun
-        elif said.time is None or not _near(said.time, datetime.combine(given, NOON)):
-            taken = datetime.combine(given, NOON)
-            sun = None
-    if row.sun_azimuth is not None and row.sun_elevation is not None:
-        sun = float(row.sun_azimuth), float(row.sun_elevation)
-    return OpenedImage(row, file, SiteImage(row.image, sensor, size, taken, sun), said)
-
-
-def _near(one: datetime, other: datetime) -> bool:
-    return abs(one - other) <= DATES_APART
+    cells = row.acquired, row.sun_azimuth, row.sun_elevation
+    image, delivery = open_image(GivenImage.of(row.image, file, *cells))
+    return OpenedImage(row, file, image, delivery)
 
 
 def images_of(city: str, images: Mapping[str, Image], settings: Configuration) -> list[OpenedImage]:
@@ -79,7 +57,7 @@ def images_of(city: str, images: Mapping[str, Image], settings: Configuration) -
             file=settings.images,
             remedy=f"add the rows of its images (cities of the sheet: {known})",
         )
-    return [open_image(row) for row in rows]
+    return [open_row(row) for row in rows]
 
 
 def check_images(
@@ -98,7 +76,7 @@ def check_images(
                 before = len(found)
                 with found.of("images"):
                     _require(row, settings)
-                    of_city.append(open_image(row))
+                    of_city.append(open_row(row))
                 if len(found) == before:
                     _check_date(of_city[-1], settings, found)
         _check_ground(city, of_city, settings, found)
@@ -138,7 +116,7 @@ def _check_date(one: OpenedImage, settings: Configuration, found: Findings) -> N
             f"{where}: nothing says when it was taken, so that its pairs have no days and no sun",
             "write it into column acquired, 2020-10-25T03:12:45Z",
         )
-    elif row.acquired and said.time is not None and not _near(said.time, image.time):
+    elif row.acquired and said.time is not None and not near(said.time, image.time):
         found.say(
             "images",
             Level.DOUBT,

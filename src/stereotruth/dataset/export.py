@@ -330,6 +330,7 @@ def _write_tiles(
         gates = _gates(city, rows, scene_checks, settings.quality, settings.strict)
         for source in windows.sources:
             gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
+            gates["scenes"][source.scene]["lidar"] = source.lidar
         half = settings.disparity_dtype == "float16"
         summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
         summary["quality"] = gates

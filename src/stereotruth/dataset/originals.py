@@ -5,6 +5,9 @@ left and right image show, as the sensor has it, all bands and bytes as delivere
 one which stands for the corrected sensor model (``corrected_rpc`` of the tile's orientation file,
 with its error), with line and sample offset of the crop; it is in the TIFF's RPC tag and in
 ``_RPC.TXT``, to all digits.
+
+Where the heights of an original image are known (:mod:`stereotruth.disparity.image_heights`), the
+crop has them beside it: pixel by pixel what the crop shows, with the same RPC.
 """
 
 from __future__ import annotations
@@ -28,17 +31,30 @@ from ..epipolar.rpc_files import rpc_text
 from ..errors import InputError
 from ..job import progress
 from ..products.files import atomic_folder, write_table
+from ..products.grids import require_complete
 from ..products.provenance import file_sha256
+from ..products.rasters import write_tiff
 from ..products.ungeoreferenced import open_raster
+from .layer_kinds import NODATA, LayerKind
 from .manifest import read_manifest
 from .polynomials import evaluate
 
 MARGIN_PX = 16  # of the crops around what the tiles show
+HEIGHTS = {
+    "height": LayerKind("float32", NODATA, "height above the WGS 84 ellipsoid in m"),
+    "sigma": LayerKind("float32", NODATA, "standard uncertainty of the height in m"),
+    "status": LayerKind("uint8", 0, "0: no points, 1: measured, 2: undecided"),
+}
 README = """Crops of the original images, with corrected RPCs
 
   {left,right}/<tile>.tif, <tile>_RPC.TXT   what the tile's left and right image show
   manifest.csv                              a row per tile: place of both crops in the original
                                             images (col0, row0; cols, rows, px), error of the RPC
+  {left,right}_height, _sigma, _status/<tile>.tif   of what each pixel of a crop shows, if they were
+                                            asked for and the image has a name in the images sheet:
+                                            height and its standard uncertainty (m, float32, nodata
+                                            -9999), and why there is one (status, uint8: 0 no
+                                            points, 1 measured, 2 undecided)
 
 Pixel values are those of the original images. RPCs are RPC00B; LINE_OFF and SAMP_OFF count from the
 crop's upper-left pixel, whose centre is (0, 0). Ground is WGS 84 longitude and latitude in degrees
@@ -51,29 +67,42 @@ def write_originals(
     tiles: str | Path,
     out: str | Path,
     images: Mapping[str, tuple[str | Path, str | Path]],
+    heights: Mapping[str, tuple[str | Path | None, str | Path | None]] | None = None,
     *,
     workers: int = 1,
 ) -> int:
     """Crop the images of a city's tiles into the folder ``out``; how many tiles there are.
 
-    ``images``: left and right original image by scene. Raises InputError if an image is not that
-    of the orientation files.
+    ``images``: left and right original image by scene; ``heights``: the stores of what they show
+    (``results/heights``), None for an image without one. Raises InputError if an image is not that
+    of the orientation files, or its heights are not of its size.
     """
     tiles = Path(tiles)
     rows = read_manifest(tiles)
+    stores = heights or {}
     with atomic_folder(out) as scratch:
-        for view in ("left", "right"):
+        for k, view in enumerate(("left", "right")):
             (scratch / view).mkdir()
+            if any(pair[k] for pair in stores.values()):
+                for layer in HEIGHTS:
+                    (scratch / f"{view}_{layer}").mkdir()
 
         def crops(row: Mapping[str, str]) -> dict[str, Any]:
             record = json.loads((tiles / row["orientation"]).read_text(encoding="utf-8"))
             found: dict[str, Any] = {k: row[k] for k in ("tile", "city", "scene", "split")}
-            for view, image in zip(("left", "right"), images[row["scene"]]):
+            both = images[row["scene"]], stores.get(row["scene"], (None, None))
+            for view, image, store in zip(("left", "right"), *both):
                 name = f"{view}/{row['tile']}.tif"
                 found |= _crop(Path(image), scratch / name, record[view], view, row)
                 text = name.removesuffix(".tif") + "_RPC.TXT"
                 found |= {view: name, f"{view}_sha256": file_sha256(scratch / name)}
                 found |= {f"{view}_rpc": text, f"{view}_rpc_sha256": file_sha256(scratch / text)}
+                for layer in HEIGHTS if stores else ():
+                    name = f"{view}_{layer}/{row['tile']}.tif" if store else ""
+                    found |= {f"{view}_{layer}": name, f"{view}_{layer}_sha256": ""}
+                    if store:
+                        _crop_heights(store, layer, scratch / name, scratch / found[view], found)
+                        found[f"{view}_{layer}_sha256"] = file_sha256(scratch / name)
             return found
 
         with ThreadPoolExecutor(workers) as pool:
@@ -136,3 +165,26 @@ def _crop(
     place = dict(zip(("col0", "row0", "cols", "rows"), (*low, cols, rows)))
     found = {f"{view}_{name}": value for name, value in place.items()}
     return found | {f"{view}_rpc_max_error_px": record["corrected_rpc_max_error_px"]}
+
+
+def _crop_heights(
+    store: str | Path, layer: str, out: Path, crop: Path, place: Mapping[str, Any]
+) -> None:
+    """Write a layer of an image's heights where a crop of it lies; ``place``: row of the table."""
+    view, kind = out.parent.name.partition("_")[0], HEIGHTS[layer]
+    group = require_complete(store)
+    first = place[f"{view}_row0"], place[f"{view}_col0"]
+    shape = place[f"{view}_rows"], place[f"{view}_cols"]
+    window = tuple(slice(start, start + size) for start, size in zip(first, shape))
+    values = np.asarray(group[layer][window])
+    if values.shape != shape:
+        raise InputError(
+            f"is of another image than {crop.parent.name}/{crop.name}: it ends before the crop",
+            file=store,
+            remedy="delete it and run the workflow again",
+        )
+    if kind.dtype.startswith("float"):
+        values = np.where(np.isfinite(values), values, kind.nodata).astype(kind.dtype)
+    write_tiff(out, values, nodata=kind.nodata, description=kind.description)
+    with open_raster(crop) as source, open_raster(out, "r+") as target:
+        target.rpcs = source.rpcs

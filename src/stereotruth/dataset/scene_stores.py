@@ -59,6 +59,7 @@ class SceneStores:
     inputs: Mapping[str, str]
     points_per_px: float | None
     points_per_m2: float | None
+    lidar: Mapping[str, Any] | None
     doubts: tuple[str, ...]
 
 
@@ -118,6 +119,7 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         inputs=inputs,
         points_per_px=disparity.attrs.get("points_per_px"),
         points_per_m2=disparity.attrs.get("points_per_m2"),
+        lidar=disparity.attrs.get("lidar"),
         doubts=doubts,
     )
 

@@ -74,6 +74,10 @@ class Dataset:
     """true: crops of the original images for each tile with corrected RPCs (tag and `_RPC.TXT`), in
     `originals/<city>/`, for multi-view and neural reconstruction"""
 
+    original_heights: Flag = False
+    """true: beside each crop in `originals/<city>/` the height of what each of its pixels shows,
+    with its standard uncertainty and status; of images that have a name in the images sheet"""
+
 
 @settings
 class Evaluation:

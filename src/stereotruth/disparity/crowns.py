@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
-from ..surface.rough_tops import RoughTops, rough_tops
+from ..surface.rough_tops import RoughTops
+from ..surface.scale import FACET_RESIDUAL_PX
 from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
@@ -33,10 +34,10 @@ from .facet_raster import (
     raster_facets,
     right_pixels,
 )
-from .image_agreement import Comparison, window_agreement
+from .image_agreement import Comparison, contradicted
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
-from .pixel_scale import FACET_RESIDUAL_PX, PixelScale
+from .pixel_scale import PixelScale
 from .seen_surface import box_max
 from .status import WATER_CLASS, Status, is_labelled
 from .visibility import FACET_IN_RIGHT, PRISM_IN_LEFT, PRISM_IN_RIGHT, VisibleSurface, hidden_by
@@ -126,9 +127,8 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     """The rough surfaces of a window, at pixels of which the facets leave open what they show."""
     surface, first = visible.projected.surface, visible.projected.first
     shape = visible.visibility.shape
-    rough = rough_tops(surface, scale.surface)
-    tops, corner = rough.vertices, rough.corner[rough.is_gentle]
-    xy = visible.projected.projection.at_points(tops.lon_q, tops.lat_q, tops.h_q)
+    rough, tops, xy = surface.tops, surface.vertices, visible.projected.xy
+    corner = rough.corner[rough.is_gentle]
     z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
     raster_facets(xy, corner, first, z_buffer, index)
     disparity = np.where(index >= 0, z_buffer, np.nan)
@@ -231,9 +231,8 @@ def with_crowns(
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        agreement = window_agreement(merged, window, comparison)
-        correlation = np.where(new, agreement.correlation, correlation)
-        changed = new & agreement.outvoted()
+        changed, with_noise = contradicted(merged, window, comparison, new)
+        correlation = np.where(new, with_noise, correlation)
         status[changed] = Status.CHANGED
         new &= ~changed
     status[new] = Status.LABELLED_CROWN

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.scale import FACET_RESIDUAL_PX
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels, OwnLabels
-from .pixel_scale import FACET_RESIDUAL_PX
 from .status import Status, is_labelled
 from .visibility import VISIBLE, VisibleSurface
 

@@ -7,13 +7,17 @@ one surface only:
 
 - :mod:`stereotruth.epipolar.surface_correlation`: correlation coefficient of the left and the
   warped right image in a window around each pixel, over the pixels of its surface;
-- :func:`apart_from_steps`: of these, only those that no pixel of another surface touches. The
-  optics blur a bright roof into the ground beside it, in one view into other ground than in the
-  other, which made two thirds of what was taken for a change at 1 point/m²;
+- :func:`.surface_means.apart_from_steps`: of these, only those that no pixel of another surface
+  touches. The optics blur a bright roof into the ground beside it, in one view into other ground
+  than in the other, which made two thirds of what was taken for a change at 1 point/m²;
 - :meth:`Agreement.outvoted`: whether most pixels of the same surface around a pixel fail the
   threshold. A building that only the LiDAR or only the images have fails as a whole; single
   failures among agreeing pixels, by noise or in shadow, do not;
-- :meth:`Agreement.outvoted_nearby`: the same for what is smaller, by what is usual around it;
+- :meth:`Agreement.unusual`: whether pixels together correlate less than is usual around them;
+- :mod:`.shifted_agreement`: whether the images agree better at another disparity. Of images that
+  share no light that alone counts;
+- :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
+  smaller, by what is usual around it;
 - :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
@@ -28,21 +32,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
-from ..epipolar.surface_correlation import (
-    BLOCK,
-    columns_inside,
-    surface_correlation,
-    surface_of_row,
-    tolerance_px,
-)
-from ..epipolar.warping import warp_rows
-from ..kernels import kernel
+from ..epipolar.surface_correlation import correlation_and_expected
 from ..numerics.summed_area import window_sums
-from .image_patches import Patch
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
+from .shifted_agreement import SIGNAL, shifted_agreement
 from .status import WATER_CLASS, Status, is_labelled
+from .surface_means import apart_from_steps, surface_mean, warp_to_left
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -50,107 +46,20 @@ Bools = NDArray[np.bool_]
 
 
 DENSE = 2.0  # points in a pixel, that miss nothing of a pixel's size
-VOTE_PX = 12  # pixels up to here vote,
-VOTE_STEP = 3  # every so many: 81 votes at most
 NEARBY_PX = 8  # for what is small, pixels up to here vote,
 NEARBY_SHARE = 0.35  # of which so many fail
+DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
+TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
+DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
-
-
-def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
-    """Right image at (x - disparity, y) of every pixel of a window of the left grid, float64[h, w].
-
-    NaN where there is no disparity, or the right image has no value. The patch holds all rows.
-    """
-    top = rows.start - right.row
-    image = right.pixels[top : top + len(disparity), : right.usable.shape[1]]
-    return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
-
-
-def apart_from_steps(disparity: Floats) -> Bools:
-    """Pixels [h, w] whose neighbours all have a disparity within SURFACE_PX of theirs."""
-    rows, cols = disparity.shape
-    around = np.pad(disparity, 1, constant_values=np.nan)
-    out = np.ones(disparity.shape, np.bool_)
-    for down in range(3):
-        for across in range(3):
-            near = around[down : down + rows, across : across + cols]
-            out &= np.abs(near - disparity) <= SURFACE_PX  # also false for NaN
-    return out
-
-
-@kernel
-def _surface_mean(
-    values: Singles,
-    disparity: Singles,
-    voters: Singles,
-    slope: Singles,
-    reach: int,
-    every: int,
-    out: Singles,
-) -> None:
-    """``voters``: disparity of the pixels that count, else NaN."""
-    rows, cols = disparity.shape
-    surface = np.empty(3 * BLOCK, np.float32)
-    sums = np.empty(2 * BLOCK, np.float32)
-    one, zero = np.float32(1.0), np.float32(0.0)
-    for y in range(rows):
-        for x0 in range(0, cols, BLOCK):
-            size = min(BLOCK, cols - x0)
-            surface_of_row(disparity, slope, y, x0, size, surface)
-            sums[:] = zero
-            for step_down in range(-reach, reach + 1, every):
-                b = y + step_down
-                if b < 0 or b >= rows:
-                    continue
-                down = np.float32(step_down)
-                for step in range(-reach, reach + 1, every):
-                    across, tolerance = np.float32(step), tolerance_px(step_down, step)
-                    first, end = columns_inside(x0, size, cols, step)
-                    d = voters[b, x0 + step + first : x0 + step + end]
-                    value = values[b, x0 + step + first : x0 + step + end]
-                    p, s = surface[first:], sums[first:]
-                    for k in range(d.size):
-                        plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                        same = one if abs(d[k] - plane) <= tolerance else zero
-                        s[k] += same
-                        s[BLOCK + k] += same * value[k]
-            for k in range(size):
-                out[y, x0 + k] = sums[BLOCK + k] / sums[k]
-
-
-def surface_mean(
-    values: NDArray[np.floating],
-    disparity: NDArray[np.floating],
-    slope: NDArray[np.floating],
-    reach: int = VOTE_PX,
-    every: int = VOTE_STEP,
-) -> Singles:
-    """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
-
-    ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
-    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value.
-    """
-    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    known = np.isfinite(values)
-    out = np.empty(disparity.shape, dtype=np.float32)
-    _surface_mean(
-        np.where(known, values, 0).astype(np.float32),
-        disparity,
-        np.where(known, disparity, np.float32(np.nan)),
-        np.ascontiguousarray(slope, dtype=np.float32),
-        reach,
-        every,
-        out,
-    )
-    return out
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """How well left and right image agree over each pixel's surface; arrays of a window.
 
-    ``correlation`` [h, w]: their coefficient around each pixel, NaN for none; ``disparity`` (px)
+    ``correlation`` [h, w]: their coefficient around each pixel as it would be without noise, NaN
+    where there is none or noise leaves nothing to tell, which is ``drowned``; ``disparity`` (px)
     [h, w] and its ``slope`` [2, h, w] decide what belongs to a surface. With less than
     ``threshold`` a pixel fails. ``weight`` in [0, 1] that no object fits between the points.
     """
@@ -160,12 +69,25 @@ class Agreement:
     slope: NDArray[np.floating]
     threshold: float
     weight: float = 1.0
+    drowned: Bools | bool = False
 
     def outvoted(self) -> Bools:
-        """Pixels [h, w] around which most of their surface fails."""
-        known = np.isfinite(self.correlation)
-        against = np.where(known, self.correlation < self.threshold, np.nan)
-        return surface_mean(against, self.disparity, self.slope) > 0.5
+        """Pixels [h, w] around which most of their surface fails.
+
+        Drowned pixels count as DROWNED_FAIL of a failure: where noise leaves but few to be told,
+        these are chosen by chance and do not speak for the surface.
+        """
+        return surface_mean(self._against(self.threshold, DROWNED_FAIL), *self._surface) > 0.5
+
+    @property
+    def _surface(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        return self.disparity, self.slope
+
+    def _against(self, least: float | Singles, drowned: float) -> Floats:
+        """1 where pixels [h, w] correlate less than ``least``, else 0; ``drowned`` where they are;
+        NaN where there is nothing to correlate."""
+        against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
+        return np.where(self.drowned, drowned, against)
 
     def _usual(self, correlation: NDArray[np.floating]) -> Singles:
         """What pixels [h, w] correlate by at least if they are as usual on their surface around
@@ -175,8 +97,16 @@ class Agreement:
         lowers both. With less weight the limit is higher.
         """
         usual = 1.0 - (1.0 - USUAL) * self.weight
-        mean = surface_mean(correlation, self.disparity, self.slope)
+        mean = surface_mean(correlation, *self._surface)
         return np.fmax(usual * mean, self.threshold)
+
+    def together(self) -> Singles:
+        """Mean correlation of the surface up to TOGETHER_PX around each pixel [h, w]."""
+        return surface_mean(self.correlation, *self._surface, TOGETHER_PX, 1)
+
+    def unusual(self) -> Bools:
+        """Pixels [h, w] that correlate less, together with those beside them, than is usual."""
+        return self.together() < self._usual(self.correlation)
 
     def outvoted_nearby(self) -> Bools:
         """Pixels [h, w] within NEARBY_PX of which NEARBY_SHARE correlate less than is usual there.
@@ -184,10 +114,9 @@ class Agreement:
         Small things are found that :meth:`outvoted` lets their surroundings outvote. With less
         weight fewer failures are enough.
         """
-        least = self._usual(self.correlation)
-        against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
+        against = self._against(self._usual(self.correlation), 0.0)
         share = NEARBY_SHARE * float(np.sqrt(self.weight))
-        return surface_mean(against, self.disparity, self.slope, NEARBY_PX, 1) > share
+        return surface_mean(against, *self._surface, NEARBY_PX, 1) > share
 
     def beside(self, changed: Bools) -> Bools:
         """Pixels [h, w] no more than NEARBY_PX from ``changed`` ones that correlate less than is
@@ -206,24 +135,74 @@ class Agreement:
 class Comparison(NamedTuple):
     """How both images are compared: side of the ``window_px``, ``threshold`` of the correlation,
     mean number of ``points_per_px``, ``weight`` in [0, 1] that no object fits between the
-    points."""
+    points; ``noise`` of both images, variances in DN²; ``diachronic``: whether they share no
+    light."""
 
     window_px: int
     threshold: float
     points_per_px: float
     weight: float
+    noise: tuple[float, float]
+    diachronic: bool = False
 
 
-def window_agreement(labels: Labels, window: PairWindow, comparison: Comparison) -> Agreement:
-    """Of both images of a window, over the surfaces of its ``labels``."""
+def window_agreement(
+    labels: Labels, window: PairWindow, comparison: Comparison
+) -> tuple[Agreement, Singles]:
+    """Of both images of a window, over the surfaces of its ``labels``: free of noise, and their
+    correlation [h, w] as it is."""
     rows, cols = labels.disparity.shape
     warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
     top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
     left = window.left.pixels[top : top + rows, side : side + cols]
     surface = labels.disparity, labels.slope
     clear = apart_from_steps(labels.disparity)
-    correlation = surface_correlation(left, warped, *surface, comparison.window_px, clear)
-    return Agreement(correlation, *surface, comparison.threshold, comparison.weight)
+    with_noise, expected = correlation_and_expected(
+        left, warped, *surface, comparison.window_px, comparison.noise, clear
+    )
+    limits = comparison.threshold, comparison.weight
+    return free_of_noise(with_noise, expected, *surface, *limits), with_noise
+
+
+def free_of_noise(
+    with_noise: Singles,
+    expected: Singles,
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    threshold: float,
+    weight: float = 1.0,
+) -> Agreement:
+    """The agreement by the correlation ``with_noise`` and the one ``expected`` of the same ground,
+    arrays [h, w] (:func:`stereotruth.epipolar.surface_correlation.correlation_and_expected`)."""
+    drowned = np.isfinite(with_noise) & np.isnan(expected)
+    correlation = np.minimum(with_noise / expected, np.float32(1.0))
+    return Agreement(correlation, disparity, slope, threshold, weight, drowned)
+
+
+def contradicted(
+    labels: Labels, window: PairWindow, comparison: Comparison, labelled: Bools
+) -> tuple[Bools, Singles]:
+    """Which of the ``labelled`` pixels [h, w] the images contradict; the correlation of the images
+    over each pixel's surface."""
+    agreement, correlation = window_agreement(labels, window, comparison)
+    if comparison.diachronic:
+        shifted = shifted_agreement(
+            labels, window, comparison.noise, comparison.window_px, APART_PX, labelled
+        )
+        return shifted.contradicts, correlation
+    changed = agreement.outvoted()
+    doubtful = labelled & (agreement.together() < DOUBT)
+    shifted = shifted_agreement(
+        labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, doubtful
+    )
+    changed |= shifted.contradicts
+    has_signal = shifted.signal > SIGNAL
+    changed |= has_signal & agreement.unusual()
+    rim = agreement.beside(changed)
+    if comparison.points_per_px < DENSE:
+        # Points far apart miss what is small: the pixels of one window vote once more.
+        changed |= agreement.outvoted_nearby()
+    return (changed | rim) & labelled, correlation
 
 
 def without_changes(
@@ -231,14 +210,9 @@ def without_changes(
 ) -> WindowLabels:
     """Labels without those that the images contradict, and without water; with the correlation of
     the images over each pixel's surface."""
-    agreement = window_agreement(labels.labels, window, comparison)
+    labelled = is_labelled(labels.status)
+    changed, correlation = contradicted(labels.labels, window, comparison, labelled)
+    changed |= labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
-    changed = agreement.outvoted()
-    rim = agreement.beside(changed)
-    if comparison.points_per_px < DENSE:
-        # Points far apart miss what is small: the pixels of one window vote once more.
-        changed |= is_labelled(status) & agreement.outvoted_nearby()
-    changed |= is_labelled(status) & rim
-    changed |= is_labelled(status) & (labels.surface_class == WATER_CLASS)
     status[changed] = Status.CHANGED
-    return replace(labels, status=status, correlation=agreement.correlation)
+    return replace(labels, status=status, correlation=correlation)

@@ -24,16 +24,19 @@ from numpy.typing import NDArray
 
 from ..alignment.aligned_pair import ViewFit
 from ..epipolar.rpc import SensorModel
+from ..epipolar.shown_ground import GroundOfImages
 from ..errors import InputError
 from ..job import progress
-from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..lidar.point_store import PointStore
+from ..lidar.point_store import PointStore, open_stores
 from ..numerics.degrees import DEGREE_M
 from ..products.grids import Layer, atomic_store, blocks, create_grid
 from ..products.provenance import digest
-from ..surface.surface import GroundSurface, ground_surface
-from ..surface.vertices import VertexBuilder, Vertices
+from ..surface.region import SQUARE_BITS, Region
+from ..surface.scale import PART
+from ..surface.surface import GroundSurface
+from ..surface.surface_store import Box, SurfaceStore
+from ..surface.vertices import Vertices
 from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
@@ -42,14 +45,11 @@ from .facet_raster import (
     raster_facets,
     raster_prisms,
 )
-from .pixel_scale import PixelScale
-from .rays import GROUND_CELL_PX, Rays
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
 
 IMAGE_CHUNK, IMAGE_SHARD = 256, 1024
-BASE_OVER_HEIGHT = 0.6  # of the pair whose tolerances the surface has: GF-7's and the like
 NO_POINTS, MEASURED, UNDECIDED = range(3)
 STATUSES = "no_points measured undecided"
 _PRISMS = 1 << 15  # prisms that are projected at once
@@ -81,7 +81,7 @@ LAYERS = {
 
 @dataclass(frozen=True, eq=False)
 class ImageInputs:
-    """An image and the points of its site.
+    """An image, the points of its site and their surface.
 
     ``sensor`` is corrected; ``fit``: the correction and its covariance, None if it counts as exact.
     ``size``: (cols, rows) px.
@@ -90,6 +90,7 @@ class ImageInputs:
     sensor: SensorModel
     size: tuple[int, int]
     stores: tuple[PointStore, ...]
+    surface: SurfaceStore
     fit: ViewFit | None = None
 
     @cached_property
@@ -106,31 +107,12 @@ class ImageInputs:
         }
 
     @cached_property
-    def scale(self) -> PixelScale:
-        """What a pixel is on the ground, and the tolerances of the surface."""
-        col, row = self.size[0] / 2, self.size[1] / 2
-        lon, lat = self.sensor.localize([col, col + 1, col], [row, row, row + 1], self.reference_m)
-        if not np.isfinite(lon).all():
-            raise InputError(
-                "the RPC reaches no ground in the middle of the image",
-                remedy="check that the RPC belongs to the image",
-            )
-        shrink = float(np.cos(np.radians(lat[0])))
-        east, north = (lon[1:] - lon[0]) * shrink, lat[1:] - lat[0]
-        pixel = float(np.sqrt(abs(east[0] * north[1] - east[1] * north[0])))  # degrees of latitude
-        side = GROUND_CELL_PX * pixel / LATTICE_DEG
-        cell = max(round(side / shrink), 1), max(round(side), 1)
-        px_per_m = BASE_OVER_HEIGHT / (pixel * DEGREE_M)
-        rays = Rays(np.zeros((2, 2, 3)), cell, px_per_m)
-        return PixelScale.of(points_per_m2(self.stores), rays)
-
-    @property
     def pixel_m(self) -> float:
-        """Side of a pixel on the ground."""
-        return BASE_OVER_HEIGHT / self.scale.px_per_m
+        """Side of a pixel on the ground, in the image's middle."""
+        return GroundOfImages([self.sensor], [self.size]).pixel_deg[1] * DEGREE_M
 
     def box(self, rows: slice, cols: slice) -> tuple[float, float, float, float] | None:
-        """(west, south, east, north) of all ground that the pixels may show, with its halo.
+        """(west, south, east, north) of all ground that the pixels may show.
 
         Degrees; None if there are no points.
         """
@@ -159,8 +141,9 @@ class ImageInputs:
             )
         )
         lon, lat = self.sensor.localize(col, row, height)
-        halo = self.scale.surface.halo_cells + 4
-        east, north = (halo * side * LATTICE_DEG for side in self.scale.surface.cell)
+        scale = self.surface.scale
+        reach = scale.height_reach / PART + 4
+        east, north = (reach * side * LATTICE_DEG for side in scale.cell)
         return (
             float(np.nanmin(lon)) - east, float(np.nanmin(lat)) - north,
             float(np.nanmax(lon)) + east, float(np.nanmax(lat)) + north,
@@ -183,10 +166,13 @@ class ImageInputs:
 def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str, NDArray] | None:
     """The layers of LAYERS at the pixels of a block; None if no point is near."""
     box = inputs.box(rows, cols)
-    vertices = None if box is None else _vertices(inputs, box)
-    if vertices is None or not len(vertices.x):
+    blocks = () if box is None else inputs.surface.blocks(box)
+    if not blocks:
         return None
-    surface = ground_surface(vertices, inputs.scale.surface)
+    around = inputs.surface.window(blocks)
+    surface = around.surface(_region(inputs, around.vertices, box))
+    if not surface.vertices.x.size:
+        return None
     shape, first = (rows.stop - rows.start, cols.stop - cols.start), (rows.start, cols.start)
     every = surface.vertices
     xy = inputs.project(every.lon_q, every.lat_q, every.h_q)
@@ -206,20 +192,22 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     return _layers(inputs, (rows, cols), index, higher, values)
 
 
-def _vertices(inputs: ImageInputs, box: tuple[float, float, float, float]) -> Vertices | None:
-    low = [int(np.floor(edge / LATTICE_DEG)) for edge in box[:2]]
-    high = [int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]]
-    builder = VertexBuilder(inputs.scale.surface, (low[0], low[1]), (high[0], high[1]))
-    some = False
-    for store in inputs.stores:
-        points = store.query(*box)
-        if len(points):
-            some = True
-            builder.add(
-                points.lon_q, points.lat_q, points.h_q, points.classification,
-                points.return_number,
-            )  # fmt: skip
-    return builder.built() if some else None
+def _region(inputs: ImageInputs, vertices: Vertices, box: Box) -> Region:
+    """The squares of a box (west, south, east, north, degrees) from the vertices' origin on."""
+    size = [int(values.max()) >> SQUARE_BITS for values in (vertices.y, vertices.x)]
+    squares = np.zeros((size[0] + 1, size[1] + 1), np.bool_)
+    part = []
+    for low, high, q, at, side in (
+        (box[1], box[3], vertices.lat_q[0], vertices.y[0], inputs.surface.scale.cell[1]),
+        (box[0], box[2], vertices.lon_q[0], vertices.x[0], inputs.surface.scale.cell[0]),
+    ):
+        first, last = (
+            int(np.floor((edge / LATTICE_DEG - q) / side * PART + at)) >> SQUARE_BITS
+            for edge in (low, high)
+        )
+        part.append(slice(max(first - 1, 0), max(last + 2, 0)))
+    squares[part[0], part[1]] = True
+    return Region(squares)
 
 
 def _prisms(inputs: ImageInputs, surface: GroundSurface, chosen: slice) -> Floats:
@@ -325,8 +313,9 @@ def open_inputs(
     sensor: SensorModel,
     size: tuple[int, int],
     point_stores: Sequence[str | Path],
+    surface: str | Path,
     fit: ViewFit | None = None,
 ) -> ImageInputs:
-    """Inputs with the point stores opened, in the order of their names."""
-    stores = tuple(PointStore(path) for path in sorted(map(str, point_stores)))
-    return ImageInputs(sensor, size, stores, fit)
+    """Inputs with the stores opened, those of points in the order of their names."""
+    stores = open_stores(sorted(map(str, point_stores)))
+    return ImageInputs(sensor, size, stores, SurfaceStore(surface), fit)

@@ -1,7 +1,7 @@
 """Where the points of a window are.
 
 A window of the left epipolar grid shows the points of a box on the ground that depends on their
-heights; by the recipe surface, points that can hide these lie around it.
+heights; what can hide these lies around it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG
 from ..lidar.point_store import PointStore
+from ..numerics.hull import corners_of_hull
 from .rays import Rays
-from .settings import Settings
 from .view_geometry import ViewGeometry
 
 Box = tuple[float, float, float, float]
@@ -28,48 +28,27 @@ READ_POINTS = 1 << 20  # about as many are read at once
 
 class Footprint(NamedTuple):
     """Where the points of a window are: box of those that it can show, with their heights (m);
-    box of those that can hide these, with the greatest height there."""
+    box ``around`` of what can hide these."""
 
     box: Box
     low: float
     high: float
     around: Box
-    top: float
-
-
-def corners_of_hull(x: Floats, y: Floats) -> list[int]:
-    """Which points are corners of the convex hull of all, counterclockwise.
-
-    Andrew's monotone chain. SciPy's hull takes a quarter of a job's start-up to import.
-    """
-    order = np.lexsort((y, x)).tolist()
-    xs, ys = x.tolist(), y.tolist()
-    corners: list[int] = []
-    for points in (order, order[::-1]):  # the lower side, then the upper
-        side: list[int] = []
-        for k in points:
-            while len(side) > 1:
-                i, j = side[-2:]
-                if (xs[j] - xs[i]) * (ys[k] - ys[i]) > (ys[j] - ys[i]) * (xs[k] - xs[i]):
-                    break
-                side.pop()
-            side.append(k)
-        corners += side[:-1]
-    return corners
 
 
 @dataclass(frozen=True, eq=False)
 class PointWindows:
     """The points of ``stores`` by windows (rows, cols) of the left epipolar grid.
 
-    ``halo``: cells around, whose points have a say in what a window shows.
+    ``margin``: pixels around a window whose points have a say in it. ``reach``: degrees (lon, lat)
+    around a place of the surface between triangles there and their vertices.
     """
 
     model: ViewGeometry
     rays: Rays
     stores: tuple[PointStore, ...]
-    settings: Settings
-    halo: int
+    margin: int
+    reach: tuple[float, float]
 
     def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
         """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
@@ -83,7 +62,7 @@ class PointWindows:
 
     def ground_outline(self, rows: slice, cols: slice, low: float, high: float) -> Floats:
         """lon, lat [2, n] (degrees) along the edges of a window and its margin at two heights."""
-        margin = self.settings.margin
+        margin = self.margin
         x = np.linspace(cols.start - margin - 1.0, cols.stop + margin, 5)
         y = np.linspace(rows.start - margin - 1.0, rows.stop + margin, 5)
         edge_x = np.concatenate([x, x, np.full(5, x[0]), np.full(5, x[-1])])
@@ -110,7 +89,7 @@ class PointWindows:
                 return None
             low, high = heights
         moves = self.rays.moves(cols, rows)
-        spare = self.spare
+        spare = np.array(self.reach) + self.spare
         around = box
         for _ in range(3):
             rise = top - low
@@ -121,29 +100,23 @@ class PointWindows:
                 box[3] + moves[1, 1] * rise + spare[1],
             )
             top = self.heights(around)[1]
-        return Footprint(box, low, high, around, top)
+        return Footprint(box, low, high, around)
 
     @property
     def spare(self) -> Floats:
-        """Degrees (lon, lat) around the ground that a window needs: its ``halo`` of cells."""
-        return (self.halo + 2.0) * np.array(self.rays.cell) * LATTICE_DEG
+        """Degrees (lon, lat) of two cells around, for what is not linear in between."""
+        return 2.0 * np.array(self.rays.cell) * LATTICE_DEG
 
-    def strips(self, rows: slice, cols: slice, footprint: Footprint) -> list[Box]:
+    def strips(
+        self, rows: slice, cols: slice, footprint: Footprint, *, by_row: bool = False
+    ) -> list[Box]:
         """Boxes, one for some rows of cells of the stores each, of the points a window needs.
 
-        They cover the hull of what it can show and of the tracks of the rays from there. A box
-        around the hull of a turned image would hold up to twice as many points.
+        They cover the hull of what it can show. A box around the hull of a turned image would hold
+        up to twice as many points. ``by_row``: one box for each row.
         """
         ground = self.ground_outline(rows, cols, footprint.low, footprint.high)
         box = footprint.box
-        if self.settings.on_surface:
-            box = footprint.around
-            corners = np.array(
-                [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]
-            )
-            moves = np.hstack([*(self.rays.track @ corners.T), np.zeros((2, 1))])
-            moves *= footprint.top - footprint.low
-            ground = (ground[:, :, None] + moves[:, None]).reshape(2, -1)
         hull = ground[:, corners_of_hull(*ground)]
         after = np.roll(hull, -1, axis=1)
         rise = after[1] - hull[1]
@@ -152,6 +125,8 @@ class PointWindows:
         side = LATTICE_DEG * (1 << CELL_BITS)
         first, last = (int(np.floor(edge / side)) for edge in (box[1], box[3]))
         step = max(round(READ_POINTS / max(self.expected([box]), 1.0) * (last + 1 - first)), 1)
+        if by_row:
+            step = 1
         strips = []
         for row in range(first, last + 1, step):
             # Half a step below the border, so that no point lies on it.
@@ -167,6 +142,18 @@ class PointWindows:
                 west, east = lon[:, touched].min(), lon[:, touched].max()
                 strips.append((west - spare[0], south, east + spare[0], north))
         return strips
+
+    def beyond_stores(self, rows: slice, cols: slice) -> float:
+        """Ground (m²) whose points a window needs, and which the stores' footprints leave out.
+
+        In whole cells of the stores, of the store that leaves out most of it.
+        """
+        footprint = self.footprint(rows, cols)
+        if footprint is None:
+            return 0.0
+        boxes = np.array(self.strips(rows, cols, footprint, by_row=True)).reshape(-1, 4)
+        held = [store.footprint for store in self.stores]
+        return max((f.beyond_m2(boxes) for f in held if f is not None), default=0.0)
 
     def expected(self, boxes: Sequence[Box]) -> float:
         """About how many points lie in boxes, if the stores are evenly filled."""

@@ -24,6 +24,7 @@ import dask
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..job import block_progress
 from ..products.grids import Strip, blocks, require_complete
@@ -31,8 +32,8 @@ from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from .image_patches import MaskedImage
 from .layers import layers
+from .lidar_read import lidar_read
 from .overlap_check import apart, refuse_apart
-from .rays import GROUND_CELL_PX
 from .recipe import label_window
 from .scene_inputs import SceneInputs
 from .status import Status, is_labelled
@@ -51,7 +52,7 @@ ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have
 
 def _log_density(inputs: SceneInputs) -> None:
     """Log how dense the points are, and what that leaves without a label."""
-    pixel = inputs.rays.cell_m / GROUND_CELL_PX
+    pixel = inputs.rays.pixel_m
     per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
     density = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
@@ -77,7 +78,10 @@ class _Blocks:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
         touched = self.scene.windows.touched(rows, self.scene.pair.cols(cols))
         points = sorted(_identity(store.attrs) for store in touched)
-        return digest({"content": content, "points": points})
+        surface = [
+            block.sha256 for block in self.scene.surface_blocks(rows, self.scene.pair.cols(cols))
+        ]
+        return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
         """Label one block and write it, with its pixels by status and counts of points.
@@ -117,9 +121,12 @@ class _Blocks:
 
 
 def _identity(attrs: Mapping[str, Any]) -> str:
-    """What stands for the values of a store; something new each time if it has no record."""
+    """What stands for the values of a store; something new each time if it has no record.
+
+    Of points, what was read of their file belongs to it.
+    """
     made_of = attrs.get("provenance") or {"unknown": os.urandom(8).hex()}
-    return attrs.get("content") or digest(made_of)
+    return attrs.get("content") or digest({**made_of, "points": attrs.get("cells_crc32")})
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +166,12 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     stores["right"] = require_complete(inputs.right_store).attrs
     epipolar = dict(stores["left"]["epipolar"])
     stores |= {f"points/{store.path.name}": store.attrs for store in inputs.stores}
+    if inputs.settings.on_surface:
+        stores["surface"] = inputs.ground.attrs
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
     if inputs.alignment is not None:
         made_of |= checksums([inputs.alignment])
     parameters = {"view": inputs.view} | asdict(inputs.settings)
-    pixel_m = inputs.rays.cell_m / GROUND_CELL_PX
     return {
         "kind": "disparity",
         "scene": scene,
@@ -172,9 +180,10 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
         "points_bounds": [*extent.points, *extent.heights],
         "alignment_sigma_px": inputs.pair.uncertainty.sigma,
         "points_per_m2": round(inputs.points_per_m2, 4),
-        "points_per_px": round(inputs.points_per_m2 * pixel_m**2, 4),
+        "points_per_px": round(inputs.points_per_m2 * inputs.rays.pixel_m**2, 4),
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
+        "lidar": lidar_read(inputs, EpipolarModel.from_dict(epipolar)),
         "settings": parameters,
         "provenance": describe(made_of, parameters, code),
     }
@@ -229,7 +238,7 @@ def project_scene(
     if not inputs.point_stores:
         raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
     extent = _Extent.of(inputs)
-    if apart(extent.points, extent.images):
+    if apart(extent.points, extent.images) or not any(store.count for store in inputs.stores):
         extent.refuse()
     attrs = _attributes(inputs, extent, scene, code)
     _log_density(inputs)

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from ..lidar.lattice import LATTICE_DEG
 from ..numerics.degrees import DEGREE_M
+from ..surface.scale import GROUND_CELL_PX
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
-
-# Cells are finer than pixels, so that walls stand where they are.
-GROUND_CELL_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +85,11 @@ class Rays:
     def cell_m(self) -> float:
         """Side of a cell on the ground, m."""
         return self.cell[1] * LATTICE_DEG * DEGREE_M
+
+    @property
+    def pixel_m(self) -> float:
+        """Side of a pixel on the ground, m."""
+        return self.cell_m / GROUND_CELL_PX
 
     def moves(self, cols: slice, rows: slice) -> Floats:
         """[2, 2] (lon, lat; lowest, highest) degrees per metre that any ray from a window moves."""

@@ -3,11 +3,10 @@
 The recipe surface, step by step; equations and a figure: docs/explanation/surface.md.
 
 1. *Points.* The LiDAR's points are projected into both images and sorted by pixel
-   (:mod:`.pixel_points`); those around become vertices over the ground, one for each half pixel at
-   most (:mod:`stereotruth.surface.vertices`).
-2. *Facets.* Delaunay triangles of the vertices that lie on one surface are facets. Triangles across
-   a height step are cut at the breakline that the points on both sides determine; what is left is
-   undecided (:mod:`stereotruth.surface.surface`).
+   (:mod:`.pixel_points`).
+2. *Facets.* The surface of the points has been made for all pairs of the site: facets, and
+   triangles that are undecided (:mod:`stereotruth.surface.surface`). Those are taken that the
+   window may see (:mod:`.ground_in_view`).
 3. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
    and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
    has the label of its nearest facet if nothing may hide it in either view; if its own points are
@@ -27,7 +26,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.surface import ground_surface
 from .crowns import crowns, with_crowns, without_contours
 from .facet_labels import facet_labels
 from .ground_in_view import ground_in_view
@@ -70,6 +68,8 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
         settings.correlation_threshold,
         scale.points_per_px,
         scale.detection_weight,
+        scene.noise,
+        settings.diachronic,
     )
 
     # points: what each pixel's own ones say
@@ -83,8 +83,9 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
 
     # facets: over the ground that the window may see
     reach, cell = scale.surface.height_reach, scale.surface.cell
-    region = ground_in_view(points.vertices, reach, cell, projection, first, shape)
-    surface = ground_surface(points.vertices, scale.surface, region)
+    around = points.surface
+    region = ground_in_view(around.vertices, reach, cell, projection, first, shape)
+    surface = around.surface(region)
 
     # visibility in both views; less than two spacings around a hidden point are searched for what
     # covers it, so that sparse points are seen through

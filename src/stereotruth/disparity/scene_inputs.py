@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,13 @@ from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
 from ..lidar.density import points_per_m2
+from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
+from ..products.provenance import digest
+from ..surface.make_surface import make_surface
+from ..surface.scale import PART
+from ..surface.surface_store import Block, SurfaceStore
 from .image_patches import MaskedImage
 from .pixel_scale import PixelScale
 from .point_windows import PointWindows
@@ -30,6 +35,7 @@ class SceneInputs:
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
     file whose corrections the images were rectified with; without it, it counts as exact.
+    ``surface``: the store with the surface of the points; the recipe paper needs none.
     """
 
     left_store: Path
@@ -38,6 +44,7 @@ class SceneInputs:
     settings: Settings
     view: str = "left"
     alignment: Path | None = None
+    surface: Path | None = None
 
     @classmethod
     def of(
@@ -48,13 +55,25 @@ class SceneInputs:
         settings: Settings,
         view: str = "left",
         alignment: str | Path | None = None,
+        surface: str | Path | None = None,
     ) -> SceneInputs:
         """With absolute paths, since workers of a Dask cluster live in other folders, and the point
         stores in their order by name."""
         left, right = Path(left_store).absolute(), Path(right_store).absolute()
         points = tuple(sorted(Path(path).absolute() for path in point_stores))
-        aligned = None if alignment is None else Path(alignment).absolute()
-        return cls(left, right, points, settings, view, aligned)
+        aligned, ground = (None if p is None else Path(p).absolute() for p in (alignment, surface))
+        return cls(left, right, points, settings, view, aligned, ground)
+
+    def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
+        """The same with the surface of all its points, which is made in a ``folder`` by the pixel
+        of its left image: for a pair that is of no project."""
+        if not self.settings.on_surface:
+            return self
+        names = digest(list(map(str, self.point_stores)))[:12]
+        out = Path(folder).absolute() / f"{names}.surface"
+        model = EpipolarModel.from_dict(require_complete(self.left_store).attrs["epipolar"])
+        make_surface(self.stores, out, cell=Rays.of(model).cell, workers=workers)
+        return replace(self, surface=out)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
@@ -92,6 +111,14 @@ class SceneInputs:
         return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
 
     @cached_property
+    def noise(self) -> tuple[float, float]:
+        """Variances of the noise of both images of the pair, DN²; 0 of a store that has none."""
+        stores = (self.left_store, self.right_store)
+        facts = [require_complete(path).attrs.get("resampling", {}) for path in stores]
+        left, right = (noise.get("noise_dn", 0.0) ** 2 for noise in facts)
+        return (left, right) if self.view == "left" else (right, left)
+
+    @cached_property
     def rays(self) -> Rays:
         """From the ground to both cameras."""
         return Rays.of(self.pair.model)
@@ -104,19 +131,30 @@ class SceneInputs:
     @cached_property
     def scale(self) -> PixelScale:
         """What a pixel is on the ground and in height."""
-        return PixelScale.of(self.points_per_m2, self.rays)
+        return PixelScale.of(self.ground.scale, self.rays)
 
     @cached_property
     def points_per_m2(self) -> float:
-        """Over the ground that the points cover."""
-        return points_per_m2(self.stores)
+        """Over the ground that the points cover, as far as the site's images show it."""
+        return self.ground.points_per_m2 if self.settings.on_surface else points_per_m2(self.stores)
 
-    @property
-    def halo(self) -> int:
-        """Cells around all that a window shows and what hides it, whose points determine labels."""
-        return self.scale.surface.halo_cells if self.settings.on_surface else 0
+    @cached_property
+    def ground(self) -> SurfaceStore:
+        """The surface of the points."""
+        return SurfaceStore(self.surface)
 
     @cached_property
     def windows(self) -> PointWindows:
         """Where the points of windows of the pair's left image are."""
-        return PointWindows(self.pair.model, self.rays, self.stores, self.settings, self.halo)
+        reach = (0.0, 0.0)
+        if self.settings.on_surface:
+            scale = self.ground.scale
+            reach = tuple(scale.height_reach / PART * side * LATTICE_DEG for side in scale.cell)
+        return PointWindows(self.pair.model, self.rays, self.stores, self.settings.margin, reach)
+
+    def surface_blocks(self, rows: slice, cols: slice) -> tuple[Block, ...]:
+        """Blocks of the surface that a window shows, or that may hide this."""
+        footprint = self.windows.footprint(rows, cols)
+        if footprint is None or not self.settings.on_surface:
+            return ()
+        return self.ground.blocks(footprint.around)

@@ -33,7 +33,8 @@ class Settings:
     surface count"""
 
     correlation_threshold: Annotated[Number, Field(ge=-1, le=1)] = 0.5
-    """with `paper` a point below is dropped; with `surface` a pixel below votes for change"""
+    """with `paper` a point below is dropped; with `surface` a pixel below votes for change, by the
+    correlation that it would have without the images' noise"""
 
     edge_margin_px: Annotated[Number, Field(ge=0, le=1), Unit("px")] = 0
     """with `surface`: a pixel whose centre lies nearer to the edge between its surface (roof,
@@ -42,6 +43,13 @@ class Settings:
 
     min_points: Annotated[Whole, Field(ge=1, alias="min_points_per_px"), Unit("points")] = 1
     """a pixel with fewer stays unlabelled with `paper`, and is one between points with `surface`"""
+
+    diachronic: Flag = False
+    """with `surface`: whether both images of a pair were taken under different suns or in different
+    seasons. Their brightness is not compared then, since shadows and leaves change it where no
+    height has changed; their detail is, at the labels' disparity and at others, and a pixel is
+    `changed` where the labels' one is no better. Column `diachronic` of the scenes sheet says it of
+    a scene"""
 
     @property
     def on_surface(self) -> bool:
@@ -67,8 +75,9 @@ class Settings:
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # here, since these load compiled code and a workflow plans with the settings
-        from .image_agreement import NEARBY_PX, VOTE_PX
+        from .image_agreement import NEARBY_PX
         from .seen_surface import OUTER_RINGS
+        from .surface_means import VOTE_PX
 
         # one for each ring of neighbours: planes, their pooled noise, support
         reach = OUTER_RINGS + 3

@@ -1,4 +1,4 @@
-"""The points of a window: by pixel, and as vertices over the ground."""
+"""The points of a window by pixel, and what it may see of the surface over the ground."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..surface.vertices import VertexBuilder, Vertices
+from ..surface.surface_store import WindowSurface
 from .image_patches import read_patch
 from .local_projection import LocalProjection
 from .pair_window import PairWindow
 from .pixel_points import Collection, PixelPoints
 from .point_windows import Box, Footprint
 from .scene_inputs import SceneInputs
+from .shifted_agreement import SHIFTED_PX
 
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
 
@@ -22,11 +23,11 @@ BLOCK = 1 << 16  # points that go through the projection at once, while they are
 @dataclass(frozen=True, eq=False)
 class WindowPoints:
     """The points of a window ``by_pixel``; the ``projection`` of all ground around; the
-    ``vertices`` of the surface around, None with the recipe paper."""
+    ``surface`` around, None with the recipe paper."""
 
     by_pixel: PixelPoints
     projection: LocalProjection
-    vertices: Vertices | None
+    surface: WindowSurface | None
 
 
 def read_window(
@@ -37,7 +38,12 @@ def read_window(
     if footprint is None:
         return None
     window = _window(scene, rows, cols, footprint)
-    points = _points(scene, scene.windows.strips(rows, cols, footprint), window)
+    surface = None
+    if blocks := scene.surface_blocks(rows, cols):
+        surface = scene.ground.window(blocks)
+    elif scene.settings.on_surface:
+        return None
+    points = _points(scene, scene.windows.strips(rows, cols, footprint), window, surface)
     return None if points is None else (window, points)
 
 
@@ -58,13 +64,16 @@ def _window(scene: SceneInputs, rows: slice, cols: slice, footprint: Footprint) 
     model, (left, right) = scene.pair.model, scene.pair.images
     x_right = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
     x_right = x_right[np.isfinite(x_right)]
-    # A few pixels more, for what is not linear in between.
-    there = slice(int(x_right.min(initial=0.0)) - 8, int(x_right.max(initial=0.0)) + 9)
+    # A few pixels more, for what is not linear in between, and what shifted disparities show.
+    more = 8 + SHIFTED_PX
+    there = slice(int(x_right.min(initial=0.0)) - more, int(x_right.max(initial=0.0)) + more + 1)
     patches = read_patch(left, rows, cols, size), read_patch(right, rows, there, size)
     return PairWindow(rows, cols, margin, *patches)
 
 
-def _points(scene: SceneInputs, strips: Sequence[Box], window: PairWindow) -> WindowPoints | None:
+def _points(
+    scene: SceneInputs, strips: Sequence[Box], window: PairWindow, surface: WindowSurface | None
+) -> WindowPoints | None:
     """The points of some strips of the ground; None if none is in the window."""
     if not strips:
         return None
@@ -72,14 +81,16 @@ def _points(scene: SceneInputs, strips: Sequence[Box], window: PairWindow) -> Wi
     heights = scene.windows.heights(box)
     if heights is None:
         return None
-    low = [int(np.floor(edge / LATTICE_DEG)) for edge in box[:2]]
-    high = [int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]]
-    low_h, high_h = (round(height / LATTICE_M) for height in heights)
-    projection = LocalProjection.of(scene.pair.model, (*low, low_h), (*high, high_h))
-    collection = Collection(window.shape, window.first, (low[0], low[1]), window.left, window.right)
-    vertices = None
-    if scene.settings.on_surface:
-        vertices = VertexBuilder(scene.scale.surface, (low[0], low[1]), (high[0], high[1]))
+    origin = int(np.floor(box[0] / LATTICE_DEG)), int(np.floor(box[1] / LATTICE_DEG))
+    low = [*origin, round(heights[0] / LATTICE_M)]
+    high = [*(int(np.ceil(edge / LATTICE_DEG)) for edge in box[2:]), round(heights[1] / LATTICE_M)]
+    if surface is not None:
+        vertices = surface.vertices
+        lattice = vertices.lon_q, vertices.lat_q, vertices.h_q
+        low = [min(q, int(values.min())) for q, values in zip(low, lattice)]
+        high = [max(q, int(values.max())) for q, values in zip(high, lattice)]
+    projection = LocalProjection.of(scene.pair.model, low, high)
+    collection = Collection(window.shape, window.first, origin, window.left, window.right)
     for strip in strips:
         for store in scene.stores:
             points = store.query(*strip)
@@ -88,9 +99,7 @@ def _points(scene: SceneInputs, strips: Sequence[Box], window: PairWindow) -> Wi
                 lattice = points.lon_q[block], points.lat_q[block], points.h_q[block]
                 classes = points.classification[block]
                 collection.add(*lattice, classes, projection.at_points(*lattice))
-                if vertices is not None:
-                    vertices.add(*lattice, classes, points.return_number[block])
     by_pixel = collection.sorted()
     if by_pixel.points.size == 0 and not by_pixel.outside.any():
         return None
-    return WindowPoints(by_pixel, projection, None if vertices is None else vertices.built())
+    return WindowPoints(by_pixel, projection, surface)

@@ -14,9 +14,10 @@ How well heights follow from a match is geometry alone: ``SitePair.metres_per_px
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .site_pairs import SitePair
+from .site_pairs import SiteImage, SitePair, pairs_of_site
 
 # log odds of a wrong match: at no base and no way of the shadows; then by each of them
 WRONG_AT_NOTHING = -2.5
@@ -51,3 +52,17 @@ def quality_of(pair: SitePair) -> Quality:
     if pair.convergence < LEAST_CONVERGENCE_DEG:
         reason = f"heights follow badly: 1 px is {pair.metres_per_px:.0f} m"
     return Quality(1.0 - wrong, reason)
+
+
+@dataclass(frozen=True)
+class RatedPair:
+    """A pair and its predicted quality."""
+
+    pair: SitePair
+    quality: Quality
+
+
+def rate(images: Sequence[SiteImage]) -> list[RatedPair]:
+    """All pairs of a site that share ground, best first, whatever the order of its images."""
+    rated = [RatedPair(pair, quality_of(pair)) for pair in pairs_of_site(images)]
+    return sorted(rated, key=lambda r: (-r.quality.matched, r.pair.left, r.pair.right))

@@ -24,6 +24,7 @@ from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from .colours import COLOURS
+from .image_noise import noise_of, resampled_noise
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
@@ -263,7 +264,7 @@ def rectify(
             }
             if source.mask_path is not None:
                 made_of["mask"] = file_sha256(source.mask_path)
-            attrs["resampling"] = rectify_image(
+            facts = rectify_image(
                 source,
                 image,
                 grid,
@@ -273,9 +274,11 @@ def rectify(
                 what=f"{view} epipolar image",
                 strip=strip,
             )
-            finished.append((grid, store, attrs))
-        if strip is None:
-            for grid, store, attrs in finished:
-                grid.write_atomically(store, blocks(model.shape, SHARD), attrs)
-            if epipolar_json is not None:
-                model.save(epipolar_json, provenance)
+            if strip is None:
+                noise = resampled_noise(noise_of(source), facts["kernel_widening_col_row"])
+                attrs["resampling"] = facts | {"noise_dn": round(noise, 3)}
+                finished.append((grid, store, attrs))
+        for grid, store, attrs in finished:
+            grid.write_atomically(store, blocks(model.shape, SHARD), attrs)
+        if strip is None and epipolar_json is not None:
+            model.save(epipolar_json, provenance)

@@ -17,6 +17,7 @@ Singles = NDArray[np.float32]
 # one order, whatever the block. 52 ns a pixel (window 9) against 240 window by window. What belongs
 # together lies at constant distances in one array: LLVM vectorises only if few may overlap.
 BLOCK = 256
+DECIDED = 2.0  # standard deviations of a chance correlation that an expected one must reach
 
 
 @inner
@@ -50,9 +51,12 @@ def _correlation(
     counted: Singles,
     slope: Singles,
     half: int,
+    noise: tuple[float, float],
     out: Singles,
+    expected: Singles,
 ) -> None:
-    """``counted``: disparity of the pixels that count, else NaN."""
+    """``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both
+    images."""
     rows, cols = left.shape
     surface = np.empty(3 * BLOCK, np.float32)
     centre = np.empty(2 * BLOCK, np.float32)
@@ -90,6 +94,7 @@ def _correlation(
             for k in range(size):
                 n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
                 # A few pixels correlate by chance: they neither agree nor disagree.
+                expected[y, x0 + k] = np.nan
                 if n < 2 * half + 1:
                     out[y, x0 + k] = np.nan
                     continue
@@ -97,6 +102,13 @@ def _correlation(
                 svv = sums[4 * BLOCK + k] - sv * sv / n
                 suv = sums[5 * BLOCK + k] - su * sv / n
                 out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
+                here, there = noise[0] * (n - 1), noise[1] * (n - 1)
+                signal = max(suu * there, svv * here) - here * there  # of that with more texture
+                share = signal / (signal + here * there) if signal > 0 else 0.0
+                if here * there == 0.0:
+                    share = 1.0
+                if share * np.sqrt(n) >= DECIDED:
+                    expected[y, x0 + k] = share
 
 
 def surface_correlation(
@@ -116,9 +128,27 @@ def surface_correlation(
     px) is wide; 0 where either image is constant. In float32, about the centre's values: within
     1e-5 of float64.
     """
+    return correlation_and_expected(left, warped, disparity, slope, window, (0.0, 0.0), clear)[0]
+
+
+def correlation_and_expected(
+    left: NDArray[np.floating],
+    warped: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    window: int,
+    noise: tuple[float, float],
+    clear: NDArray[np.bool_] | None = None,
+) -> tuple[Singles, Singles]:
+    """:func:`surface_correlation`, and the one that images of the same ground have on the average.
+
+    The latter [h, w] is in (0, 1], by the variances of the images' ``noise`` (DN²) and of the
+    window in the image that varies more: the attenuation of a correlation by errors of measurement
+    (Spearman 1904). NaN also where noise leaves so little of it that chance may do as well.
+    """
     known = np.isfinite(warped)
     disparity = np.where(known, disparity, np.float32(np.nan)).astype(np.float32, copy=False)
-    out = np.empty(left.shape, np.float32)
+    out, expected = np.empty((2, *left.shape), np.float32)
     _correlation(
         np.ascontiguousarray(left, dtype=np.float32),
         np.where(known, warped, 0).astype(np.float32, copy=False),
@@ -126,6 +156,8 @@ def surface_correlation(
         disparity if clear is None else np.where(clear, disparity, np.float32(np.nan)),
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
+        noise,
         out,
+        expected,
     )
-    return out
+    return out, expected

@@ -5,10 +5,15 @@ C at once. Both places in C should be one. Their difference is given in px of th
 its rows: the disparity of A-C by way of B less its label.
 
 All three labels rest on one point cloud and, where the images are adjusted together, on one
-correction per image. So the closure of the labels checks geometry, visibility and interpolation,
-and is far smaller than three independent labels would leave. How good the corrections are shows
-the closure of the pairs' own refinements, each of which rests on tie points of its own: see
-:func:`closure_of_refinements`.
+correction per image. Whatever the three corrections and the heights of the ground are, the rays
+that they define close: for one height h of a point, d_AB, d_BC and d_AC are its projections by the
+same three sensors. So the alignment's covariance has no part in a closure, and of the points' only
+what the three labels do not share: h differs between pairs as far as their facets do, whose cells
+follow each pair's pixels. The stated uncertainty of a closure therefore has the points' part of
+each label's variance alone, as if the three were independent. That is an upper bound: all three
+have their heights from the same points, and no layer tells how much of their noise they share.
+How good the corrections are shows the closure of the pairs' own refinements, each of which rests on
+tie points of its own: see :func:`closure_of_refinements`.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ from numpy.typing import NDArray
 
 from ..alignment.adjustment import PairEquations, estimate, over_the_image, parameters_of
 from ..alignment.aligned_pair import Alignment
+from ..alignment.label_uncertainty import LabelUncertainty
 from ..alignment.site_fit import rpc_prior
 from ..alignment.tie_equations import read_equations
 from ..epipolar.model import EpipolarModel
@@ -40,8 +46,9 @@ MOST = 250_000  # pixels of a triplet, about, that are compared
 STEP_PX = 1.0  # difference of neighbouring labels: more is a height step between them
 NODES = 9  # places along each side of an image, of the closure of refinements
 UNITS = (
-    "px along the rows of the grid of A-C; sigma: stated standard uncertainty, of labels as if the "
-    "three were independent; of refinements, px of image C, of both coordinates"
+    "px along the rows of the grid of A-C; sigma: stated standard uncertainty, of labels by the "
+    "noise of their points alone, as if the three were independent: an upper bound; of "
+    "refinements, px of image C, of both coordinates"
 )
 
 
@@ -87,22 +94,37 @@ def triplets_of(pairs: Sequence[PairFiles]) -> list[Triplet]:
 class _Labels:
     """Labels of a pair, read window by window."""
 
-    def __init__(self, path: Path) -> None:
-        group = require_complete(path)
+    def __init__(self, pair: PairFiles) -> None:
+        group = require_complete(pair.disparity)
         self.model = EpipolarModel.from_dict(group.attrs["epipolar"])
         self.disparity: zarr.Array = group["disparity"]
         self.uncertainty: zarr.Array = group["uncertainty"]
+        self.alignment = LabelUncertainty.of(Alignment.load(pair.alignment), self.model)
+
+    def window(self, window: tuple[slice, slice]) -> tuple[Floats, Floats]:
+        """Disparity and, of its variance, the part of the points [h, w] px, px²."""
+        disparity = self.disparity[window].astype(float)
+        rows, cols = (
+            np.arange(part.start, part.start + size, dtype=float)
+            for part, size in zip(window, disparity.shape)
+        )
+        slope = np.zeros((2, *disparity.shape))
+        for axis, size in ((1, cols.size), (0, rows.size)):
+            if size > 1:
+                slope[1 - axis] = np.nan_to_num(np.gradient(disparity, axis=axis))
+        of_alignment = self.alignment.variance(cols, rows, slope)
+        return disparity, np.maximum(self.uncertainty[window].astype(float) ** 2 - of_alignment, 0)
 
     def at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Disparity and uncertainty [n] px at places of the left grid; NaN between surfaces."""
+        """As :meth:`window`, [n] at places of the left grid; NaN between surfaces."""
         rows, cols = self.disparity.shape
         known = (x >= 0) & (y >= 0) & (x <= cols - 1) & (y <= rows - 1)
-        disparity, uncertainty = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+        disparity, variance = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
         if not known.any():
-            return disparity, uncertainty
+            return disparity, variance
         left, top = int(x[known].min()), int(y[known].min())
         window = np.s_[top : int(y[known].max()) + 2, left : int(x[known].max()) + 2]
-        labels, sigma = self.disparity[window], self.uncertainty[window]
+        labels, of_points = self.window(window)
         u, v = x[known] - left, y[known] - top
         i, j = u.astype(int), v.astype(int)
         below = np.minimum(j + 1, labels.shape[0] - 1)
@@ -111,39 +133,38 @@ class _Labels:
             [labels[j, i], labels[j, beside], labels[below, i], labels[below, beside]]
         )
         even = np.ptp(corners, axis=0) < STEP_PX  # not where one is NaN
-        disparity[known] = np.where(even, bilinear(labels.astype(float), u, v), np.nan)
-        uncertainty[known] = bilinear(sigma.astype(float), u, v)
-        return disparity, uncertainty
+        disparity[known] = np.where(even, bilinear(labels, u, v), np.nan)
+        variance[known] = bilinear(of_points, u, v)
+        return disparity, variance
 
 
 def _closures(triplet: Triplet) -> Iterator[tuple[Floats, Floats]]:
     """Closure and its uncertainty [n] px of each block of the grid of A-B."""
-    ab, bc, ac = (_Labels(pair.disparity) for pair in (triplet.ab, triplet.bc, triplet.ac))
+    ab, bc, ac = (_Labels(pair) for pair in (triplet.ab, triplet.bc, triplet.ac))
     rows, cols = ab.disparity.shape
     step = max(1, round((rows * cols / MOST) ** 0.5))
     for window in blocks((rows, cols), BLOCK):
-        d_ab = ab.disparity[window][::step, ::step].astype(float)
-        s_ab = ab.uncertainty[window][::step, ::step].astype(float)
+        d_ab, v_ab = (values[::step, ::step] for values in ab.window(window))
         j, i = np.nonzero(np.isfinite(d_ab))
         if not len(i):
             continue
         x, y = window[1].start + step * i.astype(float), window[0].start + step * j.astype(float)
-        d_ab, s_ab = d_ab[j, i], s_ab[j, i]
+        d_ab, v_ab = d_ab[j, i], v_ab[j, i]
 
         def in_ac(in_bc: tuple[Floats, Floats], disparity: Floats) -> tuple[Floats, Floats]:
             in_c = bc.model.epipolar_to_right(in_bc[0] - disparity, in_bc[1])
             return ac.model.right_to_epipolar(*in_c)
 
         in_bc = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab, y))
-        d_bc, s_bc = bc.at(*in_bc)
+        d_bc, v_bc = bc.at(*in_bc)
         by_b = in_ac(in_bc, d_bc)[0]
         in_a = ac.model.left_to_epipolar(*ab.model.epipolar_to_left(x, y))
-        d_ac, s_ac = ac.at(*in_a)
+        d_ac, v_ac = ac.at(*in_a)
         beside = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab - 1.0, y))
         by_ab = in_ac(beside, d_bc)[0] - by_b
         by_bc = in_ac(in_bc, d_bc + 1.0)[0] - by_b
         closure = in_a[0] - by_b - d_ac
-        variance = (by_ab * s_ab) ** 2 + (by_bc * s_bc) ** 2 + s_ac**2
+        variance = by_ab**2 * v_ab + by_bc**2 * v_bc + v_ac
         good = np.isfinite(closure) & np.isfinite(variance)
         yield closure[good], np.sqrt(variance[good])
 

@@ -25,6 +25,7 @@ from ..simulate.cities import CitySpec, SceneSpec
 from ..simulate.render import prepare
 from ..simulate.surfaces import ROOF, WALL
 from ..simulate.truth import CHANGES, SURFACES, truth_at
+from ..simulate.truth import LAYERS as OF_IMAGES
 
 CHUNK = 256
 SHARD = 1024
@@ -35,15 +36,7 @@ LAYERS = {
     "y_parallax": ("float32", "px", "y_right - y_left of what the pixel shows"),
     "visible": ("uint8", "1", "1 where both images show the surface point"),
     "hidden": ("uint8", "1", "1 where the surface point lies in the right frame, behind something"),
-    "changed": ("uint8", "1", "whether the pixel would show another surface in the LiDAR's world"),
-    "changed_right": (
-        "uint8",
-        "1",
-        "1 where the LiDAR's world is unchanged, but hides the point from the right view and that "
-        "of the images does not, or the other way round",
-    ),
-    "covered": ("uint8", "1", "1 inside the LiDAR coverage"),
-    "surface": ("uint8", "1", "kind of surface that the pixel shows"),
+    **{name: OF_IMAGES[name] for name in ("changed", "changed_right", "covered", "surface")},
     "edge": (
         "uint8",
         "1",

@@ -147,19 +147,21 @@ class SortedRuns:
 
     def write(self, folder: Path) -> int:
         """Write points and cell table in final order; return the CRC-32 of the latter's file."""
-        segments, limits = np.concatenate(self.segments), np.concatenate(self.limits)
+        segments = np.concatenate([np.empty((0, 3), np.int64), *self.segments])
+        limits = np.concatenate([np.empty((0, 2), np.int32), *self.limits])
         order = np.argsort(segments[:, 0], kind="stable")
         segments, limits = segments[order], limits[order]
         key, first = np.unique(segments[:, 0], return_index=True)
         table = np.empty(key.size, CELL)
         table["row"], table["col"] = key >> 32, (key & 0xFFFFFFFF) - (1 << 30)
         table["first"] = np.cumsum(segments[:, 2])[first] - segments[first, 2]
-        table["lowest"] = np.minimum.reduceat(limits[:, 0], first)
-        table["highest"] = np.maximum.reduceat(limits[:, 1], first)
+        if key.size:
+            table["lowest"] = np.minimum.reduceat(limits[:, 0], first)
+            table["highest"] = np.maximum.reduceat(limits[:, 1], first)
         described = {"descr": "<u4", "fortran_order": False, "shape": (self.written, WORDS)}
         with (folder / POINTS).open("wb") as file:
             np.lib.format.write_array_header_1_0(file, described)
-            for cell, of in enumerate(np.split(segments, first[1:])):
+            for cell, of in enumerate(np.split(segments, first[1:]) if key.size else ()):
                 found, squares = 0, np.zeros((SQUARES, SQUARES), np.int64)
                 for points in self._take(of):
                     found = zlib.crc32(points, found)

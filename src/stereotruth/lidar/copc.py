@@ -26,6 +26,7 @@ from .ranges import Range, Ranges
 INFO = (b"copc", 1)
 INFO_PLACE = 375 + 54  # right behind the header of LAS 1.4, and its own
 ENTRY = struct.Struct("<4iQii")
+EVLR = struct.Struct("<H16sHQ32s")
 MOST_HEAD_BYTES = 16 << 20  # of header and VLRs
 FIELDS = (
     DecompressionSelection.XY_RETURNS_CHANNEL
@@ -52,6 +53,7 @@ class Copc(Octree):
             self._packing = _Packing.of(head[at : at + length], layout.record_bytes)
             _require(self._packing.kind == LAYERED, "its points are not compressed in layers")
             self.header = laspy.LasHeader.read_from(io.BytesIO(head), read_evlrs=False)
+            self.header.vlrs.extend(self._systems_behind(layout))
             first = next((r for r in records if r[2] == INFO_PLACE), None)
             if first is None or first[:2] != INFO or first[3] < 160:
                 raise InputError(
@@ -82,6 +84,19 @@ class Copc(Octree):
             layout.first_point <= MOST_HEAD_BYTES, f"points begin at byte {layout.first_point}"
         )
         return layout, self._ranges.get(0, layout.first_point)
+
+    def _systems_behind(self, layout: Layout) -> list[laspy.VLR]:
+        """The records behind the points that declare a coordinate system."""
+        found, at = [], layout.first_evlr
+        for _ in range(int(self.header.number_of_evlrs)):
+            head = self._ranges.get(at, at + EVLR.size)
+            _, user, number, length, _ = EVLR.unpack(head)
+            if user.rstrip(b"\0") == b"LASF_Projection":
+                _require(length <= MOST_HEAD_BYTES, f"a record of {length} bytes behind its points")
+                content = self._ranges.get(at + EVLR.size, at + EVLR.size + length)
+                found.append(laspy.VLR("LASF_Projection", number, "", content))
+            at += EVLR.size + length
+        return found
 
     def _hierarchy(self, root: Range) -> tuple[Node, ...]:
         """The nodes with points of all pages, in the order of the file."""

@@ -1,88 +1,154 @@
-"""Ground that images see, by polygons and heights: which points and boxes belong to it."""
+"""Ground whose points can have a say in labels, as whole cells of the lattice.
+
+Point stores keep points by these cells (:mod:`.ingest`). A store of a footprint is that of the
+whole file without the cells outside, to the byte: so nothing that is read from a cell later
+(points, heights, counts) depends on how much of the file was read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import kernel
+from ..numerics.degrees import DEGREE_M, metres_per_degree
+from .lattice import CELL_BITS, LATTICE_DEG
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+CELL_DEG = (1 << CELL_BITS) * LATTICE_DEG
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Footprint:
-    """Ground that the images see, in the coordinate system and units of the points.
+    """Cells of the lattice: ``held`` bool[rows, cols], the first of them at ``row``, ``col``."""
 
-    ``rings``: float64[n, 2] each, the corners of a polygon without holes, in either direction; a
-    point lies in the footprint if it lies in any of them and from ``lowest`` to ``highest``.
-    """
+    row: int
+    col: int
+    held: Bools
 
-    rings: tuple[Floats, ...]
-    lowest: float = -np.inf
-    highest: float = np.inf
+    @classmethod
+    def around(cls, outlines: Iterable[Floats], margin_m: float) -> Footprint:
+        """The cells that lie within a margin of convex outlines, [2, n] lon and lat (degrees).
 
-    def touches(self, low: Floats, high: Floats) -> bool:
-        """Whether a box of corners ``low`` and ``high`` [3] has a place in common with it."""
-        if high[2] < self.lowest or low[2] > self.highest:
-            return False
-        return any(_touches(ring, low[0], low[1], high[0], high[1]) for ring in self.rings)
+        Raises ValueError if there is no outline.
+        """
+        runs = []
+        for outline in outlines:
+            margin = margin_m / metres_per_degree(np.abs(outline[1]).max())
+            runs += _runs(outline, *margin.tolist())
+        return cls.of_runs(runs)
 
-    def contains(self, xyz: Floats) -> NDArray[np.bool_]:
-        """Which of the points [3, n] lie in it."""
-        inside = np.zeros(xyz.shape[1], np.bool_)
-        for ring in self.rings:
-            _mark(np.ascontiguousarray(ring, np.float64), xyz[0], xyz[1], inside)
-        return inside & (xyz[2] >= self.lowest) & (xyz[2] <= self.highest)
+    @classmethod
+    def of_runs(cls, runs: Sequence[Sequence[int]]) -> Footprint:
+        """Of runs of cells: row, first and last column each. Raises ValueError without any."""
+        table = np.array(runs, np.int64).reshape(-1, 3)
+        if not table.size:
+            raise ValueError("no cell")
+        row, col = int(table[:, 0].min()), int(table[:, 1].min())
+        shape = int(table[:, 0].max()) - row + 1, int(table[:, 2].max()) - col + 1
+        held = np.zeros(shape, np.bool_)
+        for at, first, last in table.tolist():
+            held[at - row, first - col : last - col + 1] = True
+        return cls(row, col, held)
+
+    @property
+    def runs(self) -> list[list[int]]:
+        """The cells as runs of a row: row, first and last column each."""
+        edges = np.diff(np.pad(self.held, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+        rows, first = np.nonzero(edges == 1)
+        _, behind = np.nonzero(edges == -1)
+        table = np.stack([rows + self.row, first + self.col, behind - 1 + self.col], axis=1)
+        return table.tolist()
+
+    @property
+    def area_m2(self) -> float:
+        """Ground of its cells."""
+        return float(self.held.sum(axis=1) @ self.cell_m2)
+
+    @property
+    def cell_m2(self) -> Floats:
+        """Ground of a cell of each row."""
+        lat = (self.row + np.arange(self.held.shape[0]) + 0.5) * CELL_DEG
+        return (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians(lat))
+
+    @cached_property
+    def _sums(self) -> Integers:
+        """Summed-area table of the cells."""
+        return np.pad(self.held, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+
+    def contains(self, lattice: Integers) -> Bools:
+        """Which points lie in it: lattice longitude and latitude [2 or more, n]."""
+        inside = np.empty(lattice.shape[1], np.bool_)
+        _mark(lattice, self.held, self.row, self.col, inside)
+        return inside
+
+    def touches(self, boxes: Floats) -> Bools:
+        """Which boxes [n, 4] (west, south, east, north, degrees) share a cell with it."""
+        return self._count(boxes)[0] > 0
+
+    def covers(self, boxes: Floats) -> Bools:
+        """Of which boxes [n, 4] all cells are its own."""
+        count, cells = self._count(boxes)
+        return count == cells
+
+    def beyond_m2(self, boxes: Floats) -> float:
+        """Ground of the cells of boxes [n, 4] that are not its own, each box of one row of cells.
+
+        Boxes with a cell in common count it twice.
+        """
+        count, cells = self._count(boxes)
+        lat = np.asarray(boxes)[:, 1]
+        each = (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians(lat))
+        return float((cells - count) @ each)
+
+    def box_of(self, boxes: Floats) -> tuple[Integers, Integers]:
+        """Cells of boxes: first row and column, and those behind the last, [2, n] each."""
+        at = np.floor(np.asarray(boxes, np.float64).reshape(-1, 4) / CELL_DEG)
+        at = np.clip(at, -(2**31), 2**31).astype(np.int64)
+        return at[:, [1, 0]].T, at[:, [3, 2]].T + 1
+
+    def _count(self, boxes: Floats) -> tuple[Integers, Integers]:
+        """How many cells of boxes are its own, and how many there are."""
+        first, behind = self.box_of(boxes)
+        corner, shape = np.array([[self.row], [self.col]]), np.array([self.held.shape]).T
+        low, high = (np.clip(at - corner, 0, shape) for at in (first, behind))
+        s = self._sums
+        count = s[high[0], high[1]] - s[low[0], high[1]] - s[high[0], low[1]] + s[low[0], low[1]]
+        return count, np.prod(behind - first, axis=0)
+
+
+def _runs(outline: Floats, east: float, north: float) -> list[list[int]]:
+    """Runs of the cells that a convex outline touches, widened by degrees to all sides."""
+    after = np.roll(outline, -1, axis=1)
+    rise = after[1] - outline[1]
+    slope = (after[0] - outline[0]) / np.where(rise == 0.0, np.inf, rise)
+    low, high = outline[1].min() - north, outline[1].max() + north
+    runs = []
+    for row in range(int(np.floor(low / CELL_DEG)), int(np.floor(high / CELL_DEG)) + 1):
+        south, top = row * CELL_DEG - north, (row + 1) * CELL_DEG + north
+        meets = np.minimum(outline[1], after[1]) <= top
+        meets &= np.maximum(outline[1], after[1]) >= south
+        ends = np.clip([outline[1], after[1]], south, top)
+        lon = np.where(
+            rise == 0.0, [outline[0], after[0]], outline[0] + slope * (ends - outline[1])
+        )
+        lon = lon[:, meets]
+        west, last = (lon.min() - east) / CELL_DEG, (lon.max() + east) / CELL_DEG
+        runs.append([row, int(np.floor(west)), int(np.floor(last))])
+    return runs
 
 
 @kernel
-def _mark(ring: Floats, x: Floats, y: Floats, inside: NDArray[np.bool_]) -> None:
-    """Set ``inside`` where an odd number of the ring's sides lies to the right of a point."""
-    n = ring.shape[0]
-    west, south, east, north = ring[0, 0], ring[0, 1], ring[0, 0], ring[0, 1]
-    for i in range(n):
-        west, east = min(west, ring[i, 0]), max(east, ring[i, 0])
-        south, north = min(south, ring[i, 1]), max(north, ring[i, 1])
-    for k in range(x.size):
-        if x[k] < west or x[k] > east or y[k] < south or y[k] > north:
-            continue
-        odd = False
-        j = n - 1
-        for i in range(n):
-            ax, ay, bx, by = ring[i, 0], ring[i, 1], ring[j, 0], ring[j, 1]
-            if (ay > y[k]) != (by > y[k]) and x[k] < (bx - ax) * (y[k] - ay) / (by - ay) + ax:
-                odd = not odd
-            j = i
-        inside[k] |= odd
-
-
-def _touches(ring: Floats, west: float, south: float, east: float, north: float) -> bool:
-    """Whether a polygon and a box have a point in common; their borders belong to them."""
-    x, y = ring.T
-    if x.max() < west or x.min() > east or y.max() < south or y.min() > north:
-        return False
-    if ((x >= west) & (x <= east) & (y >= south) & (y <= north)).any():
-        return True
-    inside = np.zeros(1, np.bool_)
-    corner = np.array([west]), np.array([south])
-    _mark(np.ascontiguousarray(ring, np.float64), *corner, inside)
-    return bool(inside[0]) or _sides_cross(x, y, west, south, east, north)
-
-
-def _sides_cross(
-    x: Floats, y: Floats, west: float, south: float, east: float, north: float
-) -> bool:
-    """Whether a side of a polygon crosses a box: the part of it within the box is not empty."""
-    ax, ay = np.roll(x, 1), np.roll(y, 1)
-    first, last = np.zeros(x.size), np.ones(x.size)
-    for start, step, low, high in ((ax, x - ax, west, east), (ay, y - ay, south, north)):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.sort([(low - start) / step, (high - start) / step], axis=0)
-        along = step == 0
-        within = (start >= low) & (start <= high)
-        first = np.maximum(first, np.where(along, np.where(within, 0, np.inf), t[0]))
-        last = np.minimum(last, np.where(along, np.where(within, 1, -np.inf), t[1]))
-    return bool((first <= last).any())
+def _mark(lattice: Integers, held: Bools, row: int, col: int, inside: Bools) -> None:
+    """Set ``inside`` to whether the cell of each point is held."""
+    for i in range(inside.size):
+        y, x = (lattice[1, i] >> CELL_BITS) - row, (lattice[0, i] >> CELL_BITS) - col
+        good = (y >= 0) & (x >= 0) & (y < held.shape[0]) & (x < held.shape[1])
+        inside[i] = good and held[y, x]

@@ -7,6 +7,10 @@ meridian), cells in row-major order (south to north, west to east), inside a cel
 the file. The store of a file is the same to the byte whatever the size of the reading chunks. Its
 files: see :mod:`.point_store`.
 
+Where a footprint is given, the store has the cells of it that the file has points in, each of them
+whole: it is the file's own store without the other cells, to the byte. A file may have no point
+there: its store has none, and the box of all its points.
+
 What ingest does to a point costs less than half of decoding it: kernels take the records apart,
 bring them to the lattice and sort them by cell without an intermediate copy of the points.
 """
@@ -14,22 +18,26 @@ bring them to the lattice and sort them by cell without an intermediate copy of 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
+import laspy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..job import progress
 from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
+from ..products.remote_files import size_of
 from .cell_sort import SCRATCH_POINTS, SortedRuns
-from .las_files import PointTally, read_ahead
+from .footprint import Footprint
+from .las_files import PointTally
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
-from .point_files import PointFile, open_points
+from .octree_nodes import Touches
+from .point_files import Part, PointFile, open_points
 from .point_store import ARRAYS, ATTRIBUTES, FORMAT, WORDS
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
@@ -109,17 +117,30 @@ def _bounds(low: np.ndarray, high: np.ndarray) -> list[float]:
     ]
 
 
+def touching(transform: ToWGS84, footprint: Footprint | None) -> Touches | None:
+    """Which boxes in a file's system may hold points of a footprint; None: all are wanted."""
+    return None if footprint is None else partial(_touch, transform, footprint)
+
+
+def _touch(
+    transform: ToWGS84, footprint: Footprint, low: Floats, high: Floats
+) -> NDArray[np.bool_]:
+    boxes = transform.ground_boxes(low, high)
+    unknown = ~np.isfinite(boxes).all(axis=1)
+    return footprint.touches(np.where(unknown[:, None], 0.0, boxes)) | unknown
+
+
 def ingest(
     lidar_file: str | Path,
     store: str | Path,
     *,
+    footprint: Footprint | None = None,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
+    acquired: Sequence[str] = (),
     drop_classes: Sequence[int] | None = None,
-    scene: str = "",
     provenance: Mapping[str, Any] | None = None,
     chunk_points: int = 100_000,
-    workers: int = 1,
 ) -> dict[str, Any]:
     """Bring one file of points into a point store.
 
@@ -135,22 +156,29 @@ def ingest(
     classes (65 and 67 mark artefacts in IGN's files) are kept unless listed. Coordinates: see
     :mod:`stereotruth.lidar.to_wgs84`.
     ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
-    not needed. With ``workers`` > 1 a thread decodes ahead (the result is the same).
+    not needed.
+    ``footprint``: the ground whose points are kept; of COPC (``.copc.laz``) just the nodes that
+    touch it are read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first
+    and last day (ISO) by a catalogue, for files whose points do not tell them.
 
-    Returns what is also in the store's attributes: ``points`` (header, read, kept, dropped by
-    reason), ``classes`` (kept points by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
-    degrees, h_min, h_max in m), ``crs`` and ``notes`` (remarks for the user, which are logged too).
+    Returns what is also in the store's attributes: ``points`` (header, read, outside of the
+    footprint, kept, dropped by reason), ``nodes`` of an octree (read, all), ``bytes`` (read, all),
+    ``classes`` (points read by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
+    degrees, h_min, h_max in m; of no point: where all points of the file are about), ``crs``,
+    ``footprint`` (runs of cells, or None), ``acquired`` (first and last day of all points read, and
+    what tells them; None where nothing does) and ``notes`` (remarks for the user, which are logged
+    too).
 
     Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
-    area of the coordinate system; coordinates quantised too coarsely; no point left.
+    area of the coordinate system; coordinates quantised too coarsely; all points dropped.
     """
     if drop_classes is None:
         from .settings import Settings  # a sixth of the start of a job, which knows the classes
 
         drop_classes = Settings.drop_classes
     file = Path(lidar_file)
-    points = open_points(file)
+    points = open_points(file, by_nodes=footprint is not None)
     header = points.header
 
     def transform_of(extent: Floats | None) -> ToWGS84:
@@ -158,58 +186,131 @@ def ingest(
 
     transform = transform_of(None)
     _refuse_coarse(points, transform)
+    part = points.part(touching(transform, footprint))
     with (
         atomic_folder(store) as unfinished,
         TemporaryFile(dir=unfinished.parent) as disk,
     ):
-        reading = (drop_classes, chunk_points, workers, disk)
-        tally, runs = _read(points, transform, *reading)
+        reading = (footprint, drop_classes, chunk_points, disk)
+        tally, runs = _read(points, part, transform, *reading)
         dropped = tally.dropped(drop_classes)
-        if runs.written == 0:
+        if part.points and not tally.kept and _is_whole(part, header):
             raise InputError(
                 f"no point is left of {tally.read}: {_listed(dropped)}",
                 file=file,
                 remedy="remove the file, or drop fewer classes",
             )
-        own = tally.extent(header)
+        own = _extent(points, part, tally)
         if transform.area != area_of(transform.system.horizontal, own):
             operation, transform = transform.operation, transform_of(own)
             if transform.operation != operation:  # the header's box led elsewhere
-                tally, runs = _read(points, transform, *reading)
+                part = points.part(touching(transform, footprint))
+                tally, runs = _read(points, part, transform, *reading)
         tally.refuse_quantised(file)
-        bounds = _bounds(*tally.lattice_limits)
-        notes = _notes(points, transform, tally, bounds)
+        bounds = _bounds(*tally.lattice_limits) if runs.written else _about(transform, points, own)
+        notes = _notes(points, part, transform, tally, bounds)
         cells_crc32 = runs.write(unfinished)
         summary = {
-            "points": {
-                "header": header.point_count,
-                "read": tally.read,
-                "kept": runs.written,
-                "dropped": dropped,
-            },
+            "points": _counts(tally, runs, header, dropped),
+            "nodes": part.nodes,
+            "bytes": [part.bytes, size_of(file)],
             "classes": {str(c): int(n) for c, n in enumerate(tally.counts[0]) if n},
             "bounds": bounds,
             "crs": transform.describe(),
+            "footprint": None if footprint is None else footprint.runs,
+            "acquired": _days(tally, acquired),
             "notes": notes,
         }
-        about = {"scene": scene, "source": file.name, "cells_crc32": cells_crc32}
+        about = {"source": file.name, "cells_crc32": cells_crc32}
         _write_attributes(unfinished, about, summary, dict(provenance or {}))
-    for note in notes:
-        log.warning("%s: %s", file.name, note)
-    log.info(
-        "%s: %d of %d points kept (%s); heights %.2f to %.2f m",
-        file.name,
-        runs.written,
-        tally.read,
-        _listed(dropped),
-        *bounds[4:],
-    )
-    log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
+    _tell(file, summary, transform)
     return summary
+
+
+def _counts(
+    tally: PointTally, runs: SortedRuns, header: laspy.LasHeader, dropped: Mapping[str, int]
+) -> dict[str, Any]:
+    """How many points there were, and what became of them."""
+    return {
+        "header": header.point_count,
+        "read": tally.read,
+        "outside": tally.kept - runs.written,
+        "kept": runs.written,
+        "dropped": dropped,
+    }
+
+
+def _days(tally: PointTally, stated: Sequence[str]) -> dict[str, str] | None:
+    """First and last day of a file's points, by their times, or else as a catalogue states them."""
+    if days := tally.times.days:
+        return {"start": days[0], "end": days[1], "by": "GPS time of the points"}
+    if stated:
+        return {"start": stated[0], "end": stated[-1], "by": "catalogue"}
+    return None
+
+
+def _tell(file: Path, summary: Mapping[str, Any], transform: ToWGS84) -> None:
+    """What was read and kept, in the log."""
+    for note in summary["notes"]:
+        log.warning("%s: %s", file.name, note)
+    points, nodes = summary["points"], summary["nodes"]
+    read, every = (count / 1e6 for count in summary["bytes"])
+    log.info(
+        "%s: %s%.1f of %.1f MB read, %d of %d points",
+        file.name,
+        f"{nodes[0]} of {nodes[1]} nodes, " if nodes else "",
+        read,
+        every,
+        points["read"],
+        points["header"],
+    )
+    if points["kept"]:
+        log.info(
+            "%s: %d points kept, %d outside of the footprint (%s); heights %.2f to %.2f m",
+            file.name,
+            points["kept"],
+            points["outside"],
+            _listed(points["dropped"]),
+            *summary["bounds"][4:],
+        )
+    else:
+        log.info("%s: no point lies in the footprint", file.name)
+    log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
+
+
+def _is_whole(part: Part, header: laspy.LasHeader) -> bool:
+    """Whether a part is all of a file."""
+    return part.points == header.point_count
+
+
+def _extent(points: PointFile, part: Part, tally: PointTally) -> Floats:
+    """Lowest and highest coordinates [2, 3] of the points of a file.
+
+    Of one that is read in part, those that its header states, unless points contradict them.
+    """
+    header = points.header
+    stated = np.array([header.mins, header.maxs], np.float64)
+    if not tally.read:
+        return stated
+    own = tally.extent(header)
+    slack = 2 * np.asarray(header.scales)
+    agrees = (own[0] >= stated[0] - slack).all() and (own[1] <= stated[1] + slack).all()
+    return stated if agrees and not _is_whole(part, header) else own
+
+
+def _about(transform: ToWGS84, points: PointFile, extent: Floats) -> list[float]:
+    """Bounds of a file of which no point is kept, by its lowest and highest coordinates.
+
+    Without the geoid, which need not reach there.
+    """
+    box = np.nan_to_num(transform.ground_boxes(extent[:1], extent[1:])[0])
+    heights = np.array(points.heights or (0.0, 0.0)) * transform.system.height_unit_m
+    return [*box.tolist(), *np.nan_to_num(heights).tolist()]
 
 
 def _notes(
     points: PointFile,
+    part: Part,
     transform: ToWGS84,
     tally: PointTally,
     bounds: Sequence[float],
@@ -220,8 +321,9 @@ def _notes(
     lon, lat = (bounds[0], bounds[2]), (bounds[1], bounds[3])
     remarks = (
         points.remark,
-        tally.compare_bounds(header, units_m, file),
-        tally.compare_returns(header, file),
+        part.remark,
+        tally.compare_bounds(header, units_m, file) if tally.read else None,
+        tally.compare_returns(header, file) if _is_whole(part, header) else None,
         check_area(transform.system, lon, lat, file),
     )
     notes = [*transform.notes, *filter(None, remarks)]
@@ -233,7 +335,7 @@ def _notes(
 def _write_attributes(
     store: Path, about: Mapping[str, Any], summary: Mapping[str, Any], provenance: Mapping[str, Any]
 ) -> None:
-    """The attributes of a store beside its points; ``about``: scene, source, cells_crc32."""
+    """The attributes of a store beside its points; ``about``: source, cells_crc32."""
     attrs = {
         "kind": "points",
         "format": FORMAT,
@@ -241,7 +343,6 @@ def _write_attributes(
         f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
         "row-major; the order of the file inside a cell",
         "arrays": ARRAYS,
-        "scene": about["scene"],
         "source": about["source"],
         "cell_bits": CELL_BITS,
         "cells_crc32": about["cells_crc32"],
@@ -253,31 +354,53 @@ def _write_attributes(
 
 def _read(
     points: PointFile,
+    part: Part,
     transform: ToWGS84,
+    footprint: Footprint | None,
     drop_classes: Sequence[int],
     chunk_points: int,
-    workers: int,
     disk: BinaryIO,
 ) -> tuple[PointTally, SortedRuns]:
-    """All points of a file, in runs sorted by cell; ``disk`` is scratch for them."""
+    """The points of a part that lie in a footprint, in runs sorted by cell.
+
+    ``disk`` is scratch for them.
+    """
     file, header = points.path, points.header
     disk.seek(0)
     disk.truncate()
     tally = PointTally()
-    room = min(SCRATCH_POINTS, header.point_count)
+    room = min(SCRATCH_POINTS, part.points)
     runs = SortedRuns(np.empty((room, WORDS), "<u4"), disk)
     units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
-    chunks = points.chunks(chunk_points)
-    if workers > 1:
-        chunks = read_ahead(chunks)
-    total = -(-header.point_count // chunk_points)
-    for chunk in progress(chunks, total, f"{file.name}: chunks of points read"):
+    for chunk in _bytes_read(part.chunks(chunk_points), part, file.name):
         xyz, attributes = tally.take(chunk, header, drop_classes)
         tally.compare_bounds(header, units_m, file)
-        lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
-        tally.look(lattice)
+        if footprint is None:
+            lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
+            tally.look(lattice)
+        else:
+            lattice = _to_lattice(transform, xyz, tally.lattice_limits.copy(), file)
+            tally.look(lattice)
+            inside = footprint.contains(lattice)
+            lattice, attributes = lattice[:, inside], attributes[inside]
+            tally.widen(lattice)
         runs.add(lattice, attributes)
     return tally, runs
+
+
+def _bytes_read(
+    chunks: Iterator[laspy.ScaleAwarePointRecord], part: Part, name: str
+) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """Pass chunks through and log about every tenth of the bytes."""
+    done, last = 0, -1
+    for chunk in chunks:
+        yield chunk
+        done += len(chunk)
+        tenth = done * 10 // max(part.points, 1)
+        if tenth > last:
+            last = tenth
+            read = part.bytes * done / part.points
+            log.info("%s: %.1f of %.1f MB read", name, read / 1e6, part.bytes / 1e6)
 
 
 def _listed(dropped: Mapping[str, int]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import inner, kernel
-from ..products.remote_files import open_file, size_of
+from ..products.remote_files import size_of
+from .gps_times import GpsTimes, has_days
 from .las_layout import check_layout, wrong_count
+from .range_copies import open_stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -24,6 +25,9 @@ Bytes = NDArray[np.uint8]
 
 FAR_SHARE, FAR_M = 0.1, 10.0  # of points outside of the header's bounds: see compare_bounds
 _ANEW = "fetch the file again, or have its header written anew if that is what is wrong"
+SAMPLES = 16  # points all over a file that its header's bounds are held against
+SAMPLE_BYTES = 1 << 16  # that are read at once for them
+LAZ_CHUNK = 50_000  # points of a chunk, as all software writes it
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
 
 
@@ -60,7 +64,7 @@ def read_header(file: str | Path) -> laspy.LasHeader:
                 remedy="check or replace the file",
             )
         ),
-        open_file(file) as stream,
+        open_stream(file) as stream,
     ):
         header = laspy.LasHeader.read_from(stream, read_evlrs=True)
     by_return = sum(map(int, header.number_of_points_by_return))
@@ -90,7 +94,7 @@ def read_chunks(
     fields = laspy.DecompressionSelection
     done = 0
     with (
-        open_file(file) as stream,
+        open_stream(file) as stream,
         laspy.open(
             stream,
             closefd=False,
@@ -99,7 +103,8 @@ def read_chunks(
             decompression_selection=fields.XY_RETURNS_CHANNEL
             | fields.Z
             | fields.CLASSIFICATION
-            | fields.FLAGS,
+            | fields.FLAGS
+            | (fields.GPS_TIME if has_days(header) else fields(0)),
         ) as reader,
     ):
         while done < header.point_count:
@@ -113,13 +118,28 @@ def read_chunks(
             yield points
 
 
-def read_ahead(items: Iterator) -> Iterator:
-    """The same items, each made in a thread while the one before is in use."""
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(next, items, None)
-        while (item := coming.result()) is not None:
-            coming = pool.submit(next, items, None)
-            yield item
+def is_outside_sampled(file: Path, header: laspy.LasHeader) -> bool:
+    """Whether one of some points all over the file lies outside of the header's bounds.
+
+    They are the first ones of chunks, so that little is decoded.
+    """
+    low, high = np.asarray(header.mins), np.asarray(header.maxs)
+    slack = 2 * np.asarray(header.scales)
+    places = np.linspace(0, header.point_count, SAMPLES, endpoint=False).astype(np.int64)
+    with (
+        _decoding(lambda e: wrong_count(file, header.point_count, "decoding failed", e)),
+        open_stream(file, SAMPLE_BYTES) as stream,
+        laspy.open(
+            stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False
+        ) as reader,
+    ):
+        for place in np.unique(places // LAZ_CHUNK * LAZ_CHUNK).tolist():
+            reader.seek(place)
+            point = reader.read_points(1)
+            xyz = np.stack([np.asarray(point[axis]) for axis in "xyz"], axis=1)
+            if ((xyz < low - slack) | (xyz > high + slack)).any():
+                return True
+    return False
 
 
 def _no_limits() -> np.ndarray:
@@ -136,6 +156,7 @@ class PointTally:
     lattice_limits: Integers = field(default_factory=_no_limits)  # [2, 3], kept points
     sample: list[np.ndarray] = field(default_factory=list)
     sampled: int = 0
+    times: GpsTimes = field(default_factory=GpsTimes)  # of all points, where they tell the day
 
     def take(
         self,
@@ -144,6 +165,8 @@ class PointTally:
         drop_classes: Sequence[int],
     ) -> tuple[Floats, NDArray[np.uint32]]:
         """Coordinates [3, n] and attributes [n], see _unpack, of the points to keep."""
+        if has_days(header):
+            self.times.add(points)
         unwanted = np.isin(np.arange(256), drop_classes)
         raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
         xyz, attributes = np.empty((3, len(points))), np.empty(len(points), np.uint32)
@@ -165,6 +188,18 @@ class PointTally:
     def read(self) -> int:
         """Points read, dropped ones included."""
         return int(self.counts.sum())
+
+    @property
+    def kept(self) -> int:
+        """Points read that were not dropped."""
+        return int(self.counts[0].sum())
+
+    def widen(self, lattice: Integers) -> None:
+        """Widen ``lattice_limits`` by points [3, n]."""
+        if lattice.size:
+            low, high = self.lattice_limits
+            self.lattice_limits[0] = np.minimum(low, lattice.min(axis=1))
+            self.lattice_limits[1] = np.maximum(high, lattice.max(axis=1))
 
     def extent(self, header: laspy.LasHeader) -> Floats:
         """Lowest and highest x, y, z of all points, [2, 3]."""
@@ -227,6 +262,8 @@ class PointTally:
 
     def refuse_quantised(self, file: Path) -> None:
         """InputError if the file's first points share few positions."""
+        if not self.sample:
+            return
         sample = np.sort(np.concatenate(self.sample))  # np.unique takes ten times as long
         positions = 1 + np.count_nonzero(np.diff(sample))
         if len(sample) >= 1000 and positions < 0.1 * len(sample):

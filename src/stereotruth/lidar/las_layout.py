@@ -17,7 +17,8 @@ import lazrs
 import numpy as np
 
 from ..errors import InputError
-from ..products.remote_files import open_file, size_of
+from ..products.remote_files import size_of
+from .range_copies import open_stream
 
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point data record format
@@ -227,7 +228,7 @@ def check_layout(file: Path) -> Layout:
     """
     size = size_of(file)
     try:
-        with open_file(file) as stream:
+        with open_stream(file) as stream:
             layout = Layout.of(stream, size)
             room = size - layout.first_point
             records = _records(

@@ -5,25 +5,27 @@ points of a footprint follows from the octree's own cube, never from the header'
 writers get wrong. Before any point is read, the counts of all nodes of the hierarchy must add up to
 the header's count. While points are read, each node must hold as many as the hierarchy says, all of
 them within the node's cube: else other nodes may hold points of the footprint too, and the file is
-refused. One fault cannot be told without reading all: a hierarchy that gives the points of a node
-to a smaller one inside it, outside of the footprint, and the other way round. Source: COPC 1.0
+refused. Where all points of a node lie in the cube of one below it, the hierarchy may have
+exchanged the two: the other is read as well, and must keep to its own cube. Source: COPC 1.0
 (Hobu), "Hierarchy".
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import laspy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, in_number
-from .footprint import Footprint
 
 Floats = NDArray[np.float64]
+Touches = Callable[[Floats, Floats], NDArray[np.bool_]]
+"""Which boxes, by lowest and highest corners [n, 3], may hold points that are wanted."""
 
 MOST_LEVELS = 30  # keys of nodes stay within 32 bits
 MOST_NODES = 4_000_000  # of a hierarchy, which is kept in memory
@@ -50,7 +52,6 @@ class NodePlan:
     of the finest) are read to prove the octree's cube. None are read where none is touched.
     """
 
-    footprint: Footprint | None
     nodes: tuple[Node, ...]
     touched: int
 
@@ -84,59 +85,84 @@ class Octree(ABC):
         """Points of the whole, by its header."""
         return int(self.header.point_count)
 
-    def box(self, node: Node) -> tuple[Floats, Floats]:
-        """Lowest and highest corner [3] of a node's cube, with what rounding may add to it."""
-        side = self.side / 2 ** node.key[0]
-        low = self.low + np.array(node.key[1:], np.float64) * side
+    def boxes(self, nodes: Sequence[Node]) -> tuple[Floats, Floats]:
+        """Lowest and highest corners [n, 3] of nodes' cubes, with what rounding may add to them."""
+        keys = np.array([node.key for node in nodes], np.float64).reshape(-1, 4)
+        side = self.side / 2.0 ** keys[:, :1]
+        low = self.low + keys[:, 1:] * side
         slack = STEPS_OUTSIDE * np.asarray(self.header.scales)
         return low - slack, low + side + slack
 
-    def plan(self, footprint: Footprint | None) -> NodePlan:
-        """The nodes to read for a footprint in the octree's own system; all of them for None.
+    def plan(self, touches: Touches | None) -> NodePlan:
+        """The nodes to read for a footprint; all of them for None.
 
         Raises InputError if the header's bounds and the octree's cube contradict each other about
         whether there are points in the footprint.
         """
-        if footprint is None:
-            return NodePlan(None, self.nodes, len(self.nodes))
-        touched = [node for node in self.nodes if footprint.touches(*self.box(node))]
+        if touches is None:
+            return NodePlan(self.nodes, len(self.nodes))
+        which = touches(*self.boxes(self.nodes))
+        touched = [node for node, wanted in zip(self.nodes, which.tolist()) if wanted]
         if not touched:
-            mins, maxs = np.asarray(self.header.mins), np.asarray(self.header.maxs)
-            if np.isfinite([mins, maxs]).all() and footprint.touches(mins, maxs):
-                high = self.low + self.side
-                beyond = (mins < self.low) | (maxs > high)
-                if beyond.any():
-                    raise self._refusal(
-                        "the header's bounds reach out of the octree's cube, into the footprint"
-                    )
-            return NodePlan(footprint, (), 0)
+            bounds = np.array([[self.header.mins], [self.header.maxs]])
+            beyond = (bounds[0, 0] < self.low) | (bounds[1, 0] > self.low + self.side)
+            if np.isfinite(bounds).all() and beyond.any() and touches(*bounds)[0]:
+                raise self._refusal(
+                    "the header's bounds reach out of the octree's cube, into the footprint"
+                )
+            return NodePlan((), 0)
         deepest = max(node.key[0] for node in self.nodes)
         chosen = {node.key for node in touched}
         if max(node.key[0] for node in touched) < deepest:
             chosen.add(next(node.key for node in self.nodes if node.key[0] == deepest))
         chosen.add(min(self.nodes, key=lambda node: node.key).key)
         nodes = tuple(node for node in self.nodes if node.key in chosen)
-        return NodePlan(footprint, nodes, len(touched))
+        return NodePlan(nodes, len(touched))
 
-    def read(
-        self, plan: NodePlan, progress: Callable[[int], None] | None = None
-    ) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Points in the plan's footprint, node by node in the order of the file.
+    def read(self, plan: NodePlan) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """All points of the plan's nodes, node by node in the order of the file.
 
-        Of each point X, Y, Z, returns, class, flags and GPS time are decoded. ``progress`` is
-        called with the points that each node held. The order is the same whatever the footprint.
+        Of each point X, Y, Z, returns, class, flags and GPS time are decoded.
 
         Raises InputError: a node of other points than the hierarchy says, or points out of its
         cube; what a server or a damaged file fails with.
         """
+        by_key = {node.key: node for node in self.nodes}
+        doubted: dict[tuple[int, int, int, int], Node] = {}
         for node, points in zip(plan.nodes, self._decoded(plan.nodes), strict=True):
             xyz = self._checked(node, points)
-            if progress is not None:
-                progress(node.points)
-            if plan.footprint is None:
-                yield points
-            elif (inside := plan.footprint.contains(xyz)).any():
-                yield points[inside]
+            doubted |= self._below(node, xyz, by_key)
+            yield points
+        looked = {node.key for node in plan.nodes}
+        while others := [node for key, node in doubted.items() if key not in looked]:
+            looked |= {node.key for node in others}
+            for node, points in zip(others, self._decoded(others), strict=True):
+                doubted |= self._below(node, self._checked(node, points), by_key)
+
+    def _below(
+        self,
+        node: Node,
+        xyz: Floats,
+        by_key: Mapping[tuple[int, int, int, int], Node],
+    ) -> dict[tuple[int, int, int, int], Node]:
+        """The nodes below one whose cube holds all of its points."""
+        low, high = xyz.min(axis=1) - self.low, xyz.max(axis=1) - self.low
+        slack = np.minimum(STEPS_OUTSIDE * np.asarray(self.header.scales), (high - low) / 2)
+        low, high = low + slack, high - slack  # a point on a face may be either node's
+        inside = {}
+        for level in range(node.key[0] + 1, self._deepest + 1):
+            side = self.side / 2.0**level
+            first, last = np.floor(low / side), np.floor(high / side)
+            if (first != last).any():
+                break
+            key = (level, *map(int, first))
+            if key in by_key:
+                inside[key] = by_key[key]
+        return inside
+
+    @cached_property
+    def _deepest(self) -> int:
+        return max(node.key[0] for node in self.nodes)
 
     def _checked(self, node: Node, points: laspy.ScaleAwarePointRecord) -> Floats:
         """Coordinates [3, n] of a node's points, all of which lie in its cube."""
@@ -147,8 +173,8 @@ class Octree(ABC):
         stored = np.stack([points.array[axis] for axis in "XYZ"]).astype(np.float64)
         scales, offsets = np.asarray(self.header.scales), np.asarray(self.header.offsets)
         xyz = stored * scales[:, None] + offsets[:, None]
-        low, high = self.box(node)
-        outside = ((xyz < low[:, None]) | (xyz > high[:, None])).any(axis=0)
+        low, high = (corner[0, :, None] for corner in self.boxes([node]))
+        outside = ((xyz < low) | (xyz > high)).any(axis=0)
         if outside.any():
             raise self._refusal(
                 f"{in_number(int(outside.sum()), 'point')} of node {_shown(node)} "

@@ -1,16 +1,43 @@
-"""A file of points, whatever its format: LAS, LAZ, COPC, or a surface model as a raster."""
+"""A file of points, whatever its format: LAS, LAZ, COPC, or a surface model as a raster.
+
+Of a file, that part is read which may hold points of a footprint. Of an octree, these are nodes. Of
+other files it is all or nothing: nothing where the header's bounds miss the footprint. LAS headers
+are written by software that errs, so that they are held against some points all over the file: if
+one of these lies outside, the header counts for nothing, and the file is read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import laspy
+import numpy as np
 
+from ..products.remote_files import size_of
 from . import las_files
+from .octree import open_octree
+from .octree_nodes import Touches
 
+OCTREE, EPT = ".copc.laz", "ept.json"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # of TIFF 6.0 and of BigTIFF
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is read of a file: ``points``, and their ``bytes`` in the file, by ``chunks``.
+
+    ``chunks(size)``: the points in the order of the file, about ``size`` at a time. ``nodes``: how
+    many of an octree's nodes are read, and how many there are. ``remark`` for the user.
+    """
+
+    points: int
+    bytes: int
+    chunks: Callable[[int], Iterator[laspy.ScaleAwarePointRecord]]
+    nodes: tuple[int, int] | None = None
+    remark: str | None = None
 
 
 class PointFile:
@@ -45,6 +72,52 @@ class PointFile:
     def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
         """All points in the order of the file, about ``size`` at a time."""
         return las_files.read_chunks(self.path, self.header, size)
+
+    def part(self, touches: Touches | None) -> Part:
+        """What is to be read for a footprint; all of it for None."""
+        whole = Part(int(self.header.point_count), size_of(self.path), self.chunks)
+        if touches is None:
+            return whole
+        bounds = np.array([[self.header.mins], [self.header.maxs]], np.float64)
+        bounds = np.where(
+            np.isnan(bounds), 0.0, bounds
+        )  # heights of rasters, which only cells tell
+        if not np.isfinite(bounds).all() or not np.ptp(bounds[:, 0, :2], axis=0).any():
+            return whole  # never filled in
+        if (bounds[1, 0] < bounds[0, 0]).any() or touches(*bounds)[0]:
+            return whole
+        if self._contradicts_bounds():
+            remark = (
+                "points lie outside of its header's bounds, which count for nothing: all are read"
+            )
+            return Part(whole.points, whole.bytes, whole.chunks, remark=remark)
+        return Part(0, 0, lambda _: iter(()))
+
+    def _contradicts_bounds(self) -> bool:
+        """Whether points lie outside of the header's bounds."""
+        return las_files.is_outside_sampled(self.path, self.header)
+
+
+class OctreeFile(PointFile):
+    """A COPC file, or EPT, of which nodes are read; see :mod:`.octree_nodes`."""
+
+    def _header(self) -> laspy.LasHeader:
+        self.octree = open_octree(self.path)
+        return self.octree.header
+
+    @property
+    def remark(self) -> None:
+        """Nothing."""
+
+    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """All points node by node, whatever the size."""
+        return self.octree.read(self.octree.plan(None))
+
+    def part(self, touches: Touches | None) -> Part:
+        """The nodes that touch a footprint."""
+        plan = self.octree.plan(touches)
+        nodes = len(plan.nodes), len(self.octree.nodes)
+        return Part(plan.points, plan.bytes, lambda _: self.octree.read(plan), nodes)
 
 
 class RasterFile(PointFile):
@@ -82,10 +155,21 @@ class RasterFile(PointFile):
 
         return read_cells(self.path, self.header)
 
+    def _contradicts_bounds(self) -> bool:
+        """No: they follow from the places of the cells."""
+        return False
 
-def open_points(path: str | Path) -> PointFile:
-    """The file by its first bytes. Raises InputError if it cannot be read."""
+
+def open_points(path: str | Path, *, by_nodes: bool = False) -> PointFile:
+    """The file by its first bytes. Raises InputError if it cannot be read.
+
+    ``by_nodes``: a file that is named ``.copc.laz`` is opened as an octree; else as any LAZ, whole.
+    ``ept.json`` always is one.
+    """
     path = Path(path)
+    name = path.name.lower()
+    if name == EPT or (by_nodes and name.endswith(OCTREE)):
+        return OctreeFile(path)
     first = b""
     with suppress(OSError), path.open("rb") as stream:  # which the reader names
         first = stream.read(4)

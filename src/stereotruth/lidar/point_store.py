@@ -41,6 +41,7 @@ from ..errors import InputError
 from ..kernels import kernel
 from ..products.files import read_json
 from ..products.provenance import own_digest
+from .footprint import Footprint
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
@@ -180,7 +181,7 @@ class PointStore:
         self._crc32 = cells["crc32"].tolist()
         self._start = np.append(cells["first"], self.count)
         self._key = cell_key(self.cell_row, self.cell_col)
-        self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=self.cell_row[0] - 1))
+        self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=-(1 << 40)))
         self._offset = self._first_byte()
 
     def _attributes(self) -> dict[str, Any]:
@@ -234,6 +235,12 @@ class PointStore:
             file=self.path / name,
             remedy=f"delete {self.path} and run the workflow again",
         )
+
+    @cached_property
+    def footprint(self) -> Footprint | None:
+        """The ground whose points it has; None: all of its file."""
+        runs = self.attrs.get("footprint")
+        return None if runs is None else Footprint.of_runs(runs)
 
     @property
     def cell_counts(self) -> Integers:
@@ -327,12 +334,15 @@ def _datum_and_operation(store: PointStore) -> tuple[str, str]:
 
 
 def open_stores(paths: Iterable[str | Path]) -> tuple[PointStore, ...]:
-    """The point stores of one scene, in the order given.
+    """The point stores of one scene, in the order given, but for those without a point.
+
+    All of them, if none has a point: their bounds say where the points of their files are.
 
     Raises InputError, besides what PointStore raises, if two files of one datum were brought to
     WGS 84 by different transformations: a step of up to metres would run through the scene.
     """
-    stores = tuple(PointStore(path) for path in paths)
+    every = tuple(PointStore(path) for path in paths)
+    stores = tuple(store for store in every if store.count) or every
     first: dict[str, tuple[str, PointStore]] = {}
     for store in stores:
         datum, operation = _datum_and_operation(store)

@@ -19,12 +19,19 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 from threading import Lock
 from typing import Any
-from urllib.parse import SplitResult, urljoin, urlsplit
 
 import urllib3
 
 from ..errors import InputError, without_secrets
-from ..products.remote_files import ABSENT, WEB, is_remote, size_of, url_of
+from ..products.remote_files import size_of
+from ..products.web_requests import (
+    ABSENT,
+    MOST_REDIRECTS,
+    REDIRECTS,
+    redirected,
+    refusal,
+    web_parts,
+)
 
 Range = tuple[int, int]  # first byte, and the one behind the last
 
@@ -36,9 +43,7 @@ STALL_SHARE = 0.1  # of the patience: so long without a byte, and the request is
 FIRST_WAIT_S = 0.5  # before the second try; doubled for each other
 MOST_WAIT_S = 30.0  # where the server asks for no certain time
 MOST_TRIES = 8
-MOST_REDIRECTS = 5
 BUSY = (408, 429, 500, 502, 503, 504)
-REDIRECTS = (301, 302, 303, 307, 308)
 PIECE_BYTES = 1 << 16
 _AGAIN = "try again later, or download the file and name the copy"
 
@@ -52,10 +57,14 @@ class _Again(Exception):
 
 
 class Ranges(ABC):
-    """A file of which parts are read. ``name``: path or URL without secrets; ``size`` in bytes."""
+    """A file of which parts are read. ``name``: path or URL without secrets; ``size`` in bytes.
+
+    ``content``: what its server calls its content (ETag, or time of the last change); may be empty.
+    """
 
     name: str
     size: int
+    content: str = ""
 
     def get(self, start: int, end: int) -> bytes:
         """Bytes ``start`` to ``end``, the latter excluded. Raises InputError if there are less."""
@@ -147,11 +156,11 @@ class WebRanges(Ranges):
         head_bytes: int = 1 << 14,
     ) -> None:
         self.name, self._url = without_secrets(url), url
-        self._hosts = allow_hosts | {str(_parts(url, url).hostname)}
+        self._hosts = allow_hosts
+        web_parts(url, url)
         self._patience_s, self._stall_s = patience_s, STALL_SHARE * patience_s
         self._pool = urllib3.PoolManager(maxsize=AT_ONCE, retries=False)
         self._lock, self._not_before = Lock(), 0.0
-        self._content: str | None = None  # ETag or time of the last change
         self.size = -1
         self._head = self._get(0, head_bytes)
 
@@ -204,25 +213,10 @@ class WebRanges(Ranges):
             try:
                 if answer.status not in REDIRECTS:
                     return self._taken(answer, start, end, give_up)
-                url = self._next(url, answer.headers.get("Location"))
+                url = redirected(url, answer.headers.get("Location"), self._url, self._hosts)
             finally:
                 answer.close()
         raise self._refusal(f"it redirects more than {MOST_REDIRECTS} times", "check the URL")
-
-    def _next(self, url: str, location: str | None) -> str:
-        """Where a redirect leads to, if it may."""
-        if not location:
-            raise self._refusal("it redirects to nowhere", "check the URL")
-        target = urljoin(url, location)
-        old, new = urlsplit(url), _parts(target, self._url)
-        if new.scheme not in (old.scheme, "https"):
-            raise self._refusal("it redirects to another scheme", "name the file's own URL")
-        if new.hostname not in self._hosts:
-            raise self._refusal(
-                f"it redirects to another host, {new.hostname}",
-                f"allow it by --allow-host {new.hostname} if you trust it",
-            )
-        return target
 
     def _taken(self, answer: Any, start: int, end: int, give_up: float) -> bytes:
         """The body of an answer that is what was asked for."""
@@ -257,8 +251,8 @@ class WebRanges(Ranges):
         content = headers.get("ETag") or headers.get("Last-Modified") or ""
         with self._lock:
             if self.size < 0:
-                self.size, self._content = size, content
-        if (size, content) != (self.size, self._content):
+                self.size, self.content = size, content
+        if (size, content) != (self.size, self.content):
             raise self._changed()
 
     def _body(self, answer: Any, length: int, give_up: float) -> bytes:
@@ -284,25 +278,7 @@ class WebRanges(Ranges):
         )
 
     def _refusal(self, problem: str, remedy: str) -> InputError:
-        return InputError(
-            f"its server does not answer as it should: {problem}", file=self.name, remedy=remedy
-        )
-
-
-def _parts(url: str, asked: str) -> SplitResult:
-    """Of a URL of a web server; ``asked`` is the user's, which a message may name."""
-    try:
-        parts = urlsplit(url)
-        good = parts.scheme in WEB and bool(parts.hostname) and (parts.port or 1) > 0
-    except ValueError:
-        good = False
-    if not good:
-        raise InputError(
-            "leads to what is no file of a web server",
-            file=asked,
-            remedy="name a file by http:// or https://",
-        )
-    return parts
+        return refusal(self._url, problem, remedy)
 
 
 def _asked_wait(text: str | None) -> float | None:
@@ -329,9 +305,3 @@ def _content_range(text: str | None) -> tuple[int, int, int]:
     if unit != "bytes" or not 0 <= found[0] <= found[1] < found[2]:
         raise _Again("it does not say which bytes it sends")
     return found
-
-
-def open_ranges(location: str | Path, **how: Any) -> Ranges:
-    """A path, a URL of a web server, or the stand-in of one; see :class:`WebRanges` for ``how``."""
-    url = str(location) if is_remote(str(location)) else url_of(location)
-    return LocalRanges(Path(location)) if url is None else WebRanges(url, **how)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from ..settings import Unit, Whole, each_once, settings
+from ..settings import Number, Unit, Whole, each_once, settings
 
 
 @settings
@@ -19,3 +19,11 @@ class Settings:
         Unit("LAS classes"),
     ] = (7, 18)
     """points left out; 7 and 18 are noise, IGN files use 65 for artefacts"""
+
+    margin_m: Annotated[Annotated[Number, Field(ge=0)] | None, Unit("m")] = 200
+    """around the ground that a pair shows by its RPCs: points farther away are not read (of COPC),
+    or not kept; null: all points of all files"""
+
+    copies_gb: Annotated[Annotated[Number, Field(ge=0)], Unit("GB")] = 20
+    """parts of LiDAR files from web servers and buckets that are kept in `results/copies`, so that
+    a run that is made again reads nothing; 0: none"""

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..numerics.degrees import DEGREE_M
-from .ingest import _bounds, _refuse_coarse, _to_lattice
+from ..products.remote_files import size_of
+from .footprint import Footprint
+from .ingest import _bounds, _refuse_coarse, _to_lattice, touching
 from .point_files import open_points
 from .to_wgs84 import check_area, to_wgs84
 
@@ -22,6 +24,7 @@ class SurveyedFile:
     ``box``: lon_min, lat_min, lon_max, lat_max (degrees) and ``heights`` lowest and highest
     (ellipsoidal m) of its points, None where the header states no bounds. ``system`` names the
     coordinate system, ``surface`` what the heights count from; ``notes`` are remarks for the user.
+    ``read``: points and bytes that a run reads of it, of ``points`` and ``bytes``.
     """
 
     path: Path
@@ -31,6 +34,8 @@ class SurveyedFile:
     system: str
     surface: str
     notes: tuple[str, ...]
+    bytes: int
+    read: tuple[int, int]
 
     @property
     def area_m2(self) -> float:
@@ -43,20 +48,27 @@ class SurveyedFile:
 
 
 def survey(
-    file: str | Path, *, lidar_crs: str | None = None, geoid: str | Path | None = None
+    file: str | Path,
+    *,
+    footprint: Footprint | None = None,
+    lidar_crs: str | None = None,
+    geoid: str | Path | None = None,
 ) -> SurveyedFile:
     """A LiDAR file as :func:`.ingest.ingest` will take it, from its header and layout alone.
+
+    Of an octree that is read by a footprint, the hierarchy is read as well.
 
     Raises the InputErrors of ingest that need no points: missing, truncated or no LAS; no usable
     coordinate system; orthometric heights without a geoid; bounds off the geoid grid, off the Earth
     or far outside the area of the system; coordinates quantised too coarsely.
     """
     file = Path(file)
-    points = open_points(file)
+    points = open_points(file, by_nodes=footprint is not None)
     header = points.header
     transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
     _refuse_coarse(points, transform)
-    notes = list(transform.notes)
+    part = points.part(touching(transform, footprint))
+    notes = [*transform.notes, *([part.remark] if part.remark else [])]
     if remark := points.remark:
         notes.append(remark)
     low, high = points.heights or (np.nan, np.nan)
@@ -81,4 +93,6 @@ def survey(
         system=transform.system.name,
         surface=transform.heights,
         notes=tuple(notes),
+        bytes=size_of(file),
+        read=(part.points, part.bytes),
     )

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from .geoid import GeoidGrid
 
 WGS84_3D = "EPSG:4979"
+BOX_SAMPLES = 3  # along each side of a box
+BOX_SLACK = 0.05  # of the sides of a box in degrees
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,25 @@ class ToWGS84:
             height[good] = base[good] + self._geoid(lon[good], lat[good])
         return lon, lat, height
 
+    def ground_boxes(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """West, south, east, north (degrees) [n, 4] around boxes of corners [n, 2 or more].
+
+        They lie around the ground of the boxes: the sides of a box of 100 km bend by less than
+        BOX_SLACK of it. NaN where PROJ cannot transform a box.
+        """
+        share = np.linspace(0.0, 1.0, BOX_SAMPLES)
+        ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
+        x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
+        exact = self._transform
+        if isinstance(exact, PatchedTransform):
+            exact = exact.exact
+        lon, lat, _ = exact(x, y, np.zeros(x.size))
+        places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
+        places[~np.isfinite(places)] = np.nan
+        first, last = places.min(axis=1), places.max(axis=1)
+        slack = BOX_SLACK * (last - first)
+        return np.hstack([first - slack, last + slack])
+
     def describe(self) -> dict[str, object]:
         """Record for the attributes of a product."""
         horizontal = self.system.horizontal
@@ -96,6 +117,11 @@ class ToWGS84:
             "accuracy_m": self.accuracy_m,
             "geoid": None if self._geoid is None else self._geoid.path.name,
         }
+
+
+def _crossed(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places [n, k, 1] and [n, 1, k] of values [n, k] along both axes."""
+    return x[:, :, None], y[:, None, :]
 
 
 def _best_operation(

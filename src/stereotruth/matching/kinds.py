@@ -23,9 +23,12 @@ from ..settings import PATTERN
 from .imported_files import imported_files
 
 FOLDER = "folder"
-TOLD = ("label", "fine_tuned_of", "licence", "version")  # keys of an entry that change no result
+# keys of an entry that change no result
+TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on")
 MOVED = ("polarity", "outside")  # of any kind
 ENTRY_POINTS = "stereotruth.methods"
+MCCNN = "mccnn"  # the pipeline of Pandora that has this name in the place of a file
+MCCNN_MODULES = ("mc_cnn", "pandora_plugin_mc_cnn", "torch")
 Files = Callable[[Mapping[str, Any]], list[Path]]
 
 
@@ -37,7 +40,16 @@ def _weights(settings: Mapping[str, Any]) -> list[Path]:
     return [Path(settings["weights"])] if settings.get("weights") else []
 
 
+def mccnn_weights() -> list[Path]:
+    """MC-CNN's weights of the Data Fusion Contest in its installed package; none without it."""
+    spec = find_spec(MCCNN_MODULES[0])
+    folders = (spec and spec.submodule_search_locations) or ()
+    return [Path(at) / "weights" / "mc_cnn_fast_data_fusion_contest.pt" for at in folders][:1]
+
+
 def _pipeline(settings: Mapping[str, Any]) -> list[Path]:
+    if settings.get("pipeline") == MCCNN:
+        return mccnn_weights()
     return [Path(settings["pipeline"])] if settings.get("pipeline") else []
 
 
@@ -175,6 +187,7 @@ KINDS = {
     "stereonet": _network("StereoNet", "stereonet:StereoNet"),
     "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
     "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
+    "densemapnet": _network("DenseMapNet", "densemapnet:DenseMapNet"),
     "function": Kind(
         module="matching.user_function",
         settings=("function", "options", "margin_px"),

@@ -20,8 +20,8 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
     """The method of a configuration entry; ``workers`` are the threads that it may use.
 
     ``label`` (how tables call the method), ``fine_tuned_of`` (the method whose training was
-    carried on), ``licence`` and ``version`` are no settings; ``polarity`` and ``outside`` are those
-    of any kind (:mod:`polarity`).
+    carried on), ``licence``, ``version`` and ``trained_on`` are no settings; ``polarity`` and
+    ``outside`` are those of any kind (:mod:`polarity`).
 
     Raises InputError for an unknown kind, a function that cannot be found, and settings that the
     method does not take or lacks.

@@ -5,6 +5,11 @@ counts; without one, :data:`PIPELINE` is taken: census of 5 × 5 px, libsgm's ei
 disparities by V-fit, a median of 5 × 5 px and the left-right check. Its penalties and filter are
 those that did best on parts of three training tiles of synthetic cities.
 
+``pipeline: mccnn`` has the costs of CNES's MC-CNN (fast; Apache-2.0) in the place of census:
+features of windows of 11 × 11 px, compared by their cosine. The network learned them on the Data
+Fusion Contest; its weights come with the package ``MCCNN``. The penalties are 2.3 and 55.9, as
+published for the fast network (Žbontar & LeCun, JMLR 2016). All other steps are as above.
+
 Pandora's disparity is x_right − x_left: it searches (−high, −low], and its result changes sign.
 Pixels that its validity mask calls invalid are NaN.
 
@@ -28,6 +33,7 @@ import gc
 import json
 import logging
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +49,7 @@ from pandora.state_machine import PandoraMachine
 from scipy.special import ndtri
 
 from ..errors import InputError
+from .kinds import MCCNN, MCCNN_MODULES, mccnn_weights
 from .matcher import DisparityRange, UncertainMatcher, called
 
 MARGIN_PX = 128  # as OpenCV's SGM
@@ -60,21 +67,24 @@ PIPELINE = {
     "filter": {"filter_method": "median", "filter_size": 5},
     "validation": {"validation_method": "cross_checking_fast"},
 }
+MCCNN_COST = {"matching_cost_method": "mc_cnn", "window_size": 11, "subpix": 1}
+MCCNN_PENALTY = {"penalty_method": "sgm_penalty", "P1": 2.3, "P2": 55.9}
 
 
 class PandoraMethod(UncertainMatcher):
     """A pipeline of Pandora as a Matcher; see the module.
 
-    ``pipeline``: a JSON file of Pandora's; None: :data:`PIPELINE`.
+    ``pipeline``: a JSON file of Pandora's; ``mccnn``: with MC-CNN's costs; None: :data:`PIPELINE`.
 
-    Raises InputError if the file cannot be read, or Pandora does not take its pipeline.
+    Raises InputError if the file cannot be read, Pandora does not take its pipeline, or what
+    ``mccnn`` needs is not installed.
     """
 
     margin_px = MARGIN_PX
     invalid_outside = True  # what matches outside the right image has no disparity
 
     def __init__(self, *, name: str, pipeline: str | None = None) -> None:
-        steps = PIPELINE if pipeline is None else _read(Path(pipeline))
+        steps = _steps_of(pipeline)
         logging.getLogger("transitions").setLevel(logging.ERROR)
         pandora.import_plugin()
         self._name, self._steps = name, steps
@@ -126,6 +136,23 @@ class PandoraMethod(UncertainMatcher):
         disparity[~valid] = np.nan
         sigma = _uncertainty(found, steps["pipeline"])
         return disparity, None if sigma is None else np.where(valid, sigma, np.float32(np.nan))
+
+
+def _steps_of(pipeline: str | None) -> dict[str, Any]:
+    """The steps of a pipeline, by its name or its file."""
+    if pipeline is None:
+        return PIPELINE
+    if pipeline != MCCNN:
+        return _read(Path(pipeline))
+    if missing := [name for name in MCCNN_MODULES if not find_spec(name)]:
+        raise InputError(
+            f"pipeline mccnn needs {', '.join(missing)}, which is not installed",
+            remedy="pip install '.[mccnn]'",
+        )
+    (weights,) = mccnn_weights()
+    optimization = {**PIPELINE["optimization"], "penalty": MCCNN_PENALTY}
+    cost = {**MCCNN_COST, "model_path": str(weights)}
+    return {**PIPELINE, "matching_cost": cost, "optimization": optimization}
 
 
 def _read(file: Path) -> dict[str, Any]:

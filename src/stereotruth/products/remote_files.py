@@ -4,14 +4,16 @@ A file that a scene's row names by its URL is never fetched as a whole. A stand-
 in the working directory, ``results/remote/<scheme>/<host or bucket>/<path>``: its size and what the
 server calls its content (ETag; where there is none, the time of its last change). The stages get
 the stand-in's path, so that digests, records and reruns follow from what stands in it, and open
-what it stands for: images through GDAL's ``/vsis3`` and ``/vsicurl``, LiDAR through fsspec. Small
-files (RPCs, control points) are fetched.
+what it stands for: images through GDAL's ``/vsis3`` and ``/vsicurl``, LiDAR of buckets through
+fsspec, of web servers by :mod:`.web_requests`. Small files (RPCs, control points) are fetched.
 
-Nothing but what stands in that folder is read from a network, whatever a file contains.
+Nothing but what stands in that folder is read from a network, whatever a file contains; the hosts
+that a web server may redirect to beside its own stand there, too.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -23,14 +25,13 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from ..errors import InputError
+from .web_requests import WEB, WebStream, info_of, read_whole, too_large
 
 FOLDER = Path("results", "remote")
-WEB = ("http", "https")
 SCHEMES = ("s3", *WEB)
 MAX_COPY_BYTES = 10_000_000  # of a file that is fetched; RPCs and control points have some kB
 LONGEST_PART = 200  # bytes between slashes, of which stand-ins have their names
-CLIENTS = ("aiohttp", "aiobotocore", "botocore", "fsspec", "s3fs")  # whose errors are a server's
-ABSENT = (404, 410)  # what web servers answer where there is no file
+CLIENTS = ("aiobotocore", "botocore", "fsspec", "s3fs")  # whose errors are a server's
 READ_BYTES = 4 << 20  # of a LiDAR file at once
 _WAYS = "s3://bucket/path and https://host/path can be read"
 
@@ -111,7 +112,7 @@ def bucket(url: str) -> tuple[Any, str]:
     return storage, storage._strip_protocol(url)
 
 
-def _state(info: dict[str, Any], url: str) -> str:
+def _state(info: dict[str, Any], url: str, hosts: frozenset[str] = frozenset()) -> str:
     """What a stand-in holds. Raises InputError where a server gives no parts of files."""
     if info.get("size") is None or info.get("partial") is False:
         raise InputError(
@@ -120,26 +121,22 @@ def _state(info: dict[str, Any], url: str) -> str:
             remedy="download it, and name the local file",
         )
     known = info.get("ETag") or info.get("Last-Modified") or info.get("LastModified") or ""
-    return json.dumps({"size": int(info["size"]), "content": str(known)}) + "\n"
+    state = {"size": int(info["size"]), "content": str(known)}
+    return json.dumps(state | ({"hosts": sorted(hosts)} if hosts else {})) + "\n"
 
 
-def _look(url: str) -> str | None:
+def _look(url: str, hosts: frozenset[str] = frozenset()) -> str | None:
     """The state of a file; None if there is none. Raises InputError if nobody answers."""
+    if urlsplit(url).scheme in WEB:
+        info = info_of(url, hosts)
+        return None if info is None else _state(info, url, hosts)
     storage, name = bucket(url)
     with answering(url):
         try:
             info = storage.info(name)
-        except FileNotFoundError as error:
-            if _is_absent(error, url):
-                return None
-            raise
+        except FileNotFoundError:
+            return None
         return None if info.get("type") == "directory" else _state(info, url)
-
-
-def _is_absent(error: FileNotFoundError, url: str) -> bool:
-    """Whether a server has said that there is no such file; fsspec takes all failures for that."""
-    status = getattr(error.__cause__, "status", None)
-    return status in ABSENT if urlsplit(url).scheme in WEB else True
 
 
 # What clients fail with, by the names of their exceptions: the problem, and the remedy.
@@ -186,10 +183,8 @@ def answering(url: str) -> Iterator[None]:
         for kinds, problem, remedy in FAILURES:
             if names & set(kinds):
                 raise InputError(problem, file=url, remedy=remedy) from None
-        told = error.__cause__ if isinstance(error, FileNotFoundError) else None
-        told = told or error
         raise InputError(
-            f"its server does not answer as it should ({type(told).__name__}: {told})",
+            f"its server does not answer as it should ({type(error).__name__}: {error})",
             file=url,
             remedy="try again later; check the URL, the credentials (AWS_ACCESS_KEY_ID …, with "
             "the right to list) and AWS_ENDPOINT_URL",
@@ -219,6 +214,27 @@ def stand_in(url: str) -> Path:
     return place
 
 
+def state_of(url: str, hosts: frozenset[str] = frozenset()) -> tuple[int, str] | None:
+    """Bytes of a file now, and what its server calls its content; None if there is none.
+
+    ``hosts`` that may be redirected to. Raises InputError for a URL that no stand-in can have, and
+    if nobody answers.
+    """
+    place_of(url)
+    if (state := _look(url, hosts)) is None:
+        return None
+    held = json.loads(state)
+    return held["size"], held["content"]
+
+
+def stand_in_of(url: str, size: int, content: str, hosts: frozenset[str]) -> Path:
+    """The stand-in of a file that is known already, as by a list of tiles; nobody is asked."""
+    place = place_of(url)
+    info = {"size": size, "ETag": content}
+    _put(place, _state(info, url, hosts).encode())
+    return place
+
+
 def fetch(url: str) -> Path | None:
     """Fetch a small file; None if there is none, and none is left here either.
 
@@ -228,13 +244,7 @@ def fetch(url: str) -> Path | None:
     if (state := _look(url)) is None:
         place.unlink(missing_ok=True)
         return None
-    if json.loads(state)["size"] > MAX_COPY_BYTES:
-        raise InputError(
-            f"larger than {MAX_COPY_BYTES / 1e6:g} MB", file=url, remedy="is it the right file?"
-        )
-    storage, name = bucket(url)
-    with answering(url):
-        content = storage.cat_file(name)
+    content = read_bytes(url, MAX_COPY_BYTES, size=json.loads(state)["size"])
     if len(content) != json.loads(state)["size"]:
         raise InputError(
             f"{len(content)} bytes came of {json.loads(state)['size']}",
@@ -243,6 +253,26 @@ def fetch(url: str) -> Path | None:
         )
     _put(place, content)
     return place
+
+
+def read_bytes(
+    url: str, most_bytes: int, *, size: int | None = None, hosts: frozenset[str] = frozenset()
+) -> bytes:
+    """A file as a whole. Raises InputError if it has more than so many bytes, which are not read.
+
+    ``size``: what is known of it already. ``hosts``: see :mod:`.web_requests`.
+    """
+    if size is not None and size > most_bytes:
+        raise too_large(url, most_bytes)
+    if urlsplit(url).scheme in WEB:
+        return read_whole(url, most_bytes, hosts)
+    if size is None:
+        if (state := _look(url)) is None:
+            raise _missing(url)
+        return read_bytes(url, most_bytes, size=json.loads(state)["size"])
+    storage, name = bucket(url)
+    with answering(url):
+        return storage.cat_file(name)
 
 
 def bring_image(url: str) -> Path:
@@ -306,6 +336,11 @@ def _held(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
+def hosts_of(path: str | Path) -> frozenset[str]:
+    """The hosts, beside its own, that the server of what a path stands for may redirect to."""
+    return frozenset(_held(Path(path)).get("hosts", ())) if url_of(path) else frozenset()
+
+
 def size_of(path: str | Path) -> int:
     """Bytes of a file, or of what it stands for."""
     path = Path(path)
@@ -324,8 +359,13 @@ def open_file(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
         return
     refuse_changed(path)
+    size = _held(path)["size"]
+    if urlsplit(url).scheme in WEB:
+        with io.BufferedReader(WebStream(url, size, hosts_of(path)), READ_BYTES) as file:
+            yield file
+        return
     storage, name = bucket(url)
-    how = {"block_size": READ_BYTES, "cache_type": "readahead", "size": _held(path)["size"]}
+    how = {"block_size": READ_BYTES, "cache_type": "readahead", "size": size}
     try:
         with storage.open(name, "rb", **how) as file:
             yield file
@@ -339,7 +379,7 @@ def open_file(path: str | Path) -> Iterator[BinaryIO]:
 def refuse_changed(path: str | Path) -> None:
     """Raise InputError if the file that a path stands for is another one by now."""
     url = url_of(path)
-    if url is not None and _look(url) != Path(path).read_text():
+    if url is not None and _look(url, hosts_of(path)) != Path(path).read_text():
         raise InputError(
             "changed on its server since this run began",
             file=url,

@@ -59,6 +59,7 @@ def headlines(
     if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
         text = f"{spread(dense, '.2g')} points/m²"
         found.append(Headline("LiDAR density", text, "over the ground that it covers"))
+    found += _lidar([of for scene in scenes if (of := scene.get("lidar"))])
     low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
     high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
     if low and high:
@@ -71,6 +72,39 @@ def headlines(
         if value is not None:
             found.append(Headline(title, minus(format(factor * value, form)) + unit, note))
     return found
+
+
+def _lidar(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
+    """What was read of the LiDAR, by the scene of which most was, and what is missing."""
+    if not scenes:
+        return []
+    most = max(scenes, key=lambda of: of["bytes"][0])
+    (read, every), files = most["bytes"], most["files"]
+    nodes = f", {most['nodes'][0]} of {most['nodes'][1]} nodes" if most["nodes"] else ""
+    holes = [of for of in scenes if of["holes_m2"] or of["not_read_m2"]]
+    note = f"points in {files[0]} of {files[1]} files{nodes}"
+    for of in holes[:1]:
+        if of["holes_m2"]:
+            lon, lat = of["hole"]
+            note += f"; no point on {of['holes_m2'] / 1e6:.3f} km² that both images show, "
+            note += f"around {lon:.5f}, {lat:.5f}"
+        if of["not_read_m2"]:
+            note += f"; {of['not_read_m2'] / 1e6:.3f} km² around the images were not read"
+    text = f"{read / 1e6:.1f} of {every / 1e6:.1f} MB"
+    return [Headline("LiDAR read", text, note, bool(holes)), *_dates(scenes)]
+
+
+def _dates(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
+    """When the LiDAR was measured, and what its heights count from if that differs."""
+    days = [of["acquired"] for of in scenes if of["acquired"]]
+    surfaces = sorted({text for of in scenes for text in of["surfaces"]})
+    mixed = any(len(of["surfaces"]) > 1 for of in scenes)
+    if not days and not mixed:
+        return []
+    text = f"{min(d[0] for d in days)} to {max(d[1] for d in days)}" if days else "not known"
+    some = f"of {len(days)} of {len(scenes)} scenes" if 0 < len(days) < len(scenes) else ""
+    note = f"heights of different surfaces: {'; '.join(surfaces)}" if mixed else ""
+    return [Headline("LiDAR measured", text, _and(*filter(None, (some, note))), mixed)]
 
 
 def _and(*parts: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from ..epipolar import site_pairs
+from ..epipolar.pair_quality import rate
 from ..numerics.degrees import metres_per_degree
 from ..products.charts import Axis
 from ..products.html_page import way, write_page
@@ -45,6 +47,37 @@ class Pair:
     scene: str
 
 
+def image_of(image: site_pairs.SiteImage) -> SiteImage:
+    """An image with its corners at the height of its RPC."""
+    cols, rows = image.size
+    lon, lat = image.sensor.localize(
+        np.array([0.0, cols - 1.0, cols - 1.0, 0.0]),
+        np.array([0.0, 0.0, rows - 1.0, rows - 1.0]),
+        float(image.sensor.rpc.height_off),
+    )
+    corners = [(float(x), float(y)) for x, y in zip(lon, lat)]
+    return SiteImage(image.name, "" if image.time is None else f"{image.time:%Y-%m-%d}", corners)
+
+
+def pairs_of(
+    images: Sequence[site_pairs.SiteImage], scenes: Mapping[str, tuple[str, str]]
+) -> list[Pair]:
+    """All pairs of a site, best first; ``scenes``: names of the images of each, in any order."""
+    names = {frozenset(pair): scene for scene, pair in scenes.items()}
+    return [
+        Pair(
+            one.pair.left,
+            one.pair.right,
+            one.quality.matched,
+            one.pair.convergence,
+            one.pair.days,
+            one.quality.reason,
+            names.get(frozenset((one.pair.left, one.pair.right)), ""),
+        )
+        for one in rate(images)
+    ]
+
+
 def write_site_page(
     city: str,
     images: Sequence[SiteImage],
@@ -59,7 +92,8 @@ def write_site_page(
     """Write the page of a site to ``out``.
 
     ``adjusted``, ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there
-    are none; ``page``: of the city's tiles, None if there is none; ``index``: of all pages.
+    are none; ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all
+    pages.
     """
     values = {
         "city": city,
@@ -67,7 +101,7 @@ def write_site_page(
         "page": way(out, page),
         "map": _map(images),
         "pairs": _chart(pairs),
-        "table": _pairs_table(pairs),
+        "table": _pairs_table(pairs, way(out, page)),
         "residuals": _residuals(adjusted),
         "remarks": _remarks(adjusted),
         "closure": _closure(closure),
@@ -132,21 +166,32 @@ def _chart(pairs: Sequence[Pair]) -> dict[str, Any]:
     }
 
 
-def _pairs_table(pairs: Sequence[Pair]) -> Table | None:
-    return table(
-        [
-            {
-                "left": pair.left,
-                "right": pair.right,
-                "scene": pair.scene,
-                "matched_share": f"{pair.matched:.4f}",
-                "convergence_degrees": f"{pair.convergence:.1f}",
-                "days": "" if pair.days is None else f"{pair.days:.2f}",
-                "reason": pair.reason,
-            }
-            for pair in pairs
-        ]
-    )
+def _pairs_table(pairs: Sequence[Pair], page: Path | None) -> Table | None:
+    """All pairs; those that are scenes lead to their part of the page."""
+    rows = [
+        {
+            "left": pair.left,
+            "right": pair.right,
+            "scene": pair.scene,
+            "matched_share": f"{pair.matched:.4f}",
+            "convergence_degrees": f"{pair.convergence:.1f}",
+            "days": "" if pair.days is None else f"{pair.days:.2f}",
+            "reason": pair.reason,
+        }
+        for pair in pairs
+    ]
+    made = table(rows)
+    if made is None or page is None:
+        return made
+    ((heading, lines),) = made.groups
+    at = list(rows[0]).index("scene")
+    linked = [
+        (*cells[:at], replace(cells[at], href=f"{page}#scene-{pair.scene}"), *cells[at + 1 :])
+        if pair.scene
+        else cells
+        for cells, pair in zip(lines, pairs)
+    ]
+    return replace(made, groups=((heading, tuple(linked)),))
 
 
 def _number(value: Any, form: str = ".3f") -> str:

@@ -1,10 +1,5 @@
-"""The part of the ground whose facets are wanted.
-
-Facets follow from the points around them, so that a window has the points of a halo around all that
-it needs, and the box of these holds more. A :class:`Region` of squares says what is needed, so that
-triangles are made of the points in its halo alone, and only those that touch it are cut at
-breaklines.
-"""
+"""The part of the ground whose triangles are wanted: those of a surface's blocks are more than a
+window sees."""
 
 from __future__ import annotations
 
@@ -66,15 +61,6 @@ def _touching(x: Ints, y: Ints, corner: Steps, squares: Bools) -> Bools:
     return out
 
 
-@kernel
-def _inside(x: Ints, y: Ints, squares: Bools) -> Bools:
-    """Which vertices lie in one of the ``squares``."""
-    out = np.empty(x.size, np.bool_)
-    for k in range(x.size):
-        out[k] = squares[y[k] >> SQUARE_BITS, x[k] >> SQUARE_BITS]
-    return out
-
-
 @dataclass(frozen=True, eq=False)
 class Region:
     """``squares`` bool [rows, cols] of the ground, from the vertices' origin, that are wanted."""
@@ -84,13 +70,3 @@ class Region:
     def touching(self, vertices: Vertices, corner: Steps) -> Bools:
         """Which triangles [m, 3] lie in the region at least in part."""
         return _touching(vertices.x, vertices.y, corner, self.squares)
-
-    def near(self, vertices: Vertices, cells: int) -> Bools:
-        """Which vertices lie up to so many ``cells`` around the region."""
-        around = (cells >> (SQUARE_BITS - PART_BITS)) + 1
-        wide = greatest_around(self.squares.astype(np.int64), around) > 0
-        return _inside(vertices.x, vertices.y, wide)
-
-    def with_halo(self, vertices: Vertices, cells: int) -> Vertices:
-        """The vertices up to so many ``cells`` around the region."""
-        return vertices.taken(self.near(vertices, cells))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ..kernels import inner, kernel
 from .delaunay import Triangles, triangulate
 from .scale import ROUGH_REACH, SurfaceScale, height_steps
-from .surface import GroundSurface
 from .vertices import Vertices
 
 Floats = NDArray[np.float64]
@@ -149,29 +148,35 @@ def _rms_residuals(vertices: Vertices, triangles: Triangles, chosen: Bools) -> F
 class RoughTops:
     """Triangles of the tops of rough surfaces.
 
-    ``corner`` [m, 3]: of ``vertices``, the tops; ``residual`` [m]: root mean square of these to the
+    ``corner`` [m, 3]: of the surface's vertices; ``residual`` [m]: root mean square of these to the
     planes of the triangles beside; ``rise`` [m]: height of a triangle, both in lattice steps;
     ``is_gentle`` [m]: neither steep nor alone.
     """
 
-    vertices: Vertices
     corner: Steps
     residual: Floats
-    rise: Floats
+    rise: Ints
     is_gentle: Bools
 
+    def taken(self, chosen: NDArray) -> RoughTops:
+        """The triangles of an index or a mask."""
+        values = self.corner, self.residual, self.rise, self.is_gentle
+        return RoughTops(*(one[chosen] for one in values))
 
-def rough_tops(surface: GroundSurface, scale: SurfaceScale) -> RoughTops:
-    """The rough surfaces of the points near undecided triangles."""
-    points = surface.vertices.taken(np.flatnonzero(surface.near_undecided))
+
+def rough_tops(vertices: Vertices, near_undecided: Bools, scale: SurfaceScale) -> RoughTops:
+    """The rough surfaces of the ``vertices`` [n] that are ``near_undecided`` triangles."""
+    number = np.flatnonzero(near_undecided).astype(np.int32)
+    points = vertices.taken(number)
     radius = ROUGH_REACH * scale.spacing
     side = int(np.ceil(radius))
     cols, rows = (int(v.max(initial=0)) // side + 1 for v in (points.x, points.y))
     squares = _Squares(*_by_square(points.x, points.y, side, cols, rows), side, cols)
-    passed = _passed(points, squares, radius, height_steps(scale.passed_m))
-    tops = points.taken(np.flatnonzero(~passed))
+    top = np.flatnonzero(~_passed(points, squares, radius, height_steps(scale.passed_m)))
+    tops = points.taken(top)
     triangles = triangulate(tops.x, tops.y, scale.facet_radius)
     rise = np.ptp(tops.h_q[triangles.corner], axis=1)
     is_flat = rise <= height_steps(scale.steep_m)
     residual = _rms_residuals(tops, triangles, is_flat)
-    return RoughTops(tops, triangles.corner, residual, rise, is_flat & np.isfinite(residual))
+    corner = number[top][triangles.corner]
+    return RoughTops(corner, residual, rise, is_flat & np.isfinite(residual))

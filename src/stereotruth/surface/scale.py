@@ -1,7 +1,9 @@
 """What decides whether points lie on one surface: ground cells, spacing of points, tolerances.
 
-The surface knows no image. What a pixel is on the ground and in height comes in as one
-:class:`SurfaceScale` of plain values, so that one surface can serve several pairs of a site.
+The surface knows no image, so that one surface serves all pairs of a site. The size of a ground
+cell comes in as plain numbers, and all tolerances are heights that follow from it: those that are
+so many pixels of disparity in a pair of BASE_OVER_HEIGHT. In a pair of a narrower angle the same
+heights are fewer pixels.
 
 Plan positions are integers: parts of a ground cell (``PART`` of them along each axis), counted on
 the global lattice (:mod:`stereotruth.lidar.lattice`).
@@ -13,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lidar.lattice import LATTICE_M
+from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from ..numerics.degrees import DEGREE_M
 
 PART_BITS = 5
 PART = 1 << PART_BITS  # parts of a cell along each axis: 1 cm at pixels of 0.65 m
@@ -32,6 +35,28 @@ ROUGH_REACH = 2.2
 # Even ground: one vertex for each square of so many cells (two pixels) along each axis.
 SQUARE_CELLS = 4
 EVEN_REACH = 3 * SQUARE_CELLS  # cells around a vertex that decide whether it stays
+
+GROUND_CELL_PX = 0.5  # cells are finer than pixels, so that walls stand where they are
+BASE_OVER_HEIGHT = 0.6  # of the pair in which tolerances are px of disparity: GF-7's and the like
+# Greatest residual of a vertex on the plane of a facet, of a vertex of even ground, and of a point
+# on the top surface of its cell, px of disparity.
+FACET_RESIDUAL_PX = 0.5
+EVEN_RESIDUAL_PX = 0.15
+TOP_RESIDUAL_PX = 1.0
+# Trees and huts of fewer pixels are found by the images: where points are farther apart than this,
+# a label between them needs a higher correlation.
+NOTICED_PX = 1.5
+# Crowns bulge: all around lies below their planes, however steeply it falls, while at the foot of a
+# step it rises. A triangle of a dome is no higher than this, less where points are sparse
+# (``detection_weight``).
+DOME_PX = 3.0
+# A facet bulges if its vertices lie below each other's planes by this or more on the average (noise
+# of points stays below).
+BULGE_PX = 0.1
+# Rough surfaces: how much lower a point lies that went through, and the height of a triangle that
+# is the side of something.
+PASSED_PX = 1.0
+STEEP_PX = 6.0
 
 # Standard deviation of heights that airborne LiDAR has at least (m), and the one that is taken
 # where points are too few to estimate it.
@@ -62,6 +87,35 @@ class SurfaceScale:
     bulge_m: float
     passed_m: float
     steep_m: float
+
+    @classmethod
+    def of(cls, points_per_m2: float, cell: tuple[int, int]) -> SurfaceScale:
+        """From the points over the ground that they cover, and the ground cell: GROUND_CELL_PX of
+        the pixel of the finest image that the surface is for."""
+        cell_m = cell[1] * LATTICE_DEG * DEGREE_M
+        spacing = _spacing_parts(points_per_m2, cell_m)
+        px_m = cell_m / (GROUND_CELL_PX * BASE_OVER_HEIGHT)  # height of a px of disparity
+        return cls(
+            cell=cell,
+            spacing=spacing,
+            top_m=TOP_RESIDUAL_PX * px_m,
+            even_m=EVEN_RESIDUAL_PX * px_m,
+            residual_m=FACET_RESIDUAL_PX * px_m,
+            dome_m=detection_weight(GROUND_CELL_PX * spacing / PART) * DOME_PX * px_m,
+            bulge_m=BULGE_PX * px_m,
+            passed_m=PASSED_PX * px_m,
+            steep_m=STEEP_PX * px_m,
+        )
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell on the ground, m."""
+        return self.cell[1] * LATTICE_DEG * DEGREE_M
+
+    @property
+    def spacing_m(self) -> float:
+        """Mean spacing of points on the ground, m."""
+        return self.spacing / PART * self.cell_m
 
     @property
     def facet_radius(self) -> float:
@@ -105,7 +159,19 @@ class SurfaceScale:
         return max(breakline, 2.0 * self.swept_radius)
 
 
-def spacing_parts(points_per_m2: float, cell_m: float) -> float:
+def ground_cell(pixel_deg: tuple[float, float]) -> tuple[int, int]:
+    """(lon, lat) size of a ground cell, lattice steps, for a pixel on the ground."""
+    lon, lat = (max(round(GROUND_CELL_PX * side / LATTICE_DEG), 1) for side in pixel_deg)
+    return lon, lat
+
+
+def detection_weight(spacing_px: float) -> float:
+    """Weight in [0, 1] that no object fits between points so many pixels apart: 1 for dense points,
+    less where objects of NOTICED_PX fall between them."""
+    return min(1.0, NOTICED_PX / spacing_px)
+
+
+def _spacing_parts(points_per_m2: float, cell_m: float) -> float:
     """Mean spacing of vertices in parts of a cell of ``cell_m``, for points of this density.
 
     Density counts in steps of a factor of 1.4, so that one more file leaves the rest of a scene as

@@ -6,15 +6,18 @@
 4. Other triangles may span a height step. Where the points on both sides determine a breakline,
    a triangle is cut along it into facets and a strip (:mod:`.breaklines`, :mod:`.cut_triangles`).
 5. What is left is undecided: it may hold any height between its lowest and its highest vertex.
+6. Rough surfaces, of which no triangle is a facet, are triangles of their tops
+   (:mod:`.rough_tops`).
 
-The surface knows no image: :class:`.scale.SurfaceScale` says what a pixel is on the ground and in
-height, :class:`.region.Region` which part of the ground is wanted. Equations and a figure:
-docs/explanation/surface.md.
+The surface knows no image: :class:`.scale.SurfaceScale` says what its cells and tolerances are.
+It is made once for all pairs of a site, block by block (:mod:`.make_surface`). Equations and a
+figure: docs/explanation/surface.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +26,30 @@ from .breaklines import breaklines
 from .cut_triangles import cut_triangles, with_pieces
 from .delaunay import Triangles, triangulate
 from .facets import Facets, facets, height_variances
-from .region import Region
-from .scale import SurfaceScale
+from .rough_tops import RoughTops, rough_tops
+from .scale import PART, SurfaceScale
 from .vertices import Vertices
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
+
+
+class Core(NamedTuple):
+    """A box of the ground, of whose first and last cell ``low`` and ``high`` are the parts (x, y):
+    the first belongs to it, the last does not."""
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+
+    def holds(self, vertices: Vertices, halo_cells: int = 0) -> Bools:
+        """Which vertices [n] lie in it or up to so many cells around."""
+        halo = halo_cells * PART
+        out = np.ones(vertices.x.size, np.bool_)
+        for values, low, high in zip((vertices.x, vertices.y), self.low, self.high):
+            out &= (values >= low - halo) & (values < high + halo)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +61,8 @@ class GroundSurface:
     (lattice steps, see :class:`.facets.Facets`). ``undecided`` [k, 3]: triangles that may hold any
     height in ``height_range`` [k, 2] (lattice steps). The first ``whole`` of these are triangles
     between unknown surfaces; the others are strips along breaklines, between two known ones.
-    ``near_undecided`` [n]: which of the first vertices, those of points, are near an undecided
-    triangle, and may belong to a rough surface.
+    ``tops``: of rough surfaces. ``facet_origin`` [m], ``undecided_origin`` [k]: first vertex of
+    the triangle that each is or was cut from.
     """
 
     vertices: Vertices
@@ -53,28 +72,55 @@ class GroundSurface:
     undecided: Steps
     height_range: Ints
     whole: int
-    near_undecided: Bools
+    tops: RoughTops
+    facet_origin: Steps
+    undecided_origin: Steps
 
     @property
     def strips(self) -> slice:
         """Those of the undecided triangles that are strips along breaklines."""
         return slice(self.whole, len(self.undecided))
 
+    def within(self, core: Core) -> GroundSurface:
+        """The triangles whose first vertex lies in a box, with all vertices.
+
+        Of a triangle that is cut, it is that of the whole triangle.
+        """
+        own = core.holds(self.vertices)
+        facet, undecided = own[self.facet_origin], own[self.undecided_origin]
+        return replace(
+            self,
+            facet=self.facet[facet],
+            variance=self.variance[facet],
+            bulge=self.bulge[facet],
+            undecided=self.undecided[undecided],
+            height_range=self.height_range[undecided],
+            whole=int(undecided[: self.whole].sum()),
+            tops=self.tops.taken(own[self.tops.corner[:, 0]]),
+            facet_origin=self.facet_origin[facet],
+            undecided_origin=self.undecided_origin[undecided],
+        )
+
 
 def ground_surface(
-    vertices: Vertices, scale: SurfaceScale, region: Region | None = None
+    vertices: Vertices, scale: SurfaceScale, core: Core | None = None
 ) -> GroundSurface:
-    """The surface of ``vertices``; with a ``region``, that over its squares alone."""
-    if region is not None:
-        vertices = region.with_halo(vertices, scale.halo_cells)
+    """The surface of ``vertices``; with a ``core``, the triangles whose first vertex lies in it.
+
+    With the vertices up to ``scale.halo_cells`` around, these have the same bytes for any core.
+    """
     triangles = triangulate(vertices.x, vertices.y, scale.swept_radius)
     planes = facets(vertices, triangles, scale)
     corner = triangles.corner
     wanted = np.ones(len(corner), np.bool_)
     near_undecided = _near_undecided(vertices, triangles, planes)
-    if region is not None:
-        wanted = region.touching(vertices, corner)
-        near_undecided &= region.near(vertices, scale.rough_halo_cells)
+    if core is not None:
+        own = core.holds(vertices)
+        wanted = own[corner[:, 0]]
+        near_undecided &= core.holds(vertices, scale.rough_halo_cells)
+    tops = rough_tops(vertices, near_undecided, scale)
+    if core is not None:
+        tops = tops.taken(own[tops.corner[:, 0]])
 
     to_cut = np.flatnonzero(~planes.is_facet & wanted & (triangles.radius <= scale.facet_radius))
     lines = breaklines(
@@ -90,6 +136,7 @@ def ground_surface(
     is_whole[to_cut] = False
     whole = corner[is_whole]
     whole_range = np.stack([vertices.h_q[whole].min(axis=1), vertices.h_q[whole].max(axis=1)], 1)
+    first = corner[to_cut, 0]
     cut_variance = lines.variance[pieces.facet_of, pieces.facet_side]
     return GroundSurface(
         vertices=every,
@@ -99,7 +146,9 @@ def ground_surface(
         undecided=np.concatenate([whole, strips]),
         height_range=np.concatenate([whole_range, np.rint(pieces.heights).astype(np.int64)]),
         whole=len(whole),
-        near_undecided=near_undecided,
+        tops=tops,
+        facet_origin=np.concatenate([corner[is_facet, 0], first[pieces.facet_of]]),
+        undecided_origin=np.concatenate([whole[:, 0], first[pieces.strip_of]]),
     )
 
 

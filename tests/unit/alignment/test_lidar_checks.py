@@ -22,12 +22,13 @@ from stereotruth.alignment.lidar_checks import (
     lines_of_sight,
 )
 from stereotruth.alignment.refine import refine
+from stereotruth.lidar import geoid_candidates
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 
 from ...synthetic.box_scene import HALF, ROOF, points_on, write_points
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
-from ...synthetic.las import write_las
+from ...synthetic.las import write_gtx, write_las
 from ...synthetic.real_data import MARSEILLE
 from ...synthetic.textured_pair import NONE, start
 
@@ -70,6 +71,31 @@ def test_an_offset_is_doubted_and_told(tmp_path, offset):
     assert told[2] == ("lower" if offset > 0 else "higher")
     assert float(told[1]) == pytest.approx(abs(offset), abs=0.11)
     assert "only 0 of 9" in text and "vertical datum" in text
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """EGM2008 of 49.4 m and EGM96 of 45 m all around, on this machine."""
+    values = {"us_nga_egm08_25.tif": 49.4, "us_nga_egm96_15.tif": 45.0}
+    places = {
+        name: write_gtx(tmp_path / f"{name}.gtx", np.full((9, 9), value), 112.0, 28.0, 0.5)
+        for name, value in values.items()
+    }
+    monkeypatch.setattr(geoid_candidates, "_installed", places.get)
+
+
+def test_orthometric_heights_taken_as_ellipsoidal_fit_their_geoid(tmp_path, installed):
+    """The LiDAR lies 49.4 m too low: H in the place of H + N."""
+    cloud = points_on(True, noise=0.05, spacing=0.8)
+    cloud[:, 2] -= 49.4
+    stores = store_of(tmp_path, cloud)
+    declared = doubt_at_gcps(survey(), stores, PIXEL)
+    assert "EGM" not in declared
+    stores[0].attrs["crs"]["heights"] = "ellipsoidal (assumed), in metre"
+    text = doubt_at_gcps(survey(), stores, PIXEL)
+    assert text.startswith(declared)
+    assert "if they are ellipsoidal 49.4 m; EGM2008 height (us_nga_egm08_25.tif) 0.0 m" in text
+    assert "EGM96 height (us_nga_egm96_15.tif) 4.4 m" in text
 
 
 def test_feet_for_metres_are_doubted(tmp_path):

@@ -12,10 +12,9 @@ from typer.testing import CliRunner
 from stereotruth.command import pairs as command
 from stereotruth.command.example_city import SITE
 from stereotruth.command.main import app
-from stereotruth.command.pairs import Choice, RatedPair, list_pairs, rated_pairs, table
+from stereotruth.command.pairs import Choice, list_pairs, rated_pairs, table
 from stereotruth.command.pairs_table import show_pairs
-from stereotruth.command.site_page import write_page_of_site
-from stereotruth.epipolar.pair_quality import quality_of
+from stereotruth.epipolar.pair_quality import RatedPair, quality_of
 from stereotruth.epipolar.site_pairs import SitePair
 from stereotruth.errors import InputError
 from stereotruth.project import configured, names_in_pair, read_images, read_scenes
@@ -151,10 +150,3 @@ def test_the_command_lists_and_writes(rows):
     assert written() == []
     run = CliRunner().invoke(app, ["pairs", "Stack", "--all", "--most", "3", "--lidar", "l"])
     assert run.exit_code == 0 and len(written()) == 3
-
-
-def test_the_page_of_a_site_is_written_and_in_the_index(rows):
-    page = write_page_of_site("Stack")
-    text = page.read_text(encoding="utf-8")
-    assert text.count("<polygon") == len(rows) == 4
-    assert 'href="../site/Stack/index.html"' in Path("results/report/index.html").read_text()

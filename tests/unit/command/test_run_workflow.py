@@ -88,14 +88,14 @@ Finished jobid: 2 (Rule: project)
 def test_time_left_follows_from_the_jobs_that_are_done():
     progress = Progress(begun=100.0)
     assert progress.line(100.0) == "planning"
-    planned = 3 + 3 * 15  # SECONDS of align and project
+    planned = 3 + 3 * 8  # SECONDS of align and project
     lines = RUN.splitlines()
     for line in lines[:7]:
         progress.read(line)
     assert progress.line(100.0) == f"0 of 4 jobs done, about {planned} s left"
     for line in lines[7:]:
         progress.read(line)
-    done = 3 + 15
+    done = 3 + 8
     left = (planned - done) * (36 + TRUSTED) / (done + TRUSTED)
     assert progress.seconds_left(136.0) == pytest.approx(left)
     assert progress.line(136.0) == f"2 of 4 jobs done, about {left:.0f} s left"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from ...synthetic.surveyed_pair import RPCS, SIZES, make_gcps, write_image
 
 HEADER = "image\tcity\tfile\tacquired\tsun_azimuth\tsun_elevation\tmask\n"
 ROWS = ("L\tGood\tleft.tif\t2020-10-25T03:12:45Z", "R\tGood\tright.tif\t2020-10-25T03:13:40Z")
+PAIR_APART = re.compile("do not overlap|no ground")
 IMD = "firstLineTime = {}T03:12:45Z;\nmeanSunAz = {};\nmeanSunEl = 40;\n"
 
 
@@ -67,7 +69,25 @@ def image_from_elsewhere(folder: Path) -> None:
     write_images(*ROWS, "Far\tGood\tfar.tif\t2020-10-25")
 
 
+def images_of_two_sites(folder: Path) -> None:
+    with Path("cities.tsv").open("a", encoding="utf-8") as sheet:
+        sheet.write("Other\tOT\t1\t1\t1\n")
+    write_images(ROWS[0], ROWS[1].replace("Good", "Other"))
+
+
 FAULTS = {
+    "one file under two names": (
+        lambda folder: write_images(*ROWS, "Again\tGood\t./left.tif"),
+        "images.tsv: line 4: image 'Again': its file is that of image 'L' in line 2",
+    ),
+    "images of two sites": (
+        images_of_two_sites,
+        "scenes.tsv: line 2: scene 'Good-1': right_image 'R' is an image of Other, the scene is of",
+    ),
+    "a date of another form": (
+        lambda folder: write_images(ROWS[0], ROWS[1].replace("2020-10-25", "25.10.2020")),
+        "images.tsv: line 3: image 'R': acquired '25.10.2020T03:13:40Z' is not of the form",
+    ),
     "same bytes": (copy_of_left, "images 'L' and 'Again' are one image"),
     "not of the site": (image_from_elsewhere, "image 'Far' shares no ground with any other"),
     "no file": (
@@ -103,9 +123,29 @@ def test_faults_of_a_site_are_errors_with_a_remedy(site, fault):
 
 
 def test_a_pair_without_shared_ground_is_an_error(site):
+    """The pair by its scene, and the image by its row."""
     image_from_elsewhere(site)
     write_sheet(site, left_image="L", right_image="Far", gcps="")
-    assert any("do not overlap" in text or "no ground" in text for text in said(Level.ERROR))
+    errors = said(Level.ERROR)
+    assert sum("image 'Far' shares no ground" in text for text in errors) == 1
+    assert any("Far" not in text and PAIR_APART.search(text) for text in errors), errors
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ("2020-10-25T03:12:45Z", "2020-10-25T03:13:40Z"),
+        ("2020-10-25 11:12:45+08:00", "2020-10-25T03:13:40Z"),
+        ("2020-10-24T22:12:45-05:00", "2020-10-25T03:13:40+00:00"),
+    ],
+)
+def test_times_of_any_zone_are_one_moment(site, times):
+    write_images(*(f"{row.rpartition(chr(9))[0]}\t{time}" for row, time in zip(ROWS, times)))
+    assert said(Level.ERROR) == said(Level.DOUBT) == []
+    settings, _ = configured()
+    cities, _ = read_scenes(settings)
+    left, right = (one.image for one in images_of("Good", read_images(settings, cities), settings))
+    assert (right.time - left.time).total_seconds() == 55
 
 
 def test_long_control_points_without_an_images_sheet_are_an_error(site):

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from rasterio.rpc import RPC
 from rasterio.transform import RPCTransformer
 
-from stereotruth.dataset.originals import write_originals
+from stereotruth.dataset.originals import HEIGHTS, write_originals
 from stereotruth.dataset.polynomials import evaluate
 from stereotruth.dataset.verify import defects
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.errors import InputError
+from stereotruth.products.grids import Layer, atomic_store, create_grid
 
 from ...synthetic.images import write
 from ...synthetic.other_programs import PROGRAMS
@@ -32,6 +35,7 @@ from ...synthetic.tiled_scene import (
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 CAMERAS = {"left": camera(0.09, 0.02, 0.70), "right": camera(-0.48, -0.03, 0.75)}
 TOLERANCE = 0.01  # px
+META = {"units": "m", "long_name": "test"}
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +134,58 @@ def test_every_program_opens_them(cropped, program: str) -> None:
     if program == "OpenCV":  # blue, green, red, and the fourth
         found = found[..., ::-1][..., [2, 1, 0, 3]]
     np.testing.assert_array_equal(found, wanted)
+
+
+def heights(path: Path, shape: tuple[int, int]) -> Path:
+    """Heights of an image: 100 m, one metre more a column, rows 0 to 9 of it without points."""
+    row, col = np.indices(shape)
+    none = row < 10
+    values = {
+        "height": np.where(none, np.nan, 100.0 + col + row / 1024),
+        "sigma": np.where(none, np.nan, 0.01 * row),
+        "status": np.where(none, 0, 1),
+    }
+    layers = {name: Layer(HEIGHTS[name].dtype, 0, META) for name in HEIGHTS}
+    with atomic_store(path) as scratch:
+        arrays = create_grid(scratch, shape, layers, chunk=64, shard=128, attrs={})
+        for name, array in values.items():
+            arrays[name][:] = array.astype(HEIGHTS[name].dtype)
+    return path
+
+
+def numbers_of(rpc: RPC) -> list[float]:
+    """All of an RPC's numbers."""
+    values = {k: v for k, v in sorted(rpc.to_dict().items()) if not k.startswith("err")}
+    return [number for value in values.values() for number in np.ravel(value)]
+
+
+def test_crops_of_heights_are_those_of_the_images(cropped, tmp_path) -> None:
+    with rasterio.open(cropped / "left.tif") as image:
+        store = heights(tmp_path / "A.zarr", image.shape)
+    images = {"s1": (cropped / "left.tif", cropped / "right.tif")}
+    out = tmp_path / "out"
+    write_originals(cropped / "Town", out, images, {"s1": (store, None)})
+    assert defects(out) == []
+    for row, before in zip(rows_of(out), rows_of(cropped / "out")):
+        assert row["left_sha256"] == before["left_sha256"]
+        assert row["right_height"] == row["right_sigma"] == row["right_status"] == ""
+        with rasterio.open(out / row["left"]) as crop:
+            first = int(row["left_row0"]), int(row["left_col0"])
+            line, col = (axis + start for axis, start in zip(np.indices(crop.shape), first))
+            rpc = numbers_of(crop.rpcs)
+        for name, wanted in (("height", 100.0 + col + line / 1024), ("sigma", 0.01 * line)):
+            with rasterio.open(out / row[f"left_{name}"]) as found:
+                assert found.dtypes == ("float32",) and found.nodata == -9999
+                values = found.read(1)
+                np.testing.assert_allclose(numbers_of(found.rpcs), rpc, rtol=1e-12)
+            np.testing.assert_array_equal(values, np.where(line < 10, -9999, wanted).astype("f4"))
+        with rasterio.open(out / row["left_status"]) as found:
+            np.testing.assert_array_equal(found.read(1), line >= 10)
+
+
+def test_heights_of_another_image_are_refused(cropped, tmp_path) -> None:
+    store = heights(tmp_path / "A.zarr", (30, 30))
+    images = {"s1": (cropped / "left.tif", cropped / "right.tif")}
+    with pytest.raises(InputError, match="is of another image"):
+        write_originals(cropped / "Town", tmp_path / "out", images, {"s1": (None, store)})
+    assert not (tmp_path / "out").exists()

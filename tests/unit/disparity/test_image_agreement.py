@@ -5,13 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity.image_agreement import (
-    Agreement,
-    apart_from_steps,
-    surface_mean,
-    warp_to_left,
-)
+from stereotruth.disparity.image_agreement import Agreement
 from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.surface_means import apart_from_steps, surface_mean, warp_to_left
 from stereotruth.epipolar.surface_correlation import surface_correlation
 
 LEVEL = np.zeros((2, 80, 80))

@@ -17,13 +17,17 @@ from stereotruth.disparity.image_heights import (
     open_inputs,
     write_image_heights,
 )
+from stereotruth.epipolar.shown_ground import GroundOfImages
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import open_stores
 from stereotruth.products.grids import open_grid
 from stereotruth.simulate.cities import lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.site_images import image_truth
 from stereotruth.simulate.sites import drawn_site
+from stereotruth.surface.make_surface import make_surface
+from stereotruth.surface.scale import ground_cell
 
 from ...synthetic.site_sensors import exact_image
 
@@ -44,7 +48,11 @@ def stores(tmp_path_factory):
 @pytest.fixture(scope="module")
 def inputs(stores):
     image = exact_image(SITE, SITE.images[0])
-    return open_inputs(image.sensor, image.size, stores)
+    ground = GroundOfImages([image.sensor], [image.size])
+    surface = stores[0].parent / "site.surface"
+    cell = ground_cell(ground.pixel_deg)
+    make_surface(open_stores(stores), surface, cell=cell, ground=ground)
+    return open_inputs(image.sensor, image.size, stores, surface)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
 from stereotruth.disparity.recipe import label_window
-from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
@@ -130,7 +129,7 @@ def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, n
         return facet_labels(visible, own, *rest)
 
     monkeypatch.setattr(module, "facet_labels", record)
-    inputs = SceneInputs(*scene.images, (scene.store,), Settings(correlation_threshold=-1))
+    inputs = scene.inputs(Settings(correlation_threshold=-1))
     rows, cols = scene.model.shape
     layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
     inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
@@ -324,7 +323,7 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
 
 def test_blocks_can_go_to_other_processes(plane) -> None:
     """A block's task is made of plain values, whatever has been opened before."""
-    scene = SceneInputs(*plane.images, (plane.store,), Settings())
+    scene = plane.inputs(Settings())
     window = slice(100, 140), slice(120, 170)
     first = label_window(scene, *window)
     second = label_window(pickle.loads(pickle.dumps(scene)), *window)

@@ -96,7 +96,7 @@ def test_right_view_is_labelled_between_points_too(box) -> None:
 )
 def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
     def scene() -> SceneInputs:
-        return SceneInputs(*box.images, (box.store,), Settings(recipe=recipe), view)
+        return box.inputs(Settings(recipe=recipe), view)
 
     rows, cols = slice(60, 220), slice(70, 250)
     whole = label_window(scene(), rows, cols)[0]

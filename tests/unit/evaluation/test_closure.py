@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zarr
 
+from stereotruth.alignment.aligned_pair import Alignment, ViewFit
+from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.errors import InputError
 from stereotruth.evaluation.closure import (
     PairFiles,
@@ -28,7 +33,8 @@ CAMERAS = {
     "B": camera((-0.05, -0.25), angle=91.0, gsd=0.75, size=SIZE),
     "C": camera(FORWARD, angle=92.0, gsd=0.8, size=SIZE),
 }
-SIGMA = 0.05
+SIGMA = 0.05  # of the points
+COVARIANCE = np.diag([0.0, 0.0, 0.09, 0.0, 0.0, 0.09])  # px², of a correction
 META = {"units": "px", "long_name": "test"}
 
 
@@ -38,35 +44,60 @@ def hill(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
     return HEIGHT + 6.0 * np.sin(east / 35.0) * np.cos(north / 40.0)
 
 
-def labels(model: EpipolarModel) -> np.ndarray:
-    """Exact disparities of the hill."""
+def labels(model: EpipolarModel, higher: float = 0.0) -> np.ndarray:
+    """Exact disparities of the hill, or of one that is so many metres higher."""
     y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
     col, row = model.epipolar_to_left(x, y)
     height = np.full(col.shape, HEIGHT)
     for _ in range(25):
         lon, lat = model.left.localize(col, row, height)
-        height = hill(lon, lat)
+        height = hill(lon, lat) + higher
     return x - model.right_to_epipolar(*model.right.project(lon, lat, height))[0]
 
 
-def pair(folder: Path, left: str, right: str, shift: float = 0.0) -> PairFiles:
-    """A pair with labels that are off by ``shift`` px."""
+def aligned(left: str, right: str, cameras: dict[str, SensorModel]) -> Alignment:
+    """Corrections of both cameras that are uncertain by tenths of a pixel."""
+    fits = (
+        ViewFit(view, "", SIZE, np.eye(2, 3), (), 0.3, 10, (150.0, 140.0), 150.0, COVARIANCE)
+        for view in ("left", "right")
+    )
+    return Alignment("S", "affine", cameras[left], cameras[right], *fits, HEIGHT, (), {})
+
+
+def pair(
+    folder: Path,
+    left: str,
+    right: str,
+    shift: float = 0.0,
+    cameras: dict[str, SensorModel] = CAMERAS,
+    higher: float = 0.0,
+) -> PairFiles:
+    """A pair with labels that are off by ``shift`` px, or of ground that is ``higher``, m."""
     model = fit_epipolar(
-        CAMERAS[left], CAMERAS[right], SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 20, HEIGHT + 20)
+        cameras[left], cameras[right], SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 20, HEIGHT + 20)
     )
     path = folder / f"{left}-{right}.zarr"
     layers = {name: Layer("float32", np.nan, META) for name in ("disparity", "uncertainty")}
-    attrs = {"epipolar": model.to_dict()}
+    alignment = aligned(left, right, cameras)
+    disparity = labels(model, higher) + shift
+    at = (np.arange(n, dtype=float) for n in model.shape[::-1])
+    slope = np.stack(np.gradient(disparity)[::-1])
+    of_alignment = LabelUncertainty.of(alignment, model).variance(*at, slope)
+    assert np.sqrt(of_alignment.min()) > 2 * SIGMA
     with atomic_store(path) as scratch:
+        attrs = {"epipolar": model.to_dict()}
         arrays = create_grid(scratch, model.shape, layers, chunk=64, shard=128, attrs=attrs)
-        arrays["disparity"][:] = labels(model) + shift
-        arrays["uncertainty"][:] = SIGMA
-    return PairFiles(f"{left}-{right}", left, right, path, folder, folder)
+        arrays["disparity"][:] = disparity
+        arrays["uncertainty"][:] = np.sqrt(SIGMA**2 + of_alignment)
+    file = folder / f"{left}-{right}.json"
+    alignment.save(file)
+    return PairFiles(f"{left}-{right}", left, right, path, file, folder)
 
 
-def triplet_of(folder: Path, shift: float = 0.0):
+def triplet_of(folder: Path, shift: float = 0.0, **more: Any):
     """The triplet, the labels of B-C being off."""
-    pairs = [pair(folder, "A", "B"), pair(folder, "B", "C", shift), pair(folder, "A", "C")]
+    given = (("A", "B", 0.0), ("B", "C", shift), ("A", "C", 0.0))
+    pairs = [pair(folder, *one, **more) for one in given]
     (found,) = triplets_of(pairs[::-1])
     assert found.images == ("A", "B", "C")
     return found
@@ -76,8 +107,20 @@ def test_exact_labels_close(tmp_path):
     closures, sigma = closure_of_labels(triplet_of(tmp_path))
     assert len(closures) > 20_000
     assert np.sqrt(np.mean(closures**2)) < 0.003
-    # more than of A-C alone; less than as if both others counted twice
+    # Of the points alone: more than of A-C; less than as if both others counted twice. The
+    # alignment's part is gone but for the slopes of labels that are stored as float32.
     assert np.all((sigma > SIGMA * 1.2) & (sigma < SIGMA * 2.5))
+
+
+@pytest.mark.parametrize("higher", [0.0, 0.5])
+def test_errors_that_all_pairs_share_close(tmp_path, higher):
+    """Of an image's correction, and of the heights: they have no part in the uncertainty."""
+    rpc = CAMERAS["B"].rpc
+    moved = SensorModel(replace(rpc, samp_off=rpc.samp_off + 0.7, line_off=rpc.line_off - 0.4))
+    triplet = triplet_of(tmp_path, cameras=CAMERAS | {"B": moved}, higher=higher)
+    closures, sigma = closure_of_labels(triplet)
+    assert np.sqrt(np.mean(closures**2)) < 0.003 < SIGMA / 10
+    assert np.median(sigma) < SIGMA * 2.5
 
 
 def test_an_error_of_one_pair_is_the_closure(tmp_path):

@@ -89,12 +89,12 @@ def test_store_is_the_same_to_the_byte_whatever_the_chunks(tmp_path, monkeypatch
     module = importlib.import_module(ingest.__module__)
     write_las(tmp_path / "a.laz", 20_000)
     digests = set()
-    for k, (chunk, workers, kept_in_memory) in enumerate(
-        [(20_000, 1, 1 << 20), (333, 1, 1 << 20), (7000, 2, 9000), (900, 1, 0), (10**6, 1, 1)]
+    for k, (chunk, kept_in_memory) in enumerate(
+        [(20_000, 1 << 20), (333, 1 << 20), (7000, 9000), (900, 0), (10**6, 1)]
     ):
         monkeypatch.setattr(module, "SCRATCH_POINTS", kept_in_memory)
         store = tmp_path / f"{k}.points"
-        ingest(tmp_path / "a.laz", store, chunk_points=chunk, workers=workers)
+        ingest(tmp_path / "a.laz", store, chunk_points=chunk)
         digests.add(tree_digest(store))
         assert not list(store.rglob("*scratch*"))
     assert len(digests) == 1
@@ -171,6 +171,7 @@ def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> No
     assert result["points"] == {
         "header": 1000,
         "read": 1000,
+        "outside": 0,
         "kept": 850,
         "dropped": {"withheld": 110, "class 7": 25, "class 18": 15},
     }

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import io
+import struct
 import time
 import zlib
+from dataclasses import dataclass
 
 import laspy
 import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.octree import open_octree
 from tests.synthetic.copc_server import (
     CORNER,
+    ENTRY,
     FILE_FAULTS,
     SERVER_FAULTS,
     damaged,
@@ -24,8 +26,24 @@ from tests.synthetic.copc_server import (
 from tests.synthetic.real_data import SHARED
 
 PATIENCE_S = 3.0  # of one range; stalls of 0.3 s are given up
-RING = CORNER[:2] + np.array([[610, 700], [1100, 640], [1180, 1190], [900, 800], [650, 1100]])
-FOOTPRINT = Footprint((RING,))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A box of ground in the system of a file."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def touches(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        return ((low[:, :2] <= self.high) & (high[:, :2] >= self.low)).all(axis=1)
+
+    def contains(self, xyz: np.ndarray) -> np.ndarray:
+        x = xyz[:2].T
+        return ((x >= self.low) & (x <= self.high)).all(axis=1)
+
+
+GROUND = Ground(CORNER[:2] + np.array([610, 640]), CORNER[:2] + np.array([1180, 1190]))
 
 
 @pytest.fixture(scope="module")
@@ -39,52 +57,53 @@ def points_of(records) -> np.ndarray:
     return np.array([np.concatenate([np.asarray(r[n]) for r in records]) for n in names])
 
 
-def cropped(content: bytes, footprint: Footprint) -> np.ndarray:
+def cropped(content: bytes, ground: Ground) -> np.ndarray:
     """The same by laspy, of the whole file."""
     las = laspy.read(io.BytesIO(content))
-    inside = footprint.contains(np.stack([las.x, las.y, las.z]))
+    inside = ground.contains(np.stack([las.x, las.y]))
     return points_of([las.points[inside]])
 
 
-def read(location: str, footprint: Footprint | None, patience_s: float = PATIENCE_S) -> np.ndarray:
+def read(location: str, ground: Ground | None, patience_s: float = PATIENCE_S) -> np.ndarray:
+    """The points of a ground, by the nodes that touch it."""
     octree = open_octree(location, patience_s=patience_s)
-    return points_of(list(octree.read(octree.plan(footprint))))
+    records = list(octree.read(octree.plan(None if ground is None else ground.touches)))
+    if not records:
+        return np.empty((7, 0))
+    scales, offsets = octree.header.scales, octree.header.offsets
+    got = points_of(records)
+    return got if ground is None else got[:, ground.contains((got[:3].T * scales + offsets).T)]
 
 
 def test_a_footprint_has_the_points_of_the_whole_file(made):
     rng = np.random.default_rng(5)
     with serving(made.content) as server:
-        octree = open_octree(server.url)
         for _ in range(20):
-            ring = CORNER[:2] + rng.uniform(0, 2048, 2) + rng.uniform(-300, 300, (4, 2))
-            footprint = Footprint((ring,), lowest=float(rng.uniform(-60, 20)), highest=50.0)
-            plan = octree.plan(footprint)
-            truth = cropped(made.content, footprint)
-            got = list(octree.read(plan))
-            assert sum(map(len, got)) == truth.shape[1]
-            if got:
-                assert np.array_equal(points_of(got), truth)
+            low = CORNER[:2] + rng.uniform(-300, 2048, 2)
+            ground = Ground(low, low + rng.uniform(1, 500, 2))
+            truth = cropped(made.content, ground)
+            assert np.array_equal(read(server.url, ground), truth)
 
 
 def test_bytes_are_those_of_the_touched_nodes():
     made = make_copc(400_000, levels=4)
     with serving(made.content) as server:
         octree = open_octree(server.url)
-        plan = octree.plan(FOOTPRINT)
+        plan = octree.plan(GROUND.touches)
         assert plan.touched <= len(plan.nodes) <= plan.touched + 2
         points = sum(map(len, octree.read(plan)))
-    assert 0 < points < plan.points < 0.4 * octree.points
+    assert 0 < points == plan.points < 0.4 * octree.points
     assert server.sent <= 1.2 * plan.bytes < 0.5 * len(made.content)
 
 
 @pytest.mark.parametrize("fault", SERVER_FAULTS)
 def test_a_server_that_fails_is_overcome_or_named(made, fault):
-    truth = cropped(made.content, FOOTPRINT)
+    truth = cropped(made.content, GROUND)
     when = 1 + zlib.crc32(fault.encode()) % 5
     start = time.monotonic()
     with serving(made.content, fault, when) as server:
         try:
-            assert np.array_equal(read(server.url, FOOTPRINT), truth)
+            assert np.array_equal(read(server.url, GROUND), truth)
             assert SERVER_FAULTS[fault]
         except InputError as error:
             assert not SERVER_FAULTS[fault], error
@@ -100,12 +119,12 @@ def test_a_damaged_file_loses_nothing_silently(made, fault, tmp_path):
         rng = np.random.default_rng([zlib.crc32(fault.encode()), seed])
         file.write_bytes(damaged(made, fault, rng))
         try:
-            got = read(str(file), FOOTPRINT)
+            got = read(str(file), GROUND)
         except InputError as error:
             assert not FILE_FAULTS[fault] and "tile.copc.laz: " in str(error)
             continue
         assert FILE_FAULTS[fault] is not False
-        assert np.array_equal(got, cropped(made.content, FOOTPRINT))
+        assert np.array_equal(got, cropped(made.content, GROUND))
 
 
 def test_a_redirect_is_followed_to_hosts_that_are_allowed(made):
@@ -123,7 +142,7 @@ def test_secrets_of_a_url_are_in_no_message(made):
         with serving(made.content, fault) as server:
             url = server.url.replace("http://", "http://user:word@") + "?X-Signature=abcdef"
             try:
-                read(url, FOOTPRINT, patience_s=1.0)
+                read(url, GROUND, patience_s=1.0)
                 assert fault == "reset"
             except InputError as error:
                 assert "abcdef" not in str(error) and "word" not in str(error)
@@ -137,29 +156,64 @@ def test_files_of_other_software_are_read_whole(name):
     las = laspy.read(file)
     assert np.array_equal(read(str(file), None), points_of([las.points]))
     middle = np.median(np.stack([las.x, las.y]), axis=1)
-    ring = middle + 300 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    truth = cropped(file.read_bytes(), Footprint((ring,)))
+    ground = Ground(middle - 300, middle + 300)
+    truth = cropped(file.read_bytes(), ground)
     assert truth.shape[1] > 0
-    assert np.array_equal(read(str(file), Footprint((ring,))), truth)
+    assert np.array_equal(read(str(file), ground), truth)
 
 
-def test_a_footprint_touches_boxes():
-    concave = Footprint((np.array([[0, 0], [10, 0], [10, 10], [5, 1], [0, 10.0]]),), -5, 5)
-    box = lambda *a: tuple(np.array(a, float).reshape(2, 3))  # noqa: E731
-    assert not concave.touches(*box(4.5, 6, 0, 5.5, 9, 1))  # in the notch
-    assert concave.touches(*box(4.5, 0.2, 0, 5.5, 0.4, 1))  # inside, holds no corner
-    assert concave.touches(*box(-9, -9, 0, 19, 19, 1))  # around it
-    assert concave.touches(*box(-1, 4, 0, 11, 5, 1))  # across, no corner in either
-    assert not concave.touches(*box(0, 0, 6, 9, 9, 7))  # above
+def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path):
+    """A hierarchy with two nodes of one line of descent exchanged: refused, or nothing is lost."""
+    file, nodes = tmp_path / "tile.copc.laz", made.entries
+    content = bytearray(made.content)
+    places = {}
+    for at in range(made.hierarchy_at, len(content) - ENTRY.size + 1, ENTRY.size):
+        *key, _, _, n = ENTRY.unpack_from(content, at)
+        if n > 0:
+            places[tuple(key)] = at
+    by_key = {entry[:4]: entry[4:] for entry in nodes}
+    assert by_key.keys() == places.keys()
+    lines = [
+        (above, below)
+        for above in by_key
+        for below in by_key
+        if above[0] < below[0]
+        and tuple(v >> (below[0] - above[0]) for v in below[1:]) == above[1:]
+        and not GROUND.touches(*boxes_of(below)).any()
+        and GROUND.touches(*boxes_of(above)).all()
+    ]
+    assert len(lines) > 20
+    truth, refused = cropped(made.content, GROUND), 0
+    for above, below in lines[:: max(len(lines) // 40, 1)]:
+        changed = bytearray(content)
+        ENTRY.pack_into(changed, places[above], *above, *by_key[below])
+        ENTRY.pack_into(changed, places[below], *below, *by_key[above])
+        file.write_bytes(changed)
+        try:
+            assert np.array_equal(read(str(file), GROUND), truth)
+        except InputError as error:
+            assert "outside of its cube" in str(error)
+            refused += 1
+    assert refused > 10
 
 
-def test_boxes_without_points_in_the_footprint_are_the_only_ones_left_out():
-    """A box with a point of the footprint is touched, whatever the polygon."""
-    rng = np.random.default_rng(1)
-    for _ in range(300):
-        footprint = Footprint((rng.uniform(0, 10, (int(rng.integers(3, 9)), 2)),))
-        low = np.append(rng.uniform(0, 9, 2), 0.0)
-        high = low + np.append(rng.uniform(0.1, 4, 2), 1.0)
-        xyz = rng.uniform(low[:, None], high[:, None], (3, 400))
-        if footprint.contains(xyz).any():
-            assert footprint.touches(low, high)
+def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [1, 3] of a node's cube."""
+    side = 2048.0 / 2 ** key[0]
+    low = CORNER + np.array([key[1:]]) * side
+    return low, low + side
+
+
+def test_a_system_behind_the_points_is_read(made, tmp_path):
+    """Some software writes the coordinate system into a record behind the points."""
+    content = bytearray(made.content)
+    at = content.index(b"LASF_Projection")
+    content[at : at + 15] = b"some_other_user"
+    wkt = content[at + 52 : content.index(b"\0", at + 52) + 1]
+    count = struct.unpack_from("<I", content, 243)[0]
+    struct.pack_into("<I", content, 243, count + 1)
+    content += struct.pack("<H16sHQ32s", 0, b"LASF_Projection", 2112, len(wkt), b"") + wkt
+    file = tmp_path / "tile.copc.laz"
+    file.write_bytes(content)
+    record = open_octree(file).header.vlrs[-1]
+    assert (record.record_id, record.record_data_bytes()) == (2112, wkt)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pyproj
 import pytest
-import rasterio
-from rasterio.transform import Affine, from_origin
+from rasterio.transform import Affine
 
 from stereotruth.errors import InputError
 from stereotruth.lidar import raster_points
@@ -18,30 +15,7 @@ from stereotruth.lidar.survey import survey
 
 from ...synthetic.las import FT, SOUTH, US_FT, WEST, everything, refused, write_gtx
 from ...synthetic.stores import tree_digest
-
-UTM = "EPSG:32650"
-
-
-def write_raster(file: Path, heights: np.ndarray, cell: float = 0.5, **profile) -> Path:
-    """A GeoTIFF of heights [rows, cols], its upper left corner 100 m north of SOUTH."""
-    options = {
-        "driver": "GTiff",
-        "height": heights.shape[-2],
-        "width": heights.shape[-1],
-        "count": 1,
-        "dtype": heights.dtype,
-        "crs": UTM,
-        "transform": from_origin(WEST, SOUTH + 100, cell, cell),
-        "nodata": -9999,
-    } | profile
-    units, scales = options.pop("units", None), options.pop("scales", None)
-    with rasterio.open(file, "w", **options) as raster:
-        if units:
-            raster.units = (units,)
-        if scales:
-            raster.scales, raster.offsets = ((value,) for value in scales)
-        raster.write(heights if heights.ndim == 3 else heights[None])
-    return file
+from ...synthetic.surface_rasters import UTM, write_raster
 
 
 def surface(rows: int = 90, cols: int = 70) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
+from stereotruth.matching.kinds import KINDS
 from stereotruth.matching.matcher import UncertainMatcher
 from stereotruth.matching.methods import make_method
 
@@ -138,3 +139,23 @@ def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
         method(pipeline=str(file))
     with pytest.raises(InputError, match="has no setting 'penalty'"):
         method(penalty=3)
+
+
+def test_mccnn_that_is_not_installed_names_its_extra(monkeypatch):
+    monkeypatch.setattr(pandora_pipeline, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"mc_cnn.*'\.\[mccnn\]'"):
+        method(pipeline="mccnn")
+
+
+@pytest.mark.slow
+def test_mccnn_has_our_sign_an_uncertainty_and_its_weights_among_its_files():
+    pytest.importorskip("pandora_plugin_mc_cnn", reason="pip install '.[mccnn]'")
+    pytest.importorskip("torch", reason="pip install '.[mccnn]'")
+    scene, left, right = images()
+    disparity, sigma = method(pipeline="mccnn").with_uncertainty(left, right, RANGE)
+    error = np.abs(disparity - scene.labels)[PART]
+    assert np.isfinite(error).mean() > 0.8
+    assert np.nanmedian(error) < 0.3
+    assert np.array_equal(np.isfinite(sigma), np.isfinite(disparity))
+    (weights,) = KINDS["pandora"].files({"pipeline": "mccnn"})
+    assert weights.is_file()  # so that scores have its checksum

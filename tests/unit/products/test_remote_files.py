@@ -10,7 +10,7 @@ from threading import Thread
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products import remote_files
+from stereotruth.products import remote_files, web_requests
 from stereotruth.products.remote_files import (
     FOLDER,
     gdal_name,
@@ -84,7 +84,6 @@ def answering(status, content=b""):
 
 @pytest.mark.parametrize("status", [404, 410])
 def test_what_is_not_there_is_absent(tmp_path, monkeypatch, status):
-    pytest.importorskip("aiohttp")
     monkeypatch.chdir(tmp_path)
     with answering(status) as url:
         old = place_of(f"{url}/left_RPC.TXT")
@@ -99,17 +98,17 @@ def test_what_is_not_there_is_absent(tmp_path, monkeypatch, status):
 @pytest.mark.parametrize("status", [400, 401, 403, 429, 500, 502, 503])
 def test_a_server_that_fails_is_not_taken_for_a_missing_file(tmp_path, monkeypatch, status):
     """As it was with RPC files beside an image: the image's own tag was used then."""
-    pytest.importorskip("aiohttp")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(web_requests, "WAIT_S", 0.01)
     with answering(status) as url:
         for bring in (remote_files.bring_image, remote_files.fetch, remote_files.stand_in):
-            with pytest.raises(InputError, match=rf"does not answer as it should .*{status}"):
+            with pytest.raises(InputError, match=rf"does not answer as it should: .*{status}"):
                 bring(f"{url}/left.tif")
 
 
 def test_a_server_that_is_gone_is_not_taken_for_a_missing_file(tmp_path, monkeypatch):
-    pytest.importorskip("aiohttp")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(web_requests, "WAIT_S", 0.01)
     with answering(200) as url:
         pass
     with pytest.raises(InputError, match="nobody answers there"):
@@ -117,7 +116,6 @@ def test_a_server_that_is_gone_is_not_taken_for_a_missing_file(tmp_path, monkeyp
 
 
 def test_a_small_file_is_fetched(tmp_path, monkeypatch):
-    pytest.importorskip("aiohttp")
     monkeypatch.chdir(tmp_path)
     with answering(200, b"text") as url:
         assert remote_files.fetch(f"{url}/left_RPC.TXT").read_bytes() == b"text"
@@ -148,32 +146,21 @@ def test_gdal_may_read_the_one_file(tmp_path, monkeypatch):
 
 
 def test_a_server_that_gives_no_parts_is_refused(monkeypatch):
-    class Server:
-        def __init__(self, **info):
-            self.given = info
-
-        def _strip_protocol(self, url):
-            return url
-
-        def info(self, name):
-            return self.given
-
-    url = "https://host/left.tif"
     for info in ({"size": None}, {"size": 5, "partial": False}):
-        monkeypatch.setattr(remote_files, "_file_system", lambda scheme, i=info: Server(**i))
+        monkeypatch.setattr(remote_files, "info_of", lambda url, hosts, i=info: i)
         with pytest.raises(InputError, match="as a whole only"):
-            remote_files.stand_in(url)
+            remote_files.stand_in("https://host/left.tif")
 
 
 def test_a_stand_in_keeps_its_time_while_the_file_stays(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     state = json.dumps({"size": 5, "content": "tag"}) + "\n"
-    monkeypatch.setattr(remote_files, "_look", lambda url: state)
+    monkeypatch.setattr(remote_files, "_look", lambda url, hosts=None: state)
     place = remote_files.stand_in("https://host/left.tif")
     before = place.stat().st_mtime_ns
     assert remote_files.stand_in("https://host/left.tif").stat().st_mtime_ns == before
     assert size_of(place) == 5
     remote_files.refuse_changed(place)
-    monkeypatch.setattr(remote_files, "_look", lambda url: None)
+    monkeypatch.setattr(remote_files, "_look", lambda url, hosts=None: None)
     with pytest.raises(InputError, match="changed on its server"):
         remote_files.refuse_changed(place)

@@ -55,7 +55,8 @@ def test_residuals_and_closure_are_shown_as_they_are(tmp_path):
     (site, image) = cells(text, "closure")
     assert (site[0], image[0]) == ("all triplets", "A")
     assert site[1:5] == ["90", "−0.001", "0.015", "0.016"]
-    assert text.count('<a href="report.html"><circle') == 1  # of the pair that is a scene
+    assert text.count('<a href="report.html#scene-A-b"><circle') == 1  # of the pair that is a scene
+    assert '<a href="report.html#scene-A-b">A-b</a>' in text
     assert "&lt;b&gt;" in text and "<b>" not in text.partition("</header>")[2]
 
 

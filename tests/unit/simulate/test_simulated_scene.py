@@ -73,6 +73,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.atomic_outputs",
         "products.records",
         "products.remote_files",
+        "products.web_requests",
         "products.runs",
         "settings",
     }

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from stereotruth.lidar.lattice import LATTICE_M
-from stereotruth.surface.rough_tops import rough_tops
 
-from ...synthetic.strewn_points import CELL_M, scale_of, surface_of
+from ...synthetic.strewn_points import CELL_M, surface_of
 
 
 def test_points_that_went_through_are_left_out_but_not_the_ground_of_a_gap() -> None:
@@ -20,7 +19,7 @@ def test_points_that_went_through_are_left_out_but_not_the_ground_of_a_gap() -> 
         return np.where(gap | (rng.random(x.size) < 0.25), 0.0, top)
 
     surface = surface_of(height)
-    tops = rough_tops(surface, scale_of(1.0)).vertices
+    tops = surface.vertices.taken(np.unique(surface.tops.corner))
     x, y = (q / 3000 * CELL_M for q in (tops.lon_q, tops.lat_q))
     low = tops.h_q * LATTICE_M < 4.0
     far = np.hypot(x - 25.0, y - 25.0)

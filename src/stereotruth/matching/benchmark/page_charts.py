@@ -40,6 +40,9 @@ def cumulative_chart(methods: Sequence[Row], folders: Sequence[str | Path]) -> C
     )
 
 
+LETTER = 6.8  # px, width of a letter of the names of strata, about
+
+
 def strata_chart(methods: Sequence[Row]) -> Chart | None:
     """EPE by what the pixels show, with 95 % intervals; None of no strata."""
     names = list(dict.fromkeys(row["stratum"] for of in methods for row in of["strata"]))
@@ -92,5 +95,5 @@ def strata_chart(methods: Sequence[Row]) -> Chart | None:
         series=tuple(series),
         width=WIDTH - 70,
         height=height,
-        left=126.0,
+        left=max(126.0, LETTER * max(map(len, names))),
     )

@@ -36,7 +36,7 @@ from .panels import Column, draw_columns
 from .prediction_files import read_prediction, read_record, read_uncertainty
 from .protocols import Protocol, pair_sha256, protocol_of
 from .scores import ALL, Collector, Scorer, Scores
-from .strata import Products, exact_truth, height_m_per_px, label_strata
+from .strata import Products, exact_truth, height_m_per_px, label_strata, layers_of
 from .submission import SUBMITTED, hold_against
 
 log = logging.getLogger("stereotruth")
@@ -67,6 +67,7 @@ class ScoringPlan:
 class _Sums:
     """Sums over the pairs that are scored, by ``scorer`` and ``protocol``."""
 
+    dataset: StereoDataset
     scorer: Scorer
     protocol: Protocol
     products: Products
@@ -84,7 +85,13 @@ class _Sums:
         scorer = Scorer(dataset.disparity_range, thresholds, dataset.grows_with_height)
         doubts = Doubts(dataset.disparity_range)
         return cls(
-            scorer, protocol, products, Collector(thresholds), Cumulative(thresholds), doubts
+            dataset,
+            scorer,
+            protocol,
+            products,
+            Collector(thresholds),
+            Cumulative(thresholds),
+            doubts,
         )
 
     def add(
@@ -92,7 +99,8 @@ class _Sums:
     ) -> np.ndarray:
         """Add a pair with disparities ``found`` and their uncertainty; the truth it is held to."""
         scorer, truth = self.scorer, labels
-        strata_of_labels = label_strata(pair, labels, self.products)
+        layers = layers_of(self.dataset, pair)
+        strata_of_labels = label_strata(pair, labels, self.products, layers)
         exact_of_pair = exact_truth(pair, self.products)
         truths = [labels]
         if self.protocol.truth == "exact":

@@ -51,6 +51,9 @@ class Method:
     version: Text = ""
     """of the method, for `scores.json`"""
 
+    trained_on: Annotated[tuple[Text, ...], Unit("names")] = ()
+    """datasets that the method was trained on, named as in `benchmark.datasets`, for tables"""
+
     training: Annotated[dict[str, Any], AfterValidator(_part_of_training)] = field(
         default_factory=dict
     )

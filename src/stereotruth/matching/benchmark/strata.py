@@ -6,19 +6,22 @@ match_inside,       whether the right tile holds the pixel's match, by its label
 match_outside       a method can but guess (any dataset)
 near_occlusion      a pixel that only one view sees lies within ``NEAR_PX`` (by the tile's status)
 ground, vegetation,
-building, other     by the class of the LiDAR point that gave the label
+building, other     by the class of the LiDAR point that gave the label (layer ``class``)
+agl_…               by its height above the ground, ``AGL_M`` (layer ``agl``)
+uncertainty_…       by the label's standard uncertainty, ``UNCERTAINTY_PX`` (layer ``uncertainty``)
 exact_visible       against a synthetic city's exact truth: all pixels that both views see and that
                     are unchanged and no water, labelled or not
 exact_hidden        likewise, pixels behind something in the right view
 ==================  ================================================================================
 
-All but the first three come from products of the workflow, of which the dataset's manifest names
+Layers are those of the dataset (``tiles.layers``). Classes of a dataset without that layer, and all
+else but the first three, come from products of the workflow, of which the dataset's manifest names
 the tile, scene and window; what is missing is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +31,10 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from ...dataset.layer_kinds import column
 from ...dataset.manifest import Tile
 from ...dataset.pixel_size import PixelSize
-from ...dataset.stereo_dataset import Pair, match_inside
+from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...products.grids import require_complete
 from ...products.rasters import read_flags
 
@@ -42,6 +46,9 @@ STEP_PX = 3.0
 FAR_PX = np.float32(1e6)  # beyond any disparity
 HIDDEN = ("hidden_in_left", "hidden_in_right")  # of the meanings of a status
 WATER = 5  # of the layer surface of the exact truth
+AGL_M = (2.0, 10.0, 30.0)  # bounds: low things, houses and trees, blocks, towers
+UNCERTAINTY_PX = (0.05, 0.1, 0.2)
+LAYERS = ("class", "agl", "uncertainty")  # of ``tiles.layers``
 CLASSES = {"ground": (2,), "vegetation": (3, 4, 5), "building": (6,)}  # ASPRS
 
 
@@ -85,19 +92,49 @@ def height_m_per_px(pairs: Sequence[Pair], products: Products) -> float | None:
     return None if size is None else round(size.height_m, 4)
 
 
-def label_strata(pair: Pair, labels: NDArray[np.float32], products: Products) -> dict[str, Bools]:
-    """Masks [h, w] of the strata of a pair's labels (float32, NaN unlabelled)."""
+def layers_of(dataset: StereoDataset, pair: Pair) -> dict[str, NDArray[Any]]:
+    """Those of LAYERS that a pair has, [h, w]: m, px, LAS classes."""
+    return {name: dataset.layer(pair, name) for name in LAYERS if pair.row.get(column(name))}
+
+
+def label_strata(
+    pair: Pair,
+    labels: NDArray[np.float32],
+    products: Products,
+    layers: Mapping[str, NDArray[Any]] | None = None,
+) -> dict[str, Bools]:
+    """Masks [h, w] of the strata of a pair's labels (float32, NaN unlabelled).
+
+    ``layers``: see :func:`layers_of`.
+    """
+    layers = layers or {}
     found = {"near_step": near_step(labels), **match_in_tile(labels)}
     hidden = products.hidden(pair)
     if hidden is not None:
         found["near_occlusion"] = cv2.dilate(hidden.astype(np.uint8), _square()) > 0
-    grid = products.grid(products.project, pair)
-    if grid is not None:
+    classes = layers.get("class")
+    if classes is None and (grid := products.grid(products.project, pair)) is not None:
         classes = grid["surface_class"][Tile.of(pair.row).window]
+    if classes is not None:
         for name, codes in CLASSES.items():
             found[name] = np.isin(classes, codes)
         found["other"] = ~np.any([found[name] for name in CLASSES], axis=0)
+    if "agl" in layers:
+        found |= by_bins("agl", layers["agl"], AGL_M, "m")
+    if "uncertainty" in layers:
+        found |= by_bins("uncertainty", layers["uncertainty"], UNCERTAINTY_PX, "px")
     return found
+
+
+def by_bins(
+    name: str, values: NDArray[Any], bounds: Sequence[float], unit: str
+) -> dict[str, Bools]:
+    """Masks of values below, between and from the bounds on; NaN is in none of them."""
+    low, *between, high = zip((-np.inf, *bounds), (*bounds, np.inf))
+    masks = {f"{name}_below_{low[1]:g}_{unit}": values < low[1]}
+    for start, end in between:
+        masks[f"{name}_{start:g}_to_{end:g}_{unit}"] = (values >= start) & (values < end)
+    return masks | {f"{name}_from_{high[0]:g}_{unit}": values >= high[0]}
 
 
 def exact_truth(pair: Pair, products: Products) -> dict[str, NDArray[np.float32]]:

@@ -24,6 +24,8 @@ from ...products.html_tables import Cell, Column, metres, minus
 from ...products.html_tables import Table as Shown
 from ..kinds import KINDS
 from . import published_scores
+from .training_data import COLUMNS as TRAINING
+from .training_data import training_data
 
 Row = dict[str, Any]
 
@@ -175,6 +177,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             "peak_memory_mb": of["peak_memory_mb"],
             "device": of["device"],
             "threads": of["threads"],
+            **training_data(of),
         }
         published = published_scores.TABLE5.get(_kind(of)) if beside_paper else None
         if published and not of["fine_tuned_of"]:
@@ -229,11 +232,16 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
             known = epe is not None and height is not None
             text = metres(epe, height).removesuffix(" m of height") if known else "–"
             cells.insert(1, Cell(text, f"{epe * height:.9g}" if known else "", best=cells[0].best))
+        cells += [Cell(row[key], row[key]) for key in TRAINING]
         lines.append((Cell(row["method"], row["method"]), *cells))
     titles = [figure.title for figure in figures]
     if any(heights):
         titles.insert(1, "EPE, m of height")
-    columns = (Column("method", False), *(Column(title, True) for title in titles))
+    columns = (
+        Column("method", False),
+        *(Column(title, True) for title in titles),
+        *(Column(title, False) for title in TRAINING.values()),
+    )
     return Shown(columns, (("", tuple(lines)),))
 
 

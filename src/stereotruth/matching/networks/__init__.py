@@ -1,1 +1,1 @@
-"""StereoNet, PSM-Net and HMSM-Net: structure, weights, training, inference (PyTorch)."""
+"""StereoNet, PSM-Net, HMSM-Net, DenseMapNet: structure, weights, training, inference (PyTorch)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .weights import SavedNetwork
 
-SCALINGS = ("standardise", "us3d")
+SCALINGS = ("standardise", "us3d", "dfc2019")
 SAMPLES = 1 << 22  # pixels that a quantile is taken from
 GREY = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
 
@@ -26,7 +26,7 @@ class Scaling(NamedTuple):
 def image_statistics(image: Any, scaling: str) -> tuple[float, float] | None:
     """What the scaling of an image follows from (NumPy or Dask array of any size).
 
-    ``standardise``: mean and standard deviation. ``us3d``: 0 and the grey value that becomes the
+    ``standardise``: mean and standard deviation. Others: 0 and the grey value that becomes the
     brightest of 8 bits, above 99.9 % of the pixels that have data (of large images every k-th pixel
     of every k-th row is looked at); None for images of 8 bits, which stay as they are.
     """
@@ -65,12 +65,13 @@ def scaled(
     """
     grey = image.ndim == 2
     first, second = statistics or image_statistics(image, model.scaling) or (0.0, 255.0)
-    if model.scaling == "us3d":
-        bands = np.repeat(image[..., None], 3, axis=2) if grey else image[..., ::-1]
+    if model.scaling != "standardise":
+        bands = np.repeat(image[..., None], 3, axis=2) if grey else image
         bands = np.minimum(bands.astype(np.float32) * np.float32(255 / second), 255)
         bands = bands / np.float32(127.5) - 1
         if model.channels == 1:
-            bands = bands[..., ::-1] @ np.array(GREY, np.float32)[:, None]
+            bands = bands @ np.array(GREY, np.float32)[:, None]
+        bands = bands[..., ::-1] if model.scaling == "us3d" else bands / 2
         return np.ascontiguousarray(bands.transpose(2, 0, 1), dtype=np.float32)
     if not grey and model.channels == 1:
         image = image @ np.array(GREY, np.float32)

@@ -201,6 +201,11 @@ def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> Net
             f"method {name!r}: no uncertainty {uncertainty!r} of a network",
             remedy=f"take one of {', '.join(filter(None, UNCERTAINTIES))}, or null",
         )
+    if uncertainty == "entropy" and not hasattr(network, "expected"):
+        raise InputError(
+            f"method {name!r}: {kind} has no softmax whose entropy would be an uncertainty",
+            remedy="take uncertainty: flips, or null",
+        )
     device = choose_device(settings.get("device"))
     if device.type == "cpu" and workers:
         torch.set_num_threads(workers)

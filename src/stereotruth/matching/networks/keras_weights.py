@@ -23,7 +23,8 @@ from ...errors import InputError
 from ..kinds import NETWORKS
 from .image_scaling import SCALINGS
 from .keras_files import REMEDY, read_weights
-from .weights import SavedNetwork, save_weights
+from .layers import TRAINED
+from .weights import SavedNetwork, save_weights, scaling_of
 
 
 def _parts(network: nn.Module) -> Iterator[nn.Module]:
@@ -40,11 +41,13 @@ def _slots(part: nn.Module) -> list[tuple[torch.Tensor, tuple[int, ...]]]:
     trained: list[tuple[torch.Tensor, tuple[int, ...]]] = []
     statistics: list[tuple[torch.Tensor, tuple[int, ...]]] = []
     for module in part.modules():
-        if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.ConvTranspose3d, nn.Linear)):
+        if isinstance(module, TRAINED):
             n = module.weight.dim()
             # kernels are [space..., in, out] there; transposed ones [space..., out, in], so that
-            # the same axes serve both
-            trained.append((module.weight, (n - 1, n - 2, *range(n - 2))))
+            # the same axes serve both; those of each channel by itself [space..., in, 1]
+            single = getattr(module, "groups", 1) > 1
+            ends = (n - 2, n - 1) if single else (n - 1, n - 2)
+            trained.append((module.weight, (*ends, *range(n - 2))))
             if module.bias is not None:
                 trained.append((module.bias, (0,)))
         elif isinstance(module, (nn.BatchNorm2d, nn.BatchNorm3d)):
@@ -96,14 +99,14 @@ def read_keras(
 ) -> tuple[SavedNetwork, nn.Module]:
     """A network with the weights of a Keras file, whose first kernel says how many channels.
 
-    ``scaling``: None: that of US3D for three channels, else that of WHU-Stereo.
+    ``scaling``: None: that of the kind (:func:`.weights.scaling_of`).
     Raises InputError as :func:`load_keras` does.
     """
     first = next((of[0] for of in read_weights(path)), None)
     if first is None:
         raise InputError("no weights", file=path, remedy=REMEDY)
-    channels = first.shape[2] if first.ndim == 4 and first.shape[2] == 3 else 1
-    scaling = scaling or ("us3d" if channels == 3 else "standardise")
+    channels = 3 if first.ndim == 4 and first.shape[2] % 3 == 0 else 1  # of one image or of both
+    scaling = scaling or scaling_of(kind, channels)
     model = SavedNetwork(kind, disparity_range, channels, scaling)
     network = model.build()
     load_keras(network, path)

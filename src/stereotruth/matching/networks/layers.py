@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from .convolution_gradient import convolve
 
 EPSILON, MOMENTUM = 1e-3, 0.01  # of batch normalisation
+TRAINED = (nn.Conv2d, nn.Conv3d, nn.ConvTranspose2d, nn.ConvTranspose3d, nn.Linear)  # kernels
 SMALL = 20480  # channels x planes x rows; see _is_slow
 
 
@@ -164,7 +165,7 @@ def residuals(
 def initialise(network: nn.Module) -> None:
     """Set all kernels to He's normal distribution, biases to zero."""
     for module in network.modules():
-        if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.ConvTranspose3d, nn.Linear)):
+        if isinstance(module, TRAINED):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

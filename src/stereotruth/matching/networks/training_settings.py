@@ -68,8 +68,8 @@ class Training:
     crop_px: Annotated[
         tuple[Annotated[Whole, Field(ge=8)], Annotated[Whole, Field(ge=8)]] | None, Unit("px, px")
     ] = None
-    """rows and columns of random windows that are trained on, multiples of 8 (StereoNet), 64
-    (HMSM-Net), 256 (PSM-Net); null: whole tiles"""
+    """rows and columns of random windows that are trained on, multiples of 8 (StereoNet,
+    DenseMapNet), 64 (HMSM-Net), 256 (PSM-Net); null: whole tiles"""
 
     crops_per_pair: Annotated[Count, Unit("windows")] = 1
     """of each pair in an epoch"""

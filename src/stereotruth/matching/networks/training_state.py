@@ -23,7 +23,7 @@ from ...products.rasters import read_image
 from .load_network import load_network
 from .training_pairs import LabelledPairs
 from .training_settings import TrainingSettings
-from .weights import SavedNetwork, covering
+from .weights import SavedNetwork, covering, scaling_of
 
 log = logging.getLogger("stereotruth")
 
@@ -93,8 +93,8 @@ def model_of(kind: str, dataset: StereoDataset, training: TrainingSettings) -> S
     span = covering(kind, dataset.disparity_range)
     if training.initial_weights is None:
         image = read_image(dataset.pairs("train")[0].left)
-        colour = image.ndim == 3
-        return SavedNetwork(kind, span, 3 if colour else 1, "us3d" if colour else "standardise")
+        channels = 3 if image.ndim == 3 else 1
+        return SavedNetwork(kind, span, channels, scaling_of(kind, channels))
     there, _ = load_network(training.initial_weights, kind)
     return replace(there, kind=kind, disparity_range=span)
 

@@ -23,13 +23,21 @@ def network_class(kind: str) -> type[nn.Module]:
     return getattr(importlib.import_module(f"stereotruth.{module}"), name)
 
 
+def scaling_of(kind: str, channels: int) -> str:
+    """The scaling of images that a kind of network is trained with."""
+    return (
+        getattr(network_class(kind), "colour_scaling", "us3d") if channels == 3 else "standardise"
+    )
+
+
 @dataclass(frozen=True)
 class SavedNetwork:
     """What a network is made of besides its weights.
 
     ``kind`` of :data:`kinds.NETWORKS`; ``disparity_range`` in px, max exclusive; ``channels`` of
     its images (1 or 3); ``scaling``: ``standardise`` (each image by its mean and standard
-    deviation, as for WHU-Stereo) or ``us3d`` (8-bit values to -1 ... 1, blue first, as for US3D).
+    deviation, as for WHU-Stereo), ``us3d`` (8-bit values to -1 ... 1, blue first, as for US3D) or
+    ``dfc2019`` (8-bit values to -1/2 ... 1/2, red first, as for the contest's DenseMapNet).
     """
 
     kind: str

@@ -90,3 +90,28 @@ def test_pictures_are_chosen_of_all_cities():
     assert names == ["A_3", "A_5", "B_0", "C_1", "C_2"]
     assert len(choose(pairs(A=2, B=3), 9)) == 5
     assert choose(pairs(A=2), 0) == []
+
+
+def test_layers_of_the_tiles_are_strata_of_the_scores(compared, tmp_path):
+    """Errors of high things by their layer agl, and of all others."""
+    (pair, *_) = StereoDataset("toy", compared / "data", "whu", (-8, 8)).pairs("test")
+    labels, high = StereoDataset("toy", compared / "data", "whu", (-8, 8)).labels(pair), 20.0
+    agl = np.full(SHAPE, -9999, np.float32)
+    agl[:, :10], agl[:, 10:] = 0.5, high
+    root = tmp_path / "data"
+    write(root / "agl.tif", agl, nodata=-9999)
+    for name, file in (("left", pair.left), ("right", pair.right), ("disp", pair.disparity)):
+        (root / f"{name}.tif").write_bytes(file.read_bytes())
+    columns = {"tile": pair.name, "city": "Town", "split": "test", "layer_agl": "agl.tif"}
+    columns |= {name: f"{name}.tif" for name in ("left", "right", "disp")}
+    (root / "manifest.csv").write_text(f"{','.join(columns)}\n{','.join(columns.values())}\n")
+    dataset = StereoDataset("toy", root, "stereotruth", (-8, 8))
+    found = np.where(agl == high, labels + 2, labels + np.float32(0.25))
+    write(tmp_path / f"theirs/{pair.name}.tif", found)
+    entry = {"kind": "folder", "folder": str(tmp_path / "theirs")}
+    predict(dataset, "test", "t", entry, tmp_path / "match", work=tmp_path / "work")
+    summary = score(dataset, "test", "T", tmp_path / "match", tmp_path / "scores", PLAN)
+    epe = {row["stratum"]: row["epe_px"] for row in summary["strata"]}
+    assert epe["agl_below_2_m"] == pytest.approx(0.25, abs=1e-5)
+    assert epe["agl_10_to_30_m"] == pytest.approx(2.0, abs=1e-5)
+    assert "agl_2_to_10_m" not in epe and not any(name.startswith("unc") for name in epe)

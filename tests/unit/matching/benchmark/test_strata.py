@@ -115,6 +115,32 @@ def test_status_and_classes_are_those_of_the_window(own):
     assert found["other"][1:].all()
 
 
+def test_layers_of_the_dataset_are_strata(own):
+    """Each value is in the bin that its bounds say, and one that is not known is in none."""
+    pair, products, stores = own
+    stores["surface_class"][:] = 2
+    agl = np.full((SIZE, SIZE), np.nan, np.float32)
+    agl[0, :7] = (-0.3, 1.9, 2.0, 9.9, 10.0, 29.9, 30.0)
+    sigma = np.full((SIZE, SIZE), np.nan, np.float32)
+    sigma[0, :5] = (0.01, 0.05, 0.1, 0.19, 0.7)
+    layers = {"class": np.full((SIZE, SIZE), 6, np.uint8), "agl": agl, "uncertainty": sigma}
+    found = label_strata(pair, np.zeros((SIZE, SIZE), np.float32), products, layers)
+    assert found["building"].all() and not found["ground"].any()  # of the layer, not of the store
+    wanted = {
+        "agl_below_2_m": [0, 1],
+        "agl_2_to_10_m": [2, 3],
+        "agl_10_to_30_m": [4, 5],
+        "agl_from_30_m": [6],
+        "uncertainty_below_0.05_px": [0],
+        "uncertainty_0.05_to_0.1_px": [1],
+        "uncertainty_0.1_to_0.2_px": [2, 3],
+        "uncertainty_from_0.2_px": [4],
+    }
+    assert list(found)[-8:] == list(wanted)
+    for name, columns in wanted.items():
+        assert np.argwhere(found[name]).tolist() == [[0, column] for column in columns], name
+
+
 def test_exact_truth_is_taken_to_the_tile(own):
     """Less the right image's offset; without change and water."""
     pair, products, stores = own

@@ -17,7 +17,11 @@ from ....synthetic.small_networks import method, write_as_keras
 
 @pytest.mark.parametrize(
     "kind, trained, statistics",
-    [("stereonet", 621380, 3712), ("psmnet", 1882704, 6528), ("hmsmnet", 1308788, 3776)],
+    [
+        ("stereonet", 621380, 3712),
+        ("psmnet", 1882704, 6528),
+        ("hmsmnet", 1308788, 3776),
+    ],
 )
 def test_parameters_are_as_many_as_the_authors(kind: str, trained: int, statistics: int) -> None:
     network = SavedNetwork(kind, (-128, 64)).build()

@@ -1,4 +1,4 @@
-"""The points that a window of the grid needs."""
+"""The convex hull, held against Qhull."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from stereotruth.disparity.point_windows import corners_of_hull
+from stereotruth.numerics.hull import corners_of_hull
 
 
 @pytest.mark.parametrize("n", [3, 4, 50, 400])

@@ -1,0 +1,165 @@
+"""Do the images agree better at another disparity than at that of the labels?
+
+What has grown, been felled or been raised between LiDAR and images is seen by both images, at
+another disparity. So the detail of both images (:mod:`stereotruth.epipolar.image_detail`) is
+correlated over each pixel's surface at the labels' disparity and at shifted ones, and averaged over
+the surface around it. That is positive evidence: shadows that have moved between the images, or
+noise, lower the correlation at all disparities alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.image_detail import detail
+from ..epipolar.surface_correlation import surface_correlation
+from .image_patches import Patch
+from .pair_window import PairWindow
+from .pixel_labels import Labels
+from .surface_means import apart_from_steps, surface_mean, warp_to_left
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+SHIFTS_PX = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
+SIGNAL = 0.6  # of both images, for absence of agreement to tell something
+LEAST = 0.3  # of agreement and advantage; chance has up to 0.3 at one of the shifts, and 0 here
+# Fisher's z of a correlation of n independent pixels has the variance 1 / n, a difference of two
+# has twice that. The optics leave one independent pixel of INDEPENDENT_PX2.
+SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all shifts reaches 2
+INDEPENDENT_PX2 = 4.0
+Z_LIMIT = 0.999
+SHIFTED_PX = 24  # by which these, and what their windows take in, reach beyond a pixel's match
+TILE_PX = 64  # side of the parts of a window that are worked on as far as any of it is wanted
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftedAgreement:
+    """Mean correlation of both images' detail over the surface around each pixel [h, w].
+
+    ``here``: at the labels' disparity; ``elsewhere``: the greatest of shifted ones, which is at
+    ``shift`` px. NaN where nothing was asked, and where there is nothing to correlate. ``signal``:
+    what the images of the same ground would correlate by, as their noise leaves it; 0 where either
+    has no value. ``pixels``: that a mean takes in, at most.
+    """
+
+    here: Singles
+    elsewhere: Singles
+    shift: Singles
+    signal: Singles
+    pixels: int
+
+    @property
+    def contradicts(self) -> Bools:
+        """Where the images contradict the labels [h, w].
+
+        That is, where they agree significantly better elsewhere; or, with more signal than noise,
+        where the agreement and its advantage over that elsewhere sum up to less than LEAST.
+        """
+        z_here, z_elsewhere = (
+            np.arctanh(np.clip(value, -Z_LIMIT, Z_LIMIT)) for value in (self.here, self.elsewhere)
+        )
+        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < LEAST)
+        limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
+        return is_none | (z_elsewhere - z_here > limit)
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """Of an image: the ``patch`` with the detail in place of its pixels, the share of ``signal``
+    of each."""
+
+    patch: Patch
+    signal: Singles
+
+    @classmethod
+    def of(cls, patch: Patch, noise: float) -> Detail:
+        """By the variance of the ``noise``, DN²."""
+        pixels, signal = detail(patch.pixels, noise)
+        return cls(replace(patch, pixels=pixels), signal)
+
+
+def shifted_agreement(
+    labels: Labels,
+    window: PairWindow,
+    noise: tuple[float, float],
+    window_px: int,
+    reach: int,
+    wanted: Bools,
+) -> ShiftedAgreement:
+    """At the ``wanted`` pixels [h, w] of a window, over its ``labels``' surfaces.
+
+    ``noise``: variances of both images, DN²; ``window_px``: side of the correlation's window;
+    ``reach``: px up to which the surface is averaged.
+    """
+    shape = wanted.shape
+    out = np.full((4, *shape), np.nan, np.float32)
+    pad = reach + window_px // 2 + 1
+    images: tuple[Detail, Detail] | None = None
+    for top in range(0, shape[0], TILE_PX):
+        for side in range(0, shape[1], TILE_PX):
+            tile = np.s_[top : top + TILE_PX, side : side + TILE_PX]
+            if not wanted[tile].any():
+                continue
+            if images is None:
+                images = tuple(map(Detail.of, (window.left, window.right), noise))
+            first = max(top - pad, 0), max(side - pad, 0)
+            around = np.s_[first[0] : top + TILE_PX + pad, first[1] : side + TILE_PX + pad]
+            inside = np.s_[
+                top - first[0] : top - first[0] + TILE_PX,
+                side - first[1] : side - first[1] + TILE_PX,
+            ]
+            part = _means(labels, window, images, around, window_px, reach)
+            for k, values in enumerate(part):
+                out[k][tile] = np.where(wanted[tile], values[inside], np.nan)
+    return ShiftedAgreement(*out, (2 * reach + window_px) ** 2)
+
+
+def _means(
+    labels: Labels,
+    window: PairWindow,
+    images: tuple[Detail, Detail],
+    around: tuple[slice, slice],
+    window_px: int,
+    reach: int,
+) -> tuple[Singles, Singles, Singles, Singles]:
+    """The arrays of :class:`ShiftedAgreement` of a part of a window."""
+    left, right = (image.patch for image in images)
+    disparity, slope = labels.disparity[around], labels.slope[:, *around]
+    rows, cols = disparity.shape
+    row, col = window.rows.start + around[0].start, window.cols.start + around[1].start
+    original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
+    clear = apart_from_steps(disparity)
+    every = max(reach // 4, 1)
+
+    def mean(shift: float) -> Singles:
+        at = slice(row, row + rows), slice(col, col + cols)
+        warped = warp_to_left(right, *at, disparity + shift)
+        warped = np.where(original == 0.0, np.nan, warped)
+        correlation = surface_correlation(original, warped, disparity, slope, window_px, clear)
+        return surface_mean(correlation, disparity, slope, reach, every)
+
+    elsewhere = np.full((rows, cols), np.nan, np.float32)
+    shifted = np.full((rows, cols), np.nan, np.float32)
+    for shift in SHIFTS_PX:
+        here = mean(shift)
+        better = here > np.where(np.isnan(elsewhere), -np.inf, elsewhere)
+        elsewhere[better], shifted[better] = here[better], shift
+    return mean(0.0), elsewhere, shifted, _signal(images, row, col, disparity)
+
+
+def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:
+    """Geometric mean of the shares of signal of both images, at pixels [h, w] from (row, col)."""
+    rows, cols = disparity.shape
+    left, right = images
+    there = np.floor(np.arange(col, col + cols) - disparity + 0.5) - right.patch.col
+    inside = (there >= 0) & (there < right.signal.shape[1])  # also false for NaN
+    at = np.where(inside, there, 0).astype(np.int64)
+    strip = right.signal[row - right.patch.row :][:rows]
+    other = np.where(inside, np.take_along_axis(strip, at, axis=1), np.float32(0.0))
+    own = left.signal[row - left.patch.row :, col - left.patch.col :][:rows, :cols]
+    return np.sqrt(own * other)

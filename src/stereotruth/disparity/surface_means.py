@@ -1,0 +1,108 @@
+"""The right image brought to the left by the labels, and means over the labels' surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
+from ..epipolar.warping import warp_rows
+from ..kernels import kernel
+from .image_patches import Patch
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+VOTE_PX = 12  # pixels up to here vote,
+VOTE_STEP = 3  # every so many: 81 votes at most
+
+
+def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
+    """Right image at (x - disparity, y) of every pixel of a window of the left grid, float64[h, w].
+
+    NaN where there is no disparity, or the right image has no value. The patch holds all rows.
+    """
+    top = rows.start - right.row
+    image = right.pixels[top : top + len(disparity), : right.usable.shape[1]]
+    return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
+
+
+def apart_from_steps(disparity: Floats) -> Bools:
+    """Pixels [h, w] whose neighbours all have a disparity within SURFACE_PX of theirs."""
+    rows, cols = disparity.shape
+    around = np.pad(disparity, 1, constant_values=np.nan)
+    out = np.ones(disparity.shape, np.bool_)
+    for down in range(3):
+        for across in range(3):
+            near = around[down : down + rows, across : across + cols]
+            out &= np.abs(near - disparity) <= SURFACE_PX  # also false for NaN
+    return out
+
+
+@kernel
+def _surface_mean(
+    values: Singles,
+    disparity: Singles,
+    voters: Singles,
+    slope: Singles,
+    reach: int,
+    every: int,
+    out: Singles,
+) -> None:
+    """``voters``: disparity of the pixels that count, else NaN."""
+    rows, cols = disparity.shape
+    surface = np.empty(3 * BLOCK, np.float32)
+    sums = np.empty(2 * BLOCK, np.float32)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for y in range(rows):
+        for x0 in range(0, cols, BLOCK):
+            size = min(BLOCK, cols - x0)
+            surface_of_row(disparity, slope, y, x0, size, surface)
+            sums[:] = zero
+            for step_down in range(-reach, reach + 1, every):
+                b = y + step_down
+                if b < 0 or b >= rows:
+                    continue
+                down = np.float32(step_down)
+                for step in range(-reach, reach + 1, every):
+                    across, tolerance = np.float32(step), tolerance_px(step_down, step)
+                    first, end = columns_inside(x0, size, cols, step)
+                    d = voters[b, x0 + step + first : x0 + step + end]
+                    value = values[b, x0 + step + first : x0 + step + end]
+                    p, s = surface[first:], sums[first:]
+                    for k in range(d.size):
+                        plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
+                        same = one if abs(d[k] - plane) <= tolerance else zero
+                        s[k] += same
+                        s[BLOCK + k] += same * value[k]
+            for k in range(size):
+                out[y, x0 + k] = sums[BLOCK + k] / sums[k]
+
+
+def surface_mean(
+    values: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    reach: int = VOTE_PX,
+    every: int = VOTE_STEP,
+) -> Singles:
+    """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
+
+    ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
+    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value.
+    """
+    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
+    known = np.isfinite(values)
+    out = np.empty(disparity.shape, dtype=np.float32)
+    _surface_mean(
+        np.where(known, values, 0).astype(np.float32),
+        disparity,
+        np.where(known, disparity, np.float32(np.nan)),
+        np.ascontiguousarray(slope, dtype=np.float32),
+        reach,
+        every,
+        out,
+    )
+    return out

@@ -1,0 +1,294 @@
+"""The surface of a site, made once for all its pairs, block by block.
+
+A block is a square of ground cells on the global lattice, and has the triangles whose first vertex
+lies in it. Its bytes follow from the points up to :attr:`.scale.SurfaceScale.halo_cells` around it,
+whatever blocks are made beside it, in which order and by how many workers. Blocks are small, since
+windows read them whole, and are made by groups that are wide against their halo. Finished groups
+outlive a killed job, and one more LiDAR file leaves those that it does not touch
+(:mod:`stereotruth.products.finished_pieces`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..job import progress
+from ..lidar.density import points_per_m2
+from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
+from ..lidar.point_store import PointStore
+from ..products.atomic_outputs import marks_of_inputs
+from ..products.files import atomic_file, atomic_folder, link, sealed
+from ..products.finished_pieces import Ledger
+from ..products.inputs import refuse_replaced
+from ..products.locks import FileLock
+from ..products.provenance import describe, digest
+from .scale import PART, SurfaceScale
+from .surface import Core, GroundSurface, ground_surface
+from .surface_store import ARRAYS, ATTRIBUTES, BLOCKS, FORMAT, write_block
+from .vertices import VertexBuilder
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Number = tuple[int, int]
+Group = tuple[Number, ...]  # of blocks, in their order
+
+BLOCK_SPACINGS = 128  # spacings of points along a block's side, at least,
+BLOCK_CELLS = 512  # and cells
+HALOS = 12  # a group is so many halos wide: these cost a third more
+MOST_CELLS = 4096  # along a group's side
+
+
+class ShownGround(Protocol):
+    """The ground that the images of a site show."""
+
+    def shows(self, lon: Floats, lat: Floats, height: Floats) -> Bools:
+        """Whether an image shows places [n] (degrees, degrees, m)."""
+
+    def may_show(self, boxes: Floats) -> Bools:
+        """Whether an image may show something of boxes [n, 6] (west, south, lowest, east, north,
+        highest)."""
+
+
+def block_side(scale: SurfaceScale) -> int:
+    """Cells along the side of a block: a power of two."""
+    side = BLOCK_CELLS
+    while side * PART < BLOCK_SPACINGS * scale.spacing and side < MOST_CELLS:
+        side *= 2
+    return side
+
+
+def group_blocks(scale: SurfaceScale, side: int) -> int:
+    """Blocks of ``side`` cells along the side of a group: a power of two."""
+    blocks = 1
+    while blocks * side < min(HALOS * scale.halo_cells, MOST_CELLS):
+        blocks *= 2
+    return blocks
+
+
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """Makes blocks (row, col) of ``side`` cells of a surface, in a ``folder``."""
+
+    scale: SurfaceScale
+    side: int
+    stores: tuple[PointStore, ...]
+    folder: Path
+    code: str
+
+    def file(self, number: Number) -> Path:
+        """Of a block."""
+        return self.folder / BLOCKS / f"{number[0]}_{number[1]}.npz"
+
+    def corners(self, group: Group) -> tuple[Number, Number]:
+        """Lattice (lon, lat) of the first and last point around that determine blocks."""
+        halo, cell = self.scale.halo_cells, self.scale.cell
+        (rows, cols), side = zip(*group), self.side
+        first, last = (min(cols), min(rows)), (max(cols) + 1, max(rows) + 1)
+        low = tuple((k * side - halo) * size for k, size in zip(first, cell))
+        high = tuple((k * side + halo) * size - 1 for k, size in zip(last, cell))
+        return low, high
+
+    def key(self, group: Group) -> str:
+        """Digest of all that blocks follow from."""
+        low, high = self.corners(group)
+        box = [(q + off) * LATTICE_DEG for q, off in zip((*low, *high), (-0.5, -0.5, 0.5, 0.5))]
+        touched = [store for store in self.stores if store.height_range(*box) is not None]
+        return digest(
+            {
+                "scale": asdict(self.scale),
+                "side": self.side,
+                "blocks": group,
+                "points": sorted(store.attrs["cells_crc32"] for store in touched),
+                "code": self.code,
+            }
+        )
+
+    def surfaces(self, group: Group) -> Iterator[tuple[Number, GroundSurface]]:
+        """The triangles of each block that has any."""
+        low, high = self.corners(group)
+        bounds = np.array([store.bounds[:4] for store in self.stores]) / LATTICE_DEG
+        low = tuple(max(q, int(b) - 1) for q, b in zip(low, bounds[:, :2].min(axis=0)))
+        high = tuple(min(q, int(b) + 1) for q, b in zip(high, bounds[:, 2:].max(axis=0)))
+        if low[0] > high[0] or low[1] > high[1]:
+            return
+        builder = VertexBuilder(self.scale, low, high)
+        some = False
+        for points in self._points(low, high):
+            some |= points.lon_q.size > 0
+            builder.add(
+                points.lon_q, points.lat_q, points.h_q, points.classification, points.return_number
+            )
+        if not some:
+            return
+        first = [q // size for q, size in zip(low, self.scale.cell)]
+
+        def core(blocks: Group) -> Core:
+            """The box of blocks, in parts of a cell from the first one on."""
+            rows, cols = zip(*blocks)
+            ends = (min(cols), min(rows)), (max(cols) + 1, max(rows) + 1)
+            return Core(
+                *(tuple((k * self.side - f) * PART for k, f in zip(end, first)) for end in ends)
+            )
+
+        every = ground_surface(builder.built(), self.scale, core(group))
+        for number in group:
+            surface = every.within(core((number,)))
+            if len(surface.facet) + len(surface.undecided) + len(surface.tops.corner):
+                yield number, surface
+
+    def _points(self, low: Number, high: Number) -> Iterable[Any]:
+        """The points of a box, row of the stores' cells by row."""
+        west, east = (low[0] - 0.5) * LATTICE_DEG, (high[0] + 0.5) * LATTICE_DEG
+        for row in range(low[1] >> CELL_BITS, (high[1] >> CELL_BITS) + 1):
+            south = max(row << CELL_BITS, low[1])
+            north = min(((row + 1) << CELL_BITS) - 1, high[1])
+            edges = (south - 0.5) * LATTICE_DEG, (north + 0.5) * LATTICE_DEG
+            for store in self.stores:
+                if len(points := store.query(west, edges[0], east, edges[1])):
+                    yield points
+
+    def files(self, group: Group) -> dict[str, Path]:
+        """Of blocks, by name."""
+        return {self.file(number).stem: self.file(number) for number in group}
+
+    def make(self, group: Group, key: str, done: Ledger) -> None:
+        """Blocks and their record."""
+        written = {}
+        for number, surface in self.surfaces(group):
+            corner = [k * self.side * size for k, size in zip(number[::-1], self.scale.cell)]
+            with atomic_file(self.file(number)) as scratch:
+                facts = write_block(scratch, surface, (corner[0], corner[1]))
+            written[self.file(number).stem] = facts
+        refuse_replaced(marks_of_inputs())
+        done.put(_name(group), key, self.files(group), written)
+
+
+def _name(group: Group) -> str:
+    return f"{group[0][0]}_{group[0][1]}"
+
+
+def make_surface(
+    stores: Sequence[PointStore],
+    out: str | Path,
+    *,
+    cell: tuple[int, int],
+    ground: ShownGround | None = None,
+    blocks_at_once: int | None = None,
+    workers: int = 1,
+    made_of: Mapping[str, str] | None = None,
+    code: str = "",
+) -> None:
+    """Write the surface of the points of stores where images show the ground (see
+    :mod:`.surface_store`).
+
+    ``cell``: (lon, lat) size of a ground cell, lattice steps. ``ground``: by default all that has
+    points. ``blocks_at_once`` along the side of a group, by default
+    :func:`group_blocks`; ``made_of``, ``code``:
+    digests of other input and of the source, for the provenance. Blocks that an earlier call has
+    left, made of the same, are taken over.
+    """
+    out = Path(out).absolute()
+    density = points_per_m2(stores, ground and ground.shows) or points_per_m2(stores)
+    density = density or 1.0  # of no points any will do
+    scale = SurfaceScale.of(density, cell)
+    folder = out.with_name(f".{out.name}.work")
+    side = block_side(scale)
+    maker = _Maker(scale, side, tuple(stores), folder, code)
+    numbers = _blocks_of(stores, scale, side, ground)
+    groups = _groups(numbers, blocks_at_once or group_blocks(scale, side))
+    lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
+    try:
+        lock.take(out)
+        (folder / BLOCKS).mkdir(exist_ok=True)
+
+        def one(group: Group) -> None:
+            key = maker.key(group)
+            if done.find(_name(group), key, maker.files(group)) is None:
+                maker.make(group, key, done)
+
+        with ThreadPoolExecutor(workers) as pool:
+            for _ in progress(pool.map(one, groups), len(groups), "parts of the surface"):
+                pass
+        blocks = []
+        for group in groups:
+            piece = done.get(_name(group))
+            for number in group:
+                if (facts := piece.result.get(maker.file(number).stem)) is not None:
+                    sha256 = piece.sha256[maker.file(number).stem]
+                    blocks.append([*number, facts["box"], facts["heights"], sha256])
+        blocks.sort(key=lambda block: block[:2])
+        stores_made = {
+            f"points/{s.path.name}": digest(dict(s.attrs.get("provenance", {}))) for s in stores
+        }
+        attrs = {
+            "kind": "surface",
+            "format": FORMAT,
+            "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice of "
+            f"{LATTICE_DEG:g} degree and {LATTICE_M:g} m",
+            "arrays": ARRAYS,
+            "scale": asdict(scale),
+            "side": side,
+            "points_per_m2": round(density, 6),
+            "blocks": blocks,
+            "provenance": describe({**stores_made, **(made_of or {})}, {"cell": list(cell)}, code),
+        }
+        with atomic_folder(out) as unfinished:
+            for row, col, *_ in blocks:
+                file = maker.file((row, col))
+                link(file, unfinished / BLOCKS / file.name)
+            (unfinished / ATTRIBUTES).write_text(sealed(attrs), encoding="utf-8")
+    finally:
+        lock.close()
+    log.info(
+        "%d blocks of %d cells of %.2f m, about %.2g points per m²",
+        len(blocks), side, scale.cell_m, density,
+    )  # fmt: skip
+
+
+def _blocks_of(
+    stores: Sequence[PointStore], scale: SurfaceScale, side: int, ground: ShownGround | None
+) -> list[Number]:
+    """The blocks that have points and may have triangles in the ground that images show, in their
+    order."""
+    cells = np.concatenate([np.stack([s.cell_col, s.cell_row], axis=1) for s in stores])
+    heights = np.concatenate([s.cell_heights for s in stores]) * LATTICE_M
+    low = cells << CELL_BITS
+    high = low + (1 << CELL_BITS) - 1
+    if ground is not None:
+        reach = np.ceil(scale.height_reach / PART) * np.array(scale.cell)
+        boxes = np.column_stack(
+            [
+                (low - reach) * LATTICE_DEG,
+                heights[:, 0],
+                (high + reach) * LATTICE_DEG,
+                heights[:, 1],
+            ]
+        )
+        wanted = ground.may_show(boxes)
+        low, high = low[wanted], high[wanted]
+    size = np.array(scale.cell) * side
+    numbers: set[Number] = set()
+    for first, last in zip((low // size).tolist(), (high // size).tolist()):
+        numbers |= {
+            (row, col)
+            for col in range(first[0], last[0] + 1)
+            for row in range(first[1], last[1] + 1)
+        }
+    return sorted(numbers)
+
+
+def _groups(numbers: Sequence[Number], blocks: int) -> list[Group]:
+    """Blocks by squares of so many ``blocks`` along each side."""
+    groups: dict[Number, list[Number]] = {}
+    for number in numbers:
+        groups.setdefault((number[0] // blocks, number[1] // blocks), []).append(number)
+    return [tuple(group) for group in groups.values()]

@@ -1,0 +1,245 @@
+"""A surface store: the triangles of a site's ground, block by block, for all images that show it.
+
+A folder:
+
+=================  =========================================================================
+``blocks/R_C.npz`` triangles whose first vertex lies in block (R, C) of ``side`` ground cells:
+                   arrays of :data:`ARRAYS`, not compressed, each with a checksum
+``surface.json``   ``scale`` of the surface, ``side``, ``blocks``: of each that has triangles its
+                   number, the box of its vertices and the SHA-256 of its file; and a digest
+=================  =========================================================================
+
+Blocks lie on the global lattice. What a window of an image shows follows from the blocks whose
+boxes it sees (:meth:`SurfaceStore.blocks`), taken in their order.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..lidar.lattice import LATTICE_DEG
+from ..products.files import read_sealed
+from .region import Region
+from .rough_tops import RoughTops
+from .scale import PART, SurfaceScale
+from .surface import GroundSurface
+from .vertices import Vertices
+
+FORMAT = 1
+ATTRIBUTES, BLOCKS = "surface.json", "blocks"
+ARRAYS = {
+    "lon": "int32[n], longitude of the vertices from the block's south-west corner, 1e-9 degree",
+    "lat": "int32[n], latitude, likewise",
+    "height": "int32[n], above the WGS 84 ellipsoid, 1e-4 m",
+    "surface_class": "uint8[n], ASPRS class of the highest point of the vertex",
+    "count": "uint16[n], points that it is the mean of; 65535 stands for more, too",
+    "facet": "int32[m, 3], vertices of the facets",
+    "variance": "float32[m], of a point's height there, (1e-4 m)²",
+    "bulge": "float32[m], of the surface above the facet, 1e-4 m",
+    "whole": "int32[k, 3], vertices of the undecided triangles",
+    "strip": "int32[s, 3], vertices of the strips along breaklines",
+    "strip_range": "int32[s, 2], lowest and highest surface in each, 1e-4 m",
+    "top": "int32[t, 3], vertices of the triangles of rough surfaces' tops",
+    "top_residual": "float32[t], rms of the tops to the planes beside, 1e-4 m; NaN for none",
+    "is_gentle": "bool[t], neither steep nor alone",
+}
+Box = tuple[float, float, float, float]
+
+
+class Block(NamedTuple):
+    """A block that has triangles: number (row, col), box of its vertices (west, south, east, north,
+    lattice steps), heights of these (lowest, highest, steps), SHA-256 of its file."""
+
+    row: int
+    col: int
+    box: tuple[int, int, int, int]
+    heights: tuple[int, int]
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """Of its file, without the suffix."""
+        return f"{self.row}_{self.col}"
+
+
+def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> dict[str, Any]:
+    """Write the triangles of a block whose south-west ``corner`` is at (lon, lat), lattice steps;
+    its ``box`` and ``heights``."""
+    whole = surface.undecided[: surface.whole]
+    strip = surface.undecided[surface.strips]
+    triangles = [surface.facet, whole, strip, surface.tops.corner]
+    used = np.zeros(surface.vertices.x.size, np.bool_)
+    for corners in triangles:
+        used[corners.reshape(-1)] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    facet, whole, strip, top = (number[corners] for corners in triangles)
+    vertices = surface.vertices.taken(used)
+    np.savez(
+        path,
+        lon=(vertices.lon_q - corner[0]).astype(np.int32),
+        lat=(vertices.lat_q - corner[1]).astype(np.int32),
+        height=vertices.h_q.astype(np.int32),
+        surface_class=vertices.surface_class,
+        count=np.minimum(vertices.count, 65535).astype(np.uint16),
+        facet=facet,
+        variance=surface.variance.astype(np.float32),
+        bulge=surface.bulge.astype(np.float32),
+        whole=whole,
+        strip=strip,
+        strip_range=surface.height_range[surface.strips].astype(np.int32),
+        top=top,
+        top_residual=surface.tops.residual.astype(np.float32),
+        is_gentle=surface.tops.is_gentle,
+    )
+    lon, lat, h = vertices.lon_q, vertices.lat_q, vertices.h_q
+    box = [int(value) for value in (lon.min(), lat.min(), lon.max(), lat.max())]
+    return {"box": box, "heights": [int(h.min()), int(h.max())]}
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSurface:
+    """What a window may see of a surface: the ``blocks`` of a ``store``, and all their
+    ``vertices``, of which ``x``, ``y`` count from ``first``, (lon, lat) number of a cell."""
+
+    store: SurfaceStore
+    blocks: tuple[Block, ...]
+    vertices: Vertices
+    first: tuple[int, int]
+
+    def surface(self, region: Region) -> GroundSurface:
+        """The triangles that touch a ``region``, and their vertices."""
+        parts, used, start = [], np.zeros(self.vertices.x.size, np.bool_), 0
+        for block in self.blocks:
+            arrays = self.store.arrays(block, list(ARRAYS)[5:])
+            size = self.store.sizes[block.name]
+            part = self._touching(arrays, start, region)
+            for name in ("facet", "whole", "strip", "top"):
+                used[part[name].reshape(-1)] = True
+            parts.append(part)
+            start += size
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        for name in ("facet", "whole", "strip", "top"):
+            every[name] = number[every[name]]
+        return _surface(self.vertices.taken(used), every)
+
+    def _touching(
+        self, arrays: dict[str, NDArray], start: int, region: Region
+    ) -> dict[str, NDArray]:
+        """Of a block whose vertices begin at ``start``."""
+        out = {}
+        for name, beside in (
+            ("facet", ("variance", "bulge")),
+            ("whole", ()),
+            ("strip", ("strip_range",)),
+            ("top", ("top_residual", "is_gentle")),
+        ):
+            corner = arrays[name] + np.int32(start)
+            touching = region.touching(self.vertices, corner)
+            out[name] = corner[touching]
+            for values in beside:
+                out[values] = arrays[values][touching]
+        return out
+
+
+def _surface(vertices: Vertices, arrays: dict[str, NDArray]) -> GroundSurface:
+    h, whole, top = vertices.h_q, arrays["whole"], arrays["top"]
+    whole_range = np.stack([h[whole].min(axis=1), h[whole].max(axis=1)], axis=1)
+    residual = arrays["top_residual"].astype(np.float64)
+    undecided = np.concatenate([whole, arrays["strip"]])
+    return GroundSurface(
+        vertices=vertices,
+        facet=arrays["facet"],
+        variance=arrays["variance"].astype(np.float64),
+        bulge=arrays["bulge"].astype(np.float64),
+        undecided=undecided,
+        height_range=np.concatenate([whole_range, arrays["strip_range"].astype(np.int64)]),
+        whole=len(whole),
+        tops=RoughTops(top, residual, np.ptp(h[top], axis=1), arrays["is_gentle"]),
+        facet_origin=arrays["facet"][:, 0],
+        undecided_origin=undecided[:, 0],
+    )
+
+
+class SurfaceStore:
+    """A finished surface store, open for windows. Raises InputError if it is missing or damaged."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self.attrs = read_sealed(self.path / ATTRIBUTES)
+        except FileNotFoundError as error:
+            raise InputError(
+                "no such surface", file=self.path, remedy="run the stage that makes it"
+            ) from error
+        if self.attrs.get("kind") != "surface" or self.attrs.get("format") != FORMAT:
+            raise InputError(
+                f"no surface of format {FORMAT}",
+                file=self.path,
+                remedy="delete it and run the workflow again",
+            )
+        scale = dict(self.attrs["scale"])
+        self.scale = SurfaceScale(**scale | {"cell": tuple(scale["cell"])})
+        self.side = int(self.attrs["side"])
+        self.every = tuple(
+            Block(*number, tuple(box), tuple(heights), sha256)
+            for *number, box, heights, sha256 in self.attrs["blocks"]
+        )
+        self.sizes: dict[str, int] = {}
+
+    @property
+    def points_per_m2(self) -> float:
+        """Of the points that it is made of, over the ground that they cover."""
+        return self.attrs["points_per_m2"]
+
+    def blocks(self, box: Box) -> tuple[Block, ...]:
+        """The blocks that may have triangles in a box (west, south, east, north, degrees)."""
+        west, south, east, north = (edge / LATTICE_DEG for edge in box)
+        return tuple(
+            block
+            for block in self.every
+            if block.box[0] <= east
+            and block.box[2] >= west
+            and block.box[1] <= north
+            and block.box[3] >= south
+        )
+
+    def arrays(self, block: Block, names: Sequence[str]) -> dict[str, NDArray]:
+        """Arrays of a block by name. Raises InputError if they are not what was written."""
+        file = self.path / BLOCKS / f"{block.name}.npz"
+        try:
+            with np.load(file) as arrays:
+                return {name: arrays[name] for name in names}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(
+                "damaged: it is not what was written",
+                file=file,
+                remedy=f"delete {self.path} and run the workflow again",
+            ) from error
+
+    def window(self, blocks: Sequence[Block]) -> WindowSurface:
+        """Of some blocks, one at least."""
+        cell = self.scale.cell
+        corners = np.array([block.box[:2] for block in blocks]).min(axis=0)
+        first = tuple(int(q) // side for q, side in zip(corners, cell))
+        parts = []
+        for block in blocks:
+            a = self.arrays(block, list(ARRAYS)[:5])
+            lon = a["lon"] + np.int64(block.col * self.side * cell[0])
+            lat = a["lat"] + np.int64(block.row * self.side * cell[1])
+            x = (lon - first[0] * cell[0]) * PART // cell[0]
+            y = (lat - first[1] * cell[1]) * PART // cell[1]
+            h = a["height"].astype(np.int64)
+            count = a["count"].astype(np.int32)
+            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count))
+            self.sizes[block.name] = lon.size
+        vertices = Vertices(*(np.concatenate(values) for values in zip(*parts)))
+        return WindowSurface(self, tuple(blocks), vertices, first)

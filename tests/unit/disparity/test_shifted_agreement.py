@@ -1,0 +1,103 @@
+"""Images that agree better at another disparity than at the labels', on small made fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.disparity.image_agreement import Comparison, contradicted
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.pair_window import PairWindow
+from stereotruth.disparity.pixel_labels import Labels
+from stereotruth.disparity.shifted_agreement import ShiftedAgreement, shifted_agreement
+
+ROWS, COLS = slice(20, 140), slice(60, 200)
+SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
+FIELD = np.s_[40:80, 50:100]  # of the window
+LEVEL = Labels(np.full(SHAPE, 4.0), np.zeros((2, *SHAPE)), np.zeros(SHAPE))
+ALL = np.ones(SHAPE, np.bool_)
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    return np.round(np.random.default_rng(seed).uniform(200, 1200, (160, 260)))
+
+
+def right_of(left: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Where a pixel's match lies, the right image shows it."""
+    right = texture(9)
+    y, x = np.indices(left.shape)
+    match = x - disparity.astype(int)
+    inside = (match >= 0) & (match < left.shape[1])
+    right[y[inside], match[inside]] = left[inside]
+    return right
+
+
+def pair(left: np.ndarray, right: np.ndarray) -> PairWindow:
+    whole = slice(20, 240)
+    patches = (read_patch(left, ROWS, COLS, 1), read_patch(right, ROWS, whole, 1))
+    return PairWindow(ROWS, COLS, 0, *patches)
+
+
+def grown(by: int) -> PairWindow:
+    """Of labels of 4 px: a field that is higher by so many px."""
+    left, disparity = texture(), np.full((160, 260), 4)
+    disparity[20:140, 60:200][FIELD] += by
+    return pair(left, right_of(left, disparity))
+
+
+def shadowed() -> PairWindow:
+    """Unchanged, with stripes of shadow in the right image."""
+    left = texture()
+    right = right_of(left, np.full((160, 260), 4))
+    dark = np.arange(260) // 25 % 2 == 1
+    return pair(left, np.round(np.where(dark, right * 0.2, right)))
+
+
+def at(window: PairWindow, noise: float = 0.0, reach: int = 8) -> ShiftedAgreement:
+    return shifted_agreement(LEVEL, window, (noise, noise), 9, reach, ALL)
+
+
+@pytest.mark.parametrize("by", [-3, 2, 5])
+@pytest.mark.parametrize("reach", [4, 8])
+def test_what_has_grown_agrees_at_another_disparity(by: int, reach: int) -> None:
+    found = at(grown(by), reach=reach)
+    inner, outside = np.zeros(SHAPE, np.bool_), np.ones(SHAPE, np.bool_)
+    inner[47:73, 58:92] = True
+    outside[32:88, 35:115] = False
+    assert found.contradicts[inner].all()
+    assert (found.shift[inner] == by).mean() > 0.99
+    assert not found.contradicts[outside].any()
+
+
+@pytest.mark.parametrize("diachronic", [False, True])
+def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
+    """Where images share no light, their brightness tells nothing."""
+    comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
+    changed, _ = contradicted(LEVEL, shadowed(), comparison, ALL)
+    assert changed.any() != diachronic
+
+
+def test_a_change_is_found_under_another_sun() -> None:
+    window = grown(3)
+    window.right.pixels[:, 60:] *= 0.2
+    comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), True)
+    changed, _ = contradicted(LEVEL, window, comparison, ALL)
+    assert changed[47:73, 58:92].all() and not changed[:30].any()
+
+
+def test_noise_is_no_evidence() -> None:
+    """Two images that show nothing but noise contradict no label."""
+    rng = np.random.default_rng(3)
+    images = (np.round(rng.normal(900.0, 20.0, (160, 260))) for _ in range(2))
+    assert at(pair(*images), 400.0).contradicts.mean() < 0.01
+
+
+def test_only_what_is_wanted_is_compared() -> None:
+    """And it is the same whatever else is."""
+    window, wanted = grown(3), np.zeros(SHAPE, np.bool_)
+    wanted[60:75, 60:110] = True
+    whole, part = at(window), shifted_agreement(LEVEL, window, (0.0, 0.0), 9, 8, wanted)
+    for name in ("here", "elsewhere", "shift", "signal"):
+        values = getattr(part, name)
+        assert np.isnan(values[~wanted]).all()
+        assert (values[wanted] == getattr(whole, name)[wanted]).all()

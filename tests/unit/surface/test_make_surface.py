@@ -1,0 +1,168 @@
+"""The surface of a site: the same bytes however it is made, and no more than images show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.errors import InputError
+from stereotruth.lidar.lattice import LATTICE_DEG
+from stereotruth.lidar.point_store import PointStore, open_stores
+from stereotruth.products.files import read_sealed
+from stereotruth.surface import make_surface as module
+from stereotruth.surface.delaunay import MAX_PARTS
+from stereotruth.surface.make_surface import make_surface
+from stereotruth.surface.scale import PART, SurfaceScale
+from stereotruth.surface.surface_store import ARRAYS, SurfaceStore
+
+from ...synthetic.box_scene import points_on, write_points
+from ...synthetic.stores import tree_digest
+
+CELL = (3400, 2900)
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch) -> None:
+    """So that a small scene has many."""
+    monkeypatch.setattr(module, "block_side", lambda scale: 128)
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory) -> tuple[PointStore, ...]:
+    """A plane and a box on it by points 1 m apart with noise, in two files."""
+    folder = tmp_path_factory.mktemp("points")
+    points = points_on(True, noise=0.03, spacing=1.0)
+    east = points[:, 0] > np.median(points[:, 0])
+    return open_stores(
+        [write_points(folder, points[east], "east"), write_points(folder, points[~east], "west")]
+    )
+
+
+class East:
+    """Images that show what lies east of a longitude."""
+
+    def __init__(self, lon: float) -> None:
+        self.lon = lon
+
+    def shows(self, lon, lat, height):
+        return lon > self.lon
+
+    def may_show(self, boxes):
+        return boxes[:, 3] > self.lon
+
+
+def triangles(store: SurfaceStore) -> dict[str, set]:
+    """All triangles of a surface by the lattice positions of their vertices, with their values."""
+    found = {name: set() for name in ("facet", "whole", "strip", "top")}
+    beside = {"facet": ("variance", "bulge"), "strip": ("strip_range",), "top": ("top_residual",)}
+    for block in store.every:
+        a = store.arrays(block, list(ARRAYS))
+        lon, lat = (
+            a[name] + np.int64(number * store.side * size)
+            for name, number, size in zip(("lon", "lat"), (block.col, block.row), store.scale.cell)
+        )
+        corners = np.stack([lon, lat, a["height"], a["count"]], axis=1).astype(np.int64)
+        for name, into in found.items():
+            values = [a[other] for other in beside.get(name, ())]
+            for k, corner in enumerate(a[name]):
+                told = tuple(value[k].tobytes() for value in values)
+                into.add((corners[corner].tobytes(), *told))
+    return found
+
+
+def test_triangles_are_the_same_for_any_blocks(stores, tmp_path, monkeypatch):
+    make_surface(stores, tmp_path / "one", cell=CELL)
+    one = SurfaceStore(tmp_path / "one")
+    expected = triangles(one)
+    assert all(expected.values())
+    for side in (64, 1024):
+        monkeypatch.setattr(module, "block_side", lambda scale, side=side: side)
+        make_surface(stores, tmp_path / f"{side}", cell=CELL)
+        other = SurfaceStore(tmp_path / f"{side}")
+        assert len(other.every) > 3 * len(one.every) or len(other.every) <= 4
+        assert triangles(other) == expected
+        total = sum(len(other.arrays(block, ["facet"])["facet"]) for block in other.every)
+        assert total == len(expected["facet"])  # each triangle once
+
+
+def test_bytes_are_the_same_for_any_groups_workers_and_order(stores, tmp_path):
+    ways = {"a": (stores, 1, 1), "b": (stores[::-1], 3, 2), "c": (stores, 2, 16)}
+    for name, (made_of, workers, at_once) in ways.items():
+        out = tmp_path / name / "s"
+        make_surface(made_of, out, cell=CELL, workers=workers, blocks_at_once=at_once)
+    assert len({tree_digest(tmp_path / name / "s/blocks") for name in ways}) == 1
+    assert len(list((tmp_path / "a/s/blocks").iterdir())) > 16
+    one, *others = (read_sealed(tmp_path / name / "s/surface.json") for name in ways)
+    assert all(one["blocks"] == other["blocks"] for other in others)
+
+
+def test_finished_blocks_are_taken_over(stores, tmp_path, monkeypatch):
+    def make(out, most):
+        made, whole = [], module._Maker.make
+
+        def one(self, number, key, done):
+            if len(made) == most:
+                raise KeyboardInterrupt
+            made.append(number)
+            whole(self, number, key, done)
+
+        monkeypatch.setattr(module._Maker, "make", one)
+        try:
+            make_surface(stores, out, cell=CELL, blocks_at_once=1)
+        finally:
+            monkeypatch.setattr(module._Maker, "make", whole)
+        return len(made)
+
+    every = make(tmp_path / "fresh/s", 1000)
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "killed/s", 3)
+    assert not (tmp_path / "killed/s").exists()
+    assert make(tmp_path / "killed/s", 1000) == every - 3
+    assert tree_digest(tmp_path / "killed/s") == tree_digest(tmp_path / "fresh/s")
+
+
+def test_points_that_no_image_shows_count_for_nothing(stores, tmp_path):
+    """A dense survey a kilometre off changes neither scale nor a byte of what is shown."""
+    west = min(store.bounds[0] for store in stores)
+    far = points_on(False, spacing=0.4) - [0.011, 0.0, 0.0]
+    more = (*stores, *open_stores([write_points(tmp_path, far, "far")]))
+    shown = East(west - 1e-4)
+    for name, made_of in (("alone", stores), ("beside", more)):
+        make_surface(made_of, tmp_path / name, cell=CELL, ground=shown)
+    alone, beside = (SurfaceStore(tmp_path / name) for name in ("alone", "beside"))
+    assert alone.scale == beside.scale and alone.every == beside.every
+    make_surface(more, tmp_path / "all", cell=CELL)
+    assert SurfaceStore(tmp_path / "all").scale.spacing < alone.scale.spacing
+
+
+def test_half_of_the_ground_has_the_blocks_of_all(stores, tmp_path):
+    middle = max(store.bounds[2] for store in stores) - 3e-4
+    for name, ground in (("all", None), ("half", East(middle))):
+        make_surface(stores, tmp_path / name, cell=CELL, ground=ground)
+    every, half = (SurfaceStore(tmp_path / name) for name in ("all", "half"))
+    if every.scale == half.scale:
+        assert set(half.every) < set(every.every)
+    assert min(b.box[2] for b in half.every) * LATTICE_DEG > middle - 0.002
+
+
+def test_a_damaged_block_is_named(stores, tmp_path):
+    make_surface(stores, tmp_path / "s", cell=CELL)
+    store = SurfaceStore(tmp_path / "s")
+    file = tmp_path / "s/blocks" / f"{store.every[0].name}.npz"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.unlink()
+    file.write_bytes(data)
+    with pytest.raises(InputError, match=f"{store.every[0].name}.npz"):
+        store.arrays(store.every[0], list(ARRAYS))
+
+
+@pytest.mark.parametrize("density", [0.01, 0.25, 1.0, 15.0])
+def test_groups_are_wide_against_their_halo(density, monkeypatch):
+    monkeypatch.undo()
+    scale = SurfaceScale.of(density, CELL)
+    side = module.block_side(scale)
+    group = side * module.group_blocks(scale, side)
+    assert side & (side - 1) == group & (group - 1) == 0
+    assert group >= 12 * scale.halo_cells or group == 4096
+    assert group + 2 * scale.halo_cells < MAX_PARTS // PART

@@ -1,0 +1,33 @@
+"""The page of a site: its images, all pairs, residuals by image, closure."""
+
+from pathlib import Path
+
+from stereotruth.alignment.site_images import GivenImage, open_image
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.files import read_json
+from stereotruth.products.html_page import INDEX
+from stereotruth.report.index_page import write_index
+from stereotruth.report.site_page import image_of, pairs_of, write_site_page
+
+if __name__ == "__main__":
+    city, given = snakemake.wildcards.city, snakemake.input
+    with (
+        job(snakemake.log[0], f"site {city}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        images = [
+            open_image(GivenImage.of(name, Path(file), *cells))[0]
+            for name, (file, *cells) in snakemake.params.images.items()
+        ]
+        write_site_page(
+            city,
+            [image_of(image) for image in images],
+            pairs_of(images, snakemake.params.scenes),
+            snakemake.output[0],
+            adjusted=read_json(given.adjusted[0]) if given.adjusted else {},
+            closure=read_json(given.closure[0]) if given.closure else {},
+            page=given.page,
+            index=INDEX,
+        )
+        write_index()

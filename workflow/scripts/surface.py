@@ -1,0 +1,26 @@
+"""The points of a site to their surface, for all images that show it."""
+
+from stereotruth.epipolar.shown_ground import GroundOfImages
+from stereotruth.job import job
+from stereotruth.lidar.point_store import open_stores
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.provenance import checksums
+from stereotruth.surface.make_surface import make_surface
+from stereotruth.surface.scale import ground_cell
+
+if __name__ == "__main__":
+    scene, images = snakemake.wildcards.scene, sorted(set(snakemake.input.images))
+    with (
+        job(snakemake.log[0], f"surface {scene}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        ground = GroundOfImages.open(images)
+        make_surface(
+            open_stores(sorted(snakemake.input.points)),
+            snakemake.output.surface,
+            cell=ground_cell(ground.pixel_deg),
+            ground=ground,
+            workers=snakemake.threads,
+            made_of=checksums(images),
+            code=snakemake.params.code,
+        )
