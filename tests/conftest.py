@@ -8,8 +8,9 @@ import pytest
 pytest.register_assert_rewrite("tests.synthetic")
 
 # One thread for linear algebra: two test processes would fight for two cores (measured: 84 s
-# against 32 s for the same tests). OpenMP's threads would wait for each other by spinning.
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+# against 32 s for the same tests). OpenMP's threads would wait for each other by spinning. A fork
+# of a process that has OpenCV's threads waits for them for ever, since it has none of them.
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(threads, "1")
 
 # Test files that processes begin with: the first makes the city of the workflow's tests and all
