@@ -142,6 +142,7 @@ SERVER_FAULTS = {
     "429 for an hour": False,
     "stall for ever": False,
     "drip": False,
+    "drip of the head": False,
     "no ranges": False,
     "replaced: ETag": False,
     "replaced: size": False,
@@ -152,6 +153,7 @@ SERVER_FAULTS = {
     "redirect loop": False,
     "redirect to file:": False,
     "redirect to another host": False,
+    "redirect to another port": False,
 }
 
 
@@ -197,6 +199,8 @@ def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
             if fault == "reset":
                 self.close_connection = True
                 return None
+            if fault == "drip of the head":
+                return self.drip_head()
             if fault.startswith("stall"):
                 time.sleep(0.6)
             if fault == "no ranges":
@@ -223,6 +227,14 @@ def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
             if fault == "encoded":
                 headers["Content-Encoding"] = "gzip"
             return self.plain(206, headers, body, drip=fault == "drip")
+
+        def drip_head(self):
+            """A line that goes on for as long as anybody listens, a minute at most."""
+            self.close_connection = True
+            self.wfile.write(b"HTTP/1.1 206 Partial Content\r\nX-Long: ")
+            for _ in range(600):
+                self.wfile.write(b"x")
+                time.sleep(0.1)
 
         def plain(self, status, headers, body=b"", drip=False):
             self.send_response(status)
@@ -272,6 +284,7 @@ STATUS = {
     "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
     "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
     "redirect to another host": lambda s: (302, {"Location": s.target}),
+    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
 }
 
 

@@ -18,10 +18,10 @@ from laspy.compression import DecompressionSelection
 from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
 
 from ..errors import InputError
+from ..products.ranges import Range, Ranges
 from .las_files import _decoding
 from .las_layout import LASZIP, LAYERED, Layout, _Packing, _records, _require
 from .octree_nodes import MOST_NODES, Node, Octree, good_key
-from .ranges import Range, Ranges
 
 INFO = (b"copc", 1)
 INFO_PLACE = 375 + 54  # right behind the header of LAS 1.4, and its own

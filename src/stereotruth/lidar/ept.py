@@ -25,6 +25,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..errors import InputError
+from ..products.ranges import AT_ONCE, LocalRanges, WebRanges
 from ..products.remote_files import hosts_of, is_remote, read_bytes, url_of
 from ..products.web_requests import WEB
 from .copc import FIELDS
@@ -32,7 +33,6 @@ from .las_files import _decoding
 from .las_layout import _require
 from .octree_nodes import MOST_NODE_POINTS, MOST_NODES, Node, Octree, good_key
 from .range_copies import open_ranges
-from .ranges import AT_ONCE, LocalRanges, WebRanges
 
 NAME = "ept.json"
 MOST_JSON_BYTES = 64 << 20  # of ept.json, and of a file of the hierarchy

@@ -21,9 +21,17 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from ..errors import InputError, without_secrets
-from ..products.remote_files import answering, bucket, hosts_of, is_remote, refuse_changed, url_of
+from ..products.ranges import LocalRanges, Ranges, RangeStream, WebRanges
+from ..products.remote_files import (
+    answering,
+    bucket,
+    hosts_of,
+    is_remote,
+    refuse_changed,
+    same_as_stand_in,
+    url_of,
+)
 from ..products.web_requests import WEB
-from .ranges import LocalRanges, Ranges, WebRanges
 
 FOLDER = Path("results", "copies")
 STREAM_BYTES = 4 << 20  # of a file that is read as a whole, at once
@@ -57,15 +65,7 @@ class StandInRanges(Ranges):
     def _ask(self) -> Ranges:
         with self._lock:
             if self._source is None:
-                source = self._opened()
-                other = source.content and self._content and source.content != self._content
-                if source.size != self.size or other:
-                    raise InputError(
-                        "changed on its server since this run began",
-                        file=self.name,
-                        remedy="run again, and leave it alone until the run has ended",
-                    )
-                self._source = source
+                self._source = same_as_stand_in(self._opened(), self.size, self._content)
             return self._source
 
 
@@ -93,7 +93,7 @@ class BucketRanges(Ranges):
 def open_ranges(location: str | Path, **how: Any) -> Ranges:
     """A path, a URL of a web server, or the stand-in of one or of an object of a bucket.
 
-    ``how``: see :class:`.ranges.WebRanges`.
+    ``how``: see :class:`..products.ranges.WebRanges`.
     """
     if is_remote(str(location)):
         return WebRanges(str(location), **how)
@@ -104,47 +104,6 @@ def open_ranges(location: str | Path, **how: Any) -> Ranges:
         return StandInRanges(place, url, lambda: BucketRanges(place, url))
     hosts = how.pop("allow_hosts", frozenset()) | hosts_of(place)
     return StandInRanges(place, url, lambda: WebRanges(url, allow_hosts=hosts, **how))
-
-
-class RangeStream(io.RawIOBase):
-    """A file as a stream of blocks."""
-
-    def __init__(self, ranges: Ranges, block_bytes: int) -> None:
-        self._ranges, self._block_bytes, self._at = ranges, block_bytes, 0
-        self._number, self._block = -1, b""
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
-
-    def tell(self) -> int:
-        """The place of the next byte."""
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place, as of any stream."""
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._ranges.size}[whence]
-        self._at = max(0, start + offset)
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        """Bytes from here on to the end of the block."""
-        if self._at >= self._ranges.size:
-            return 0
-        number = self._at // self._block_bytes
-        if number != self._number:
-            start = number * self._block_bytes
-            end = min(start + self._block_bytes, self._ranges.size)
-            self._block, self._number = self._ranges.get(start, end), number
-        first = self._at - number * self._block_bytes
-        part = self._block[first : first + len(buffer)]
-        memoryview(buffer)[: len(part)] = part
-        self._at += len(part)
-        return len(part)
 
 
 def open_stream(path: str | Path, block_bytes: int = STREAM_BYTES) -> BinaryIO:
