@@ -312,6 +312,9 @@ FILE_FAULTS = {
     "node made empty": False,
     "node doubled": False,
     "page loop": False,
+    "pages that overlap": False,
+    "pages nested without end": False,
+    "records without end": False,
     "root page cut": False,
     "hierarchy out of the file": False,
     "cube too small": False,
@@ -325,6 +328,23 @@ FILE_FAULTS = {
     "two nodes swapped": None,
     "no info record": False,
 }
+
+
+def _overlap(made: MadeCopc, content: bytearray, info: list) -> None:
+    """A root of many pages, each of them most of the file."""
+    start, size = len(content), ENTRY.size
+    pages = [ENTRY.pack(1, 0, 0, 0, start, size * (5000 - k), -1) for k in range(5000)]
+    content += b"".join(pages)
+    info[5], info[6] = start, size * 5000
+
+
+def _nest(content: bytearray, info: list) -> None:
+    """Pages of which each names the next alone."""
+    start, size, n = len(content), ENTRY.size, 20_000
+    for k in range(n):
+        content += ENTRY.pack(1, 0, 0, 0, start + size * (k + 1), size, -1)
+    content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
+    info[5], info[6] = start, size
 
 
 def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
@@ -357,6 +377,13 @@ def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
         ENTRY.pack_into(content, at, *(other if fault == "node doubled" else [3, 0, 0, 7, 0, 0, 0]))
     elif fault == "page loop":
         ENTRY.pack_into(content, at, *entry[:4], info[5], info[6], -1)
+    elif fault == "pages that overlap":
+        _overlap(made, content, info)
+    elif fault == "pages nested without end":
+        _nest(content, info)
+    elif fault == "records without end":
+        struct.pack_into("<I", content, 243, 4_000_000_000)
+        content += bytes(10**6)
     elif fault == "root page cut":
         info[6] -= int(rng.integers(1, info[6]))
     elif fault == "hierarchy out of the file":

@@ -65,6 +65,11 @@ class PointFile:
         return float(self.header.mins[2]), float(self.header.maxs[2])
 
     @property
+    def bytes(self) -> int:
+        """All that there is to read."""
+        return size_of(self.path)
+
+    @property
     def cell(self) -> float:
         """Side of the cells that points are the middles of, or 0: the points lie anywhere."""
         return 0.0
@@ -75,7 +80,7 @@ class PointFile:
 
     def part(self, touches: Touches | None) -> Part:
         """What is to be read for a footprint; all of it for None."""
-        whole = Part(int(self.header.point_count), size_of(self.path), self.chunks)
+        whole = Part(int(self.header.point_count), self.bytes, self.chunks)
         if touches is None:
             return whole
         bounds = np.array([[self.header.mins], [self.header.maxs]], np.float64)
@@ -108,6 +113,12 @@ class OctreeFile(PointFile):
     @property
     def remark(self) -> None:
         """Nothing."""
+
+    @property
+    def bytes(self) -> int:
+        """Of the file, or of all nodes of EPT."""
+        every = sum(node.bytes for node in self.octree.nodes)
+        return max(every, size_of(self.path))
 
     def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
         """All points node by node, whatever the size."""

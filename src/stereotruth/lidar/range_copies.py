@@ -50,17 +50,12 @@ class StandInRanges(Ranges):
         self.name, self.size = without_secrets(url), int(state["size"])
         self._content, self._opened, self._lock = str(state["content"]), opened, Lock()
         self._source: Ranges | None = None
-        key = json.dumps([self.name, self.size, self._content])
-        self._folder = FOLDER / hashlib.sha256(key.encode()).hexdigest()[:32]
+        self._copies = copies_of(place, url)
 
     def _get(self, start: int, end: int) -> bytes:
-        kept = self._folder / f"{start}-{end}"
-        if self._content and (content := _read(kept, end - start)) is not None:
-            return content
-        content = self._ask().get(start, end)
-        if self._content:
-            _keep(kept, content)
-        return content
+        return kept(
+            self._copies, f"{start}-{end}", lambda: self._ask().get(start, end), end - start
+        )
 
     def _ask(self) -> Ranges:
         with self._lock:
@@ -113,28 +108,50 @@ def open_stream(path: str | Path, block_bytes: int = STREAM_BYTES) -> BinaryIO:
     return io.BufferedReader(RangeStream(open_ranges(path), block_bytes))
 
 
-def _read(kept: Path, length: int) -> bytes | None:
+def copies_of(place: Path, url: str) -> Path | None:
+    """Where copies of what a stand-in stands for are kept; None if its server names no content."""
+    state = json.loads(place.read_text())
+    if not state["content"]:
+        return None
+    key = json.dumps([without_secrets(url), int(state["size"]), str(state["content"])])
+    return FOLDER / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def kept(
+    folder: Path | None, name: str, fetch: Callable[[], bytes], length: int | None = None
+) -> bytes:
+    """The copy of that name, if it is whole and of that length; else what is fetched, and kept."""
+    if folder is None:
+        return fetch()
+    copy = folder / name.replace("/", ".")
+    if (content := _read(copy, length)) is None:
+        content = fetch()
+        _keep(copy, content)
+    return content
+
+
+def _read(copy: Path, length: int | None) -> bytes | None:
     """A copy, if it is there and whole."""
     try:
-        content = kept.read_bytes()
+        content = copy.read_bytes()
     except OSError:
         return None
     body = content[:-CHECK_BYTES]
     whole = content[-CHECK_BYTES:] == zlib.crc32(body).to_bytes(CHECK_BYTES, "little")
-    if len(body) != length or not whole:
+    if length not in (None, len(body)) or not whole:
         return None
     with suppress(OSError):
-        os.utime(kept)
+        os.utime(copy)
     return body
 
 
-def _keep(kept: Path, content: bytes) -> None:
+def _keep(copy: Path, content: bytes) -> None:
     """Write a copy atomically; a disk that does not take it is no harm."""
-    scratch = kept.with_name(f".{kept.name}.{os.getpid()}")
+    scratch = copy.with_name(f".{copy.name}.{os.getpid()}")
     try:
-        kept.parent.mkdir(parents=True, exist_ok=True)
+        copy.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(content + zlib.crc32(content).to_bytes(CHECK_BYTES, "little"))
-        scratch.replace(kept)
+        scratch.replace(copy)
     except OSError:
         with suppress(OSError):
             scratch.unlink()
@@ -142,13 +159,13 @@ def _keep(kept: Path, content: bytes) -> None:
 
 def prune(limit_bytes: float) -> None:
     """Remove the copies that were not used for the longest time, until no more bytes are kept."""
-    kept = []
+    copies = []
     for file in FOLDER.glob("*/*"):
         with suppress(OSError):  # of another job, which prunes as well
             state = file.stat()
-            kept.append((state.st_mtime_ns, state.st_size, file))
-    total = sum(size for _, size, _ in kept)
-    for _, size, file in sorted(kept):
+            copies.append((state.st_mtime_ns, state.st_size, file))
+    total = sum(size for _, size, _ in copies)
+    for _, size, file in sorted(copies):
         if total <= limit_bytes:
             break
         with suppress(OSError):
