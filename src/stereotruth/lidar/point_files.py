@@ -20,8 +20,10 @@ from ..products.remote_files import size_of
 from . import las_files
 from .octree import open_octree
 from .octree_nodes import Touches
+from .range_copies import open_stream
 
 OCTREE, EPT = ".copc.laz", "ept.json"
+FIRST_BYTES = 1 << 14  # that servers are asked for at once
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # of TIFF 6.0 and of BigTIFF
 
 
@@ -182,6 +184,6 @@ def open_points(path: str | Path, *, by_nodes: bool = False) -> PointFile:
     if name == EPT or (by_nodes and name.endswith(OCTREE)):
         return OctreeFile(path)
     first = b""
-    with suppress(OSError), path.open("rb") as stream:  # which the reader names
+    with suppress(OSError), open_stream(path, FIRST_BYTES) as stream:  # which the reader names
         first = stream.read(4)
     return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path)

@@ -41,6 +41,7 @@ PATIENCE_S = 300.0  # with one range, all tries together
 STALL_SHARE = 0.1  # of the patience: so long without a byte, and the request is made again
 FIRST_WAIT_S = 0.5  # before the second try
 MOST_TRIES = 8
+BLOCKS_HELD = 3  # of a stream
 
 
 class Ranges(ABC):
@@ -238,7 +239,7 @@ class RangeStream(io.RawIOBase):
 
     def __init__(self, ranges: Ranges, block_bytes: int) -> None:
         self._ranges, self._block_bytes, self._at = ranges, block_bytes, 0
-        self._number, self._block = -1, b""
+        self._blocks: dict[int, bytes] = {}  # the last ones, by number
 
     def readable(self) -> bool:
         """It is."""
@@ -263,12 +264,14 @@ class RangeStream(io.RawIOBase):
         if self._at >= self._ranges.size:
             return 0
         number = self._at // self._block_bytes
-        if number != self._number:
+        if number not in self._blocks:
             start = number * self._block_bytes
             end = min(start + self._block_bytes, self._ranges.size)
-            self._block, self._number = self._ranges.get(start, end), number
+            if len(self._blocks) == BLOCKS_HELD:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[number] = self._ranges.get(start, end)
         first = self._at - number * self._block_bytes
-        part = self._block[first : first + len(buffer)]
+        part = self._blocks[number][first : first + len(buffer)]
         memoryview(buffer)[: len(part)] = part
         self._at += len(part)
         return len(part)
