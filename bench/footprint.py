@@ -1,4 +1,4 @@
-"""Reading a COPC file by footprint: points, bytes, time, memory, faults. See README.md.
+"""Reading a COPC file by footprint: points, bytes, time, memory, faults, requests. See README.md.
 
 Files are made (tests/synthetic/copc_server.py) and served on the loopback by a server that counts.
 """
@@ -10,10 +10,11 @@ import io
 import json
 import multiprocessing
 import os
+import struct
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,13 +26,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.synthetic.copc_server import (
     CORNER,
     FILE_FAULTS,
+    INFO_AT,
     SERVER_FAULTS,
     damaged,
     make_copc,
     serving,
 )
 
-from stereotruth.errors import InputError
+from stereotruth.errors import InputError, in_number
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.octree import open_octree
@@ -107,6 +109,24 @@ def same_cells(whole: PointStore, part: PointStore) -> bool:
     return np.concatenate(kept).tobytes() == np.load(part.path / "points.npy").tobytes()
 
 
+def trace(points: int, levels: int) -> None:
+    """Print the requests of one ingest of 1 % of a file, and those of a second one."""
+    side = (points / DENSITY) ** 0.5
+    file = Path("tile.copc.laz")
+    file.write_bytes(make_copc(points, side, levels).content)
+    with serving(file.read_bytes()) as server:
+        place = stand_in(server.url, file.stat().st_size)
+        for store in ("first.points", "second.points"):
+            ingest(place, store, footprint=cells_of(0.01, side))
+            nodes = PointStore(store).attrs["nodes"]
+            print(f"{store}: {nodes[0]} of {nodes[1]} nodes, {PointStore(store).count} points kept")
+            if server.requests:
+                print_trace(file, server.requests)
+            print(f"{in_number(len(server.requests), 'request')}, {server.sent} bytes sent")
+            server.requests.clear()
+            server.sent = 0
+
+
 def measure(points: int, levels: int) -> None:
     """Bytes, time and memory of 1 % of a file against all of it."""
     side = (points / DENSITY) ** 0.5
@@ -131,11 +151,33 @@ def measure(points: int, levels: int) -> None:
         place = stand_in(server.url, size)
         ingest(place, "web.points", footprint=footprint)
         nodes_bytes = PointStore("web.points").attrs["bytes"][0]
-        print("requests: " + "; ".join(text.split("=")[1] for text in server.requests))
+        print_trace(file, server.requests)
         print(
             f"bytes sent {server.sent}, of the nodes {nodes_bytes}: {server.sent / nodes_bytes:.3f}"
         )
         print(f"store equals that of the disk: {same_cells(part, PointStore('web.points'))}")
+
+
+def print_trace(file: Path, requests: Sequence[str]) -> None:
+    """The requests of a run: which bytes of the file, how many, and what for."""
+    octree, size = open_octree(file), file.stat().st_size
+    with file.open("rb") as stream:
+        head = stream.read(INFO_AT + 160)
+    (hierarchy,) = struct.unpack_from("<Q", head, INFO_AT + 40)
+    print("| request | bytes of the file | how many | what for |\n|---|---|---|---|")
+    for number, text in enumerate(requests, 1):
+        first, last = map(int, text.rpartition("=")[2].split("-"))
+        last = min(last, size - 1)
+        nodes = [n for n in octree.nodes if first <= n.start and n.start + n.bytes - 1 <= last]
+        what = "chunk table" if last < hierarchy else "hierarchy"
+        if first == 0:
+            what = "header, coordinate system, cube and place of the hierarchy"
+        elif nodes:
+            levels = sorted({node.key[0] for node in nodes})
+            points = sum(node.points for node in nodes)
+            of = f"level {levels[0]}" if len(levels) == 1 else f"levels {levels[0]}-{levels[-1]}"
+            what = f"{in_number(len(nodes), 'node')} of {of}, {points} points"
+        print(f"| {number} | {first}-{last} | {last + 1 - first} | {what} |")
 
 
 def ingest_part(file: Path, store: str, footprint: Footprint) -> None:
@@ -184,11 +226,15 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--levels", type=int, default=6)
     parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--trace", action="store_true", help="the requests of one run, alone")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        measure(options.points, options.levels)
-        plant(options.rounds)
+        if options.trace:
+            trace(options.points, options.levels)
+        else:
+            measure(options.points, options.levels)
+            plant(options.rounds)
 
 
 if __name__ == "__main__":

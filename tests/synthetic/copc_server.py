@@ -142,6 +142,7 @@ SERVER_FAULTS = {
     "429 for an hour": False,
     "stall for ever": False,
     "drip": False,
+    "drip of the head": False,
     "no ranges": False,
     "replaced: ETag": False,
     "replaced: size": False,
@@ -152,6 +153,7 @@ SERVER_FAULTS = {
     "redirect loop": False,
     "redirect to file:": False,
     "redirect to another host": False,
+    "redirect to another port": False,
 }
 
 
@@ -197,6 +199,8 @@ def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
             if fault == "reset":
                 self.close_connection = True
                 return None
+            if fault == "drip of the head":
+                return self.drip_head()
             if fault.startswith("stall"):
                 time.sleep(0.6)
             if fault == "no ranges":
@@ -223,6 +227,14 @@ def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
             if fault == "encoded":
                 headers["Content-Encoding"] = "gzip"
             return self.plain(206, headers, body, drip=fault == "drip")
+
+        def drip_head(self):
+            """A line that goes on for as long as anybody listens, a minute at most."""
+            self.close_connection = True
+            self.wfile.write(b"HTTP/1.1 206 Partial Content\r\nX-Long: ")
+            for _ in range(600):
+                self.wfile.write(b"x")
+                time.sleep(0.1)
 
         def plain(self, status, headers, body=b"", drip=False):
             self.send_response(status)
@@ -272,6 +284,7 @@ STATUS = {
     "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
     "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
     "redirect to another host": lambda s: (302, {"Location": s.target}),
+    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
 }
 
 
@@ -299,6 +312,9 @@ FILE_FAULTS = {
     "node made empty": False,
     "node doubled": False,
     "page loop": False,
+    "pages that overlap": False,
+    "pages nested without end": False,
+    "records without end": False,
     "root page cut": False,
     "hierarchy out of the file": False,
     "cube too small": False,
@@ -312,6 +328,23 @@ FILE_FAULTS = {
     "two nodes swapped": None,
     "no info record": False,
 }
+
+
+def _overlap(made: MadeCopc, content: bytearray, info: list) -> None:
+    """A root of many pages, each of them most of the file."""
+    start, size = len(content), ENTRY.size
+    pages = [ENTRY.pack(1, 0, 0, 0, start, size * (5000 - k), -1) for k in range(5000)]
+    content += b"".join(pages)
+    info[5], info[6] = start, size * 5000
+
+
+def _nest(content: bytearray, info: list) -> None:
+    """Pages of which each names the next alone."""
+    start, size, n = len(content), ENTRY.size, 20_000
+    for k in range(n):
+        content += ENTRY.pack(1, 0, 0, 0, start + size * (k + 1), size, -1)
+    content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
+    info[5], info[6] = start, size
 
 
 def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
@@ -344,6 +377,13 @@ def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
         ENTRY.pack_into(content, at, *(other if fault == "node doubled" else [3, 0, 0, 7, 0, 0, 0]))
     elif fault == "page loop":
         ENTRY.pack_into(content, at, *entry[:4], info[5], info[6], -1)
+    elif fault == "pages that overlap":
+        _overlap(made, content, info)
+    elif fault == "pages nested without end":
+        _nest(content, info)
+    elif fault == "records without end":
+        struct.pack_into("<I", content, 243, 4_000_000_000)
+        content += bytes(10**6)
     elif fault == "root page cut":
         info[6] -= int(rng.integers(1, info[6]))
     elif fault == "hierarchy out of the file":

@@ -140,6 +140,13 @@ FAULTS = {
     "key that climbs": lambda f: _page(f, lambda p: p.update({"../../../etc/passwd": -1})),
     "key with a host": lambda f: _page(f, lambda p: p.update({"//evil.example/x": -1})),
     "count that is a text": lambda f: _page(f, lambda p: p.update({"0-0-0-0": "9"})),
+    "count a truth value": lambda f: _page(f, lambda p: p.update({"0-0-0-0": True})),
+    "root that leads to itself": lambda f: _page(f, lambda p: p.update({"0-0-0-0": -1})),
+    "page without its own node": lambda f: _page(
+        f, lambda p: p.pop(_branch(f).stem), _branch(f).stem
+    ),
+    "negative count": lambda f: _page(f, lambda p: p.update({"0-0-0-0": -7})),
+    "digits of another script": lambda f: _page(f, lambda p: p.update({"1-0-0-\u0663": 0})),
     "node lacks": lambda f: _some_node(f).unlink(),
     "node cut": lambda f: _some_node(f).write_bytes(_some_node(f).read_bytes()[:-300]),
     "node empty": lambda f: _some_node(f).write_bytes(b""),

@@ -18,16 +18,18 @@ from laspy.compression import DecompressionSelection
 from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
 
 from ..errors import InputError
+from ..products.ranges import Range, Ranges
 from .las_files import _decoding
 from .las_layout import LASZIP, LAYERED, Layout, _Packing, _records, _require
-from .octree_nodes import MOST_NODES, Node, Octree, good_key
-from .ranges import Range, Ranges
+from .octree_nodes import MOST_LEVELS, MOST_NODES, Node, Octree, good_key
 
 INFO = (b"copc", 1)
 INFO_PLACE = 375 + 54  # right behind the header of LAS 1.4, and its own
 ENTRY = struct.Struct("<4iQii")
 EVLR = struct.Struct("<H16sHQ32s")
 MOST_HEAD_BYTES = 16 << 20  # of header and VLRs
+MOST_EVLRS = 1000  # each of which is a request
+MOST_RAW_BYTES = 1 << 30  # of the decoded points of a node
 FIELDS = (
     DecompressionSelection.XY_RETURNS_CHANNEL
     | DecompressionSelection.Z
@@ -72,6 +74,8 @@ class Copc(Octree):
             by_return = sum(map(int, self.header.number_of_points_by_return))
             _require(by_return <= self.points, f"its counts by return add up to {by_return}")
             self._complete()
+            most = max(node.points for node in self.nodes) * layout.record_bytes
+            _require(most <= MOST_RAW_BYTES, f"a node has {most} bytes of points")
             self._compare_chunks(layout)
 
     def _layout(self) -> tuple[Layout, bytes]:
@@ -88,7 +92,8 @@ class Copc(Octree):
     def _systems_behind(self, layout: Layout) -> list[laspy.VLR]:
         """The records behind the points that declare a coordinate system."""
         found, at = [], layout.first_evlr
-        for _ in range(int(self.header.number_of_evlrs)):
+        _require(layout.evlrs <= MOST_EVLRS, f"it has {layout.evlrs} records behind its points")
+        for _ in range(layout.evlrs):
             head = self._ranges.get(at, at + EVLR.size)
             _, user, number, length, _ = EVLR.unpack(head)
             if user.rstrip(b"\0") == b"LASF_Projection":
@@ -102,7 +107,12 @@ class Copc(Octree):
         """The nodes with points of all pages, in the order of the file."""
         nodes: dict[tuple[int, int, int, int], Node] = {}
         empty, asked, pages = set(), {root}, [root]
+        depth = 0
         while pages:
+            depth += 1
+            held = sum(end - start for start, end in asked)
+            _require(held <= self._ranges.size, "pages of its hierarchy overlap")
+            _require(depth <= MOST_LEVELS + 1, "pages of its hierarchy are nested without end")
             contents, pages = list(self._ranges.parts(sorted(pages))), []
             for content in contents:
                 _require(
@@ -127,7 +137,8 @@ class Copc(Octree):
                         empty.add(key)
                     else:
                         nodes[key] = Node(key, points, start, size)
-                _require(len(nodes) + len(asked) <= MOST_NODES, "its hierarchy is too large")
+                held = len(nodes) + len(empty) + len(asked)
+                _require(held <= MOST_NODES, "its hierarchy is too large")
         _require((0, 0, 0, 0) in nodes.keys() | empty, "its hierarchy has no root")
         _require(bool(nodes), "no node of its hierarchy has points")
         return tuple(sorted(nodes.values(), key=lambda node: node.start))

@@ -3,8 +3,9 @@
 What of a footprint is read, and how it is proven complete, is that of all octrees
 (:mod:`.octree_nodes`): the counts of the hierarchy must add up to that of ``ept.json``, so that a
 part of the hierarchy that lacks is found before a point is read. Nothing but files of the dataset's
-own folder is asked for. Source: Entwine Point Tile 1.0 (entwine.io), "ept.json", "Point data",
-"Hierarchy".
+own folder is asked for. How many bytes a node has is told by its file alone: until then it is
+estimated by the points and bytes of the first one. Source: Entwine Point Tile 1.0 (entwine.io),
+"ept.json", "Point data", "Hierarchy".
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +27,23 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..errors import InputError
+from ..products.ranges import AT_ONCE, LocalRanges, Ranges, WebRanges
 from ..products.remote_files import hosts_of, is_remote, read_bytes, url_of
 from ..products.web_requests import WEB
 from .copc import FIELDS
 from .las_files import _decoding
 from .las_layout import _require
 from .octree_nodes import MOST_NODE_POINTS, MOST_NODES, Node, Octree, good_key
-from .range_copies import open_ranges
-from .ranges import AT_ONCE, LocalRanges, WebRanges
+from .range_copies import copies_of, kept, open_ranges
 
 NAME = "ept.json"
 MOST_JSON_BYTES = 64 << 20  # of ept.json, and of a file of the hierarchy
 MOST_NODE_BYTES = 256 << 20
 HEAD_BYTES = 4 << 20  # that are asked for at once: of most files, all
-KEY = re.compile(r"(\d{1,2})-(\d{1,10})-(\d{1,10})-(\d{1,10})")
+KEY = re.compile(r"([0-9]{1,2})-([0-9]{1,10})-([0-9]{1,10})-([0-9]{1,10})")
+PAGES_AT_ONCE = 64  # of the hierarchy, in memory
 Key = tuple[int, int, int, int]
+TOP: Key = (0, 0, 0, 0)
 
 
 class Ept(Octree):
@@ -50,12 +54,15 @@ class Ept(Octree):
     ) -> None:
         self.name, self._location = str(location), location
         self._hosts, self._patience_s = allow_hosts, patience_s
+        self._copies: Path | None = None
         place = str(location) if is_remote(str(location)) else url_of(location)
         if place is None:
             self._folder: str | Path = Path(location).parent
         else:
             self.name, self._folder = place, place.rpartition("/")[0]
-            self._hosts |= frozenset() if is_remote(str(location)) else hosts_of(location)
+            if not is_remote(str(location)):
+                self._hosts |= hosts_of(location)
+                self._copies = copies_of(Path(location), place)
         with _decoding(lambda error: self._refusal(f"{type(error).__name__} {error}")):
             about = self._json(NAME)
             bounds = np.array(about["bounds"], np.float64)
@@ -73,19 +80,27 @@ class Ept(Octree):
                     remedy="have it written again with dataType laszip",
                 )
             points = about["points"]
-            _require(isinstance(points, int) and points > 0, "it announces no points")
-            self.nodes = self._hierarchy()
-            self.header = self._reference(about, points)
+            _require(type(points) is int and points > 0, "it announces no points")
+            nodes = self._hierarchy()
+            self.header, size = self._reference(about, points, nodes[0])
+            share = size / nodes[0].points
+            self.nodes = tuple(replace(n, bytes=max(1, round(n.points * share))) for n in nodes)
             self._complete()
 
     def _read(self, name: str, most: int) -> bytes:
-        """A file of the dataset."""
+        """A file of the dataset, or its copy."""
         if name == NAME:
-            ranges: Any = open_ranges(
+            ranges: Ranges = open_ranges(
                 self._location, allow_hosts=self._hosts, patience_s=self._patience_s
             )
-        elif isinstance(self._folder, Path):
-            ranges = LocalRanges(self._folder / name)
+            _require(ranges.size <= most, f"{name} has {ranges.size} bytes")
+            return ranges.get(0, ranges.size)
+        return kept(self._copies, name, lambda: self._asked(name, most))
+
+    def _asked(self, name: str, most: int) -> bytes:
+        """A file beside ept.json."""
+        if isinstance(self._folder, Path):
+            ranges: Ranges = LocalRanges(self._folder / name)
         elif self._folder.partition("://")[0] in WEB:
             ranges = WebRanges(
                 f"{self._folder}/{name}",
@@ -106,36 +121,48 @@ class Ept(Octree):
     def _hierarchy(self) -> tuple[Node, ...]:
         """The nodes with points of all files of the hierarchy, by level and place."""
         counts: dict[Key, int] = {}
-        waiting: deque[Key] = deque([(0, 0, 0, 0)])
-        asked = set(waiting)
-        while waiting:
-            top = waiting.popleft()
-            held = self._json(f"ept-hierarchy/{_text(top)}.json")
-            _require(_text(top) in held, f"its hierarchy lacks node {_text(top)}")
-            for text, points in held.items():
-                found = KEY.fullmatch(text)
-                _require(found is not None, f"its hierarchy has a node {text[:40]!r}")
-                level, x, y, z = map(int, found.groups())
-                key = (level, x, y, z)
-                _require(good_key(key), f"its hierarchy has a node {text}")
-                if points == -1 and key != top:
-                    _require(key not in asked, f"two places name the hierarchy of node {text}")
-                    asked.add(key)
-                    waiting.append(key)
-                    continue
-                _require(
-                    isinstance(points, int) and points >= 0 and key not in counts,
-                    f"node {text} stands twice in its hierarchy, or has {points} points",
-                )
-                counts[key] = points
-            _require(len(counts) + len(asked) <= MOST_NODES, "its hierarchy is too large")
+        asked, waiting = {TOP}, [TOP]
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            while waiting:
+                tops = waiting[:PAGES_AT_ONCE]
+                del waiting[:PAGES_AT_ONCE]
+                names = [f"ept-hierarchy/{_text(top)}.json" for top in tops]
+                for top, page in zip(tops, pool.map(self._json, names)):
+                    waiting += self._counted(page, top, counts, asked)
+                _require(len(counts) + len(asked) <= MOST_NODES, "its hierarchy is too large")
         nodes = tuple(Node(key, points, 0, 0) for key, points in sorted(counts.items()) if points)
         _require(bool(nodes), "no node of its hierarchy has points")
         return nodes
 
-    def _reference(self, about: dict[str, Any], points: int) -> laspy.LasHeader:
-        """The header of the first node, made that of the whole."""
-        header, _ = self._opened(self.nodes[0])
+    def _counted(
+        self, page: dict[str, Any], top: Key, counts: dict[Key, int], asked: set[Key]
+    ) -> list[Key]:
+        """Add the counts of a page, and return the nodes whose own pages are named by it."""
+        _require(_text(top) in page, f"its hierarchy lacks node {_text(top)}")
+        below = []
+        for text, points in page.items():
+            parts = KEY.fullmatch(text)
+            _require(parts is not None, f"its hierarchy has a node {text[:40]!r}")
+            level, x, y, z = map(int, parts.groups())
+            key = (level, x, y, z)
+            _require(good_key(key), f"its hierarchy has a node {text}")
+            if points == -1 and key != top:
+                _require(key not in asked, f"two places name the hierarchy of node {text}")
+                asked.add(key)
+                below.append(key)
+                continue
+            _require(
+                type(points) is int and points >= 0 and key not in counts,
+                f"node {text} stands twice in its hierarchy, or has {str(points)[:20]} points",
+            )
+            counts[key] = points
+        return below
+
+    def _reference(
+        self, about: dict[str, Any], points: int, first: Node
+    ) -> tuple[laspy.LasHeader, int]:
+        """The header of the first node, made that of the whole, and the bytes of its file."""
+        header, content = self._opened(first)
         bounds = np.array(about.get("boundsConforming", about["bounds"]), np.float64)
         _require(bounds.shape == (6,), "its boundsConforming are no box")
         header.mins, header.maxs = bounds[:3], bounds[3:]
@@ -146,7 +173,7 @@ class Ept(Octree):
             kept = [vlr for vlr in header.vlrs if vlr.user_id != "LASF_Projection"]
             header.vlrs = [*kept, record]
             header.global_encoding.wkt = True
-        return header
+        return header, len(content)
 
     def _system(self, srs: Any) -> CRS | None:
         """The coordinate system that ept.json states; None where it states none."""

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
-from ..products.remote_files import size_of
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .footprint import Footprint
 from .las_files import PointTally
@@ -213,7 +212,7 @@ def ingest(
         summary = {
             "points": _counts(tally, runs, header, dropped),
             "nodes": part.nodes,
-            "bytes": [part.bytes, size_of(file)],
+            "bytes": [part.bytes, points.bytes],
             "classes": {str(c): int(n) for c, n in enumerate(tally.counts[0]) if n},
             "bounds": bounds,
             "crs": transform.describe(),

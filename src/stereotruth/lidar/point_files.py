@@ -20,8 +20,10 @@ from ..products.remote_files import size_of
 from . import las_files
 from .octree import open_octree
 from .octree_nodes import Touches
+from .range_copies import open_stream
 
 OCTREE, EPT = ".copc.laz", "ept.json"
+FIRST_BYTES = 1 << 14  # that servers are asked for at once
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # of TIFF 6.0 and of BigTIFF
 
 
@@ -65,6 +67,11 @@ class PointFile:
         return float(self.header.mins[2]), float(self.header.maxs[2])
 
     @property
+    def bytes(self) -> int:
+        """All that there is to read."""
+        return size_of(self.path)
+
+    @property
     def cell(self) -> float:
         """Side of the cells that points are the middles of, or 0: the points lie anywhere."""
         return 0.0
@@ -75,7 +82,7 @@ class PointFile:
 
     def part(self, touches: Touches | None) -> Part:
         """What is to be read for a footprint; all of it for None."""
-        whole = Part(int(self.header.point_count), size_of(self.path), self.chunks)
+        whole = Part(int(self.header.point_count), self.bytes, self.chunks)
         if touches is None:
             return whole
         bounds = np.array([[self.header.mins], [self.header.maxs]], np.float64)
@@ -108,6 +115,12 @@ class OctreeFile(PointFile):
     @property
     def remark(self) -> None:
         """Nothing."""
+
+    @property
+    def bytes(self) -> int:
+        """Of the file, or of all nodes of EPT."""
+        every = sum(node.bytes for node in self.octree.nodes)
+        return max(every, size_of(self.path))
 
     def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
         """All points node by node, whatever the size."""
@@ -171,6 +184,6 @@ def open_points(path: str | Path, *, by_nodes: bool = False) -> PointFile:
     if name == EPT or (by_nodes and name.endswith(OCTREE)):
         return OctreeFile(path)
     first = b""
-    with suppress(OSError), path.open("rb") as stream:  # which the reader names
+    with suppress(OSError), open_stream(path, FIRST_BYTES) as stream:  # which the reader names
         first = stream.read(4)
     return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path)

@@ -21,9 +21,17 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from ..errors import InputError, without_secrets
-from ..products.remote_files import answering, bucket, hosts_of, is_remote, refuse_changed, url_of
+from ..products.ranges import LocalRanges, Ranges, RangeStream, WebRanges
+from ..products.remote_files import (
+    answering,
+    bucket,
+    hosts_of,
+    is_remote,
+    refuse_changed,
+    same_as_stand_in,
+    url_of,
+)
 from ..products.web_requests import WEB
-from .ranges import LocalRanges, Ranges, WebRanges
 
 FOLDER = Path("results", "copies")
 STREAM_BYTES = 4 << 20  # of a file that is read as a whole, at once
@@ -42,30 +50,17 @@ class StandInRanges(Ranges):
         self.name, self.size = without_secrets(url), int(state["size"])
         self._content, self._opened, self._lock = str(state["content"]), opened, Lock()
         self._source: Ranges | None = None
-        key = json.dumps([self.name, self.size, self._content])
-        self._folder = FOLDER / hashlib.sha256(key.encode()).hexdigest()[:32]
+        self._copies = copies_of(place, url)
 
     def _get(self, start: int, end: int) -> bytes:
-        kept = self._folder / f"{start}-{end}"
-        if self._content and (content := _read(kept, end - start)) is not None:
-            return content
-        content = self._ask().get(start, end)
-        if self._content:
-            _keep(kept, content)
-        return content
+        return kept(
+            self._copies, f"{start}-{end}", lambda: self._ask().get(start, end), end - start
+        )
 
     def _ask(self) -> Ranges:
         with self._lock:
             if self._source is None:
-                source = self._opened()
-                other = source.content and self._content and source.content != self._content
-                if source.size != self.size or other:
-                    raise InputError(
-                        "changed on its server since this run began",
-                        file=self.name,
-                        remedy="run again, and leave it alone until the run has ended",
-                    )
-                self._source = source
+                self._source = same_as_stand_in(self._opened(), self.size, self._content)
             return self._source
 
 
@@ -93,7 +88,7 @@ class BucketRanges(Ranges):
 def open_ranges(location: str | Path, **how: Any) -> Ranges:
     """A path, a URL of a web server, or the stand-in of one or of an object of a bucket.
 
-    ``how``: see :class:`.ranges.WebRanges`.
+    ``how``: see :class:`..products.ranges.WebRanges`.
     """
     if is_remote(str(location)):
         return WebRanges(str(location), **how)
@@ -106,47 +101,6 @@ def open_ranges(location: str | Path, **how: Any) -> Ranges:
     return StandInRanges(place, url, lambda: WebRanges(url, allow_hosts=hosts, **how))
 
 
-class RangeStream(io.RawIOBase):
-    """A file as a stream of blocks."""
-
-    def __init__(self, ranges: Ranges, block_bytes: int) -> None:
-        self._ranges, self._block_bytes, self._at = ranges, block_bytes, 0
-        self._number, self._block = -1, b""
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
-
-    def tell(self) -> int:
-        """The place of the next byte."""
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place, as of any stream."""
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._ranges.size}[whence]
-        self._at = max(0, start + offset)
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        """Bytes from here on to the end of the block."""
-        if self._at >= self._ranges.size:
-            return 0
-        number = self._at // self._block_bytes
-        if number != self._number:
-            start = number * self._block_bytes
-            end = min(start + self._block_bytes, self._ranges.size)
-            self._block, self._number = self._ranges.get(start, end), number
-        first = self._at - number * self._block_bytes
-        part = self._block[first : first + len(buffer)]
-        memoryview(buffer)[: len(part)] = part
-        self._at += len(part)
-        return len(part)
-
-
 def open_stream(path: str | Path, block_bytes: int = STREAM_BYTES) -> BinaryIO:
     """A LiDAR file, or what it stands for, by blocks that are kept."""
     if url_of(path) is None:
@@ -154,28 +108,50 @@ def open_stream(path: str | Path, block_bytes: int = STREAM_BYTES) -> BinaryIO:
     return io.BufferedReader(RangeStream(open_ranges(path), block_bytes))
 
 
-def _read(kept: Path, length: int) -> bytes | None:
+def copies_of(place: Path, url: str) -> Path | None:
+    """Where copies of what a stand-in stands for are kept; None if its server names no content."""
+    state = json.loads(place.read_text())
+    if not state["content"]:
+        return None
+    key = json.dumps([without_secrets(url), int(state["size"]), str(state["content"])])
+    return FOLDER / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def kept(
+    folder: Path | None, name: str, fetch: Callable[[], bytes], length: int | None = None
+) -> bytes:
+    """The copy of that name, if it is whole and of that length; else what is fetched, and kept."""
+    if folder is None:
+        return fetch()
+    copy = folder / name.replace("/", ".")
+    if (content := _read(copy, length)) is None:
+        content = fetch()
+        _keep(copy, content)
+    return content
+
+
+def _read(copy: Path, length: int | None) -> bytes | None:
     """A copy, if it is there and whole."""
     try:
-        content = kept.read_bytes()
+        content = copy.read_bytes()
     except OSError:
         return None
     body = content[:-CHECK_BYTES]
     whole = content[-CHECK_BYTES:] == zlib.crc32(body).to_bytes(CHECK_BYTES, "little")
-    if len(body) != length or not whole:
+    if length not in (None, len(body)) or not whole:
         return None
     with suppress(OSError):
-        os.utime(kept)
+        os.utime(copy)
     return body
 
 
-def _keep(kept: Path, content: bytes) -> None:
+def _keep(copy: Path, content: bytes) -> None:
     """Write a copy atomically; a disk that does not take it is no harm."""
-    scratch = kept.with_name(f".{kept.name}.{os.getpid()}")
+    scratch = copy.with_name(f".{copy.name}.{os.getpid()}")
     try:
-        kept.parent.mkdir(parents=True, exist_ok=True)
+        copy.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(content + zlib.crc32(content).to_bytes(CHECK_BYTES, "little"))
-        scratch.replace(kept)
+        scratch.replace(copy)
     except OSError:
         with suppress(OSError):
             scratch.unlink()
@@ -183,13 +159,13 @@ def _keep(kept: Path, content: bytes) -> None:
 
 def prune(limit_bytes: float) -> None:
     """Remove the copies that were not used for the longest time, until no more bytes are kept."""
-    kept = []
+    copies = []
     for file in FOLDER.glob("*/*"):
         with suppress(OSError):  # of another job, which prunes as well
             state = file.stat()
-            kept.append((state.st_mtime_ns, state.st_size, file))
-    total = sum(size for _, size, _ in kept)
-    for _, size, file in sorted(kept):
+            copies.append((state.st_mtime_ns, state.st_size, file))
+    total = sum(size for _, size, _ in copies)
+    for _, size, file in sorted(copies):
         if total <= limit_bytes:
             break
         with suppress(OSError):

@@ -11,8 +11,9 @@ offset; cells are read by the blocks of the file, whose order is that of the poi
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,10 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from ..errors import InputError, in_number
+from ..products.remote_files import url_of
 from ..products.ungeoreferenced import open_raster
 from .declared_crs import LINEAR_UNITS
+from .range_copies import open_stream
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +39,7 @@ HEIGHT_STEP = 1e-4  # of the unit of the heights
 LOWEST, HIGHEST = -4000.0, 30000.0  # heights on Earth, in metres or in feet
 MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
 MOST_BLOCK_CELLS = 1 << 26  # of a block, which GDAL reads as a whole
+STREAM_BYTES = 1 << 20  # that servers are asked for at once
 SAMPLES = 64  # cells along each side that say how high a surface lies
 UNCLASSIFIED = 1
 UNITS = {  # of GDAL's bands
@@ -47,18 +51,71 @@ UNITS = {  # of GDAL's bands
 
 @contextmanager
 def _opened(file: Path) -> Iterator[rasterio.DatasetReader]:
-    """A raster of heights. Raises InputError if it cannot be read or is no such raster."""
-    try:
+    """A raster of heights. Raises InputError if it cannot be read or is no such raster.
+
+    Of a stand-in, GDAL is given the parts that servers send to this package: left to itself it
+    follows redirects to anywhere.
+    """
+    with ExitStack() as stack:
         # vertical parts of systems are not told otherwise
-        with rasterio.Env(GTIFF_REPORT_COMPD_CS=True), open_raster(file, formats=FORMATS) as raster:
-            _refuse_other(raster, file)
-            yield raster
-    except RasterioError as error:
-        raise InputError(
-            f"no GeoTIFF that can be read ({error})",
-            file=file,
-            remedy="check or replace the file; lidar takes LAS, LAZ, COPC, and GeoTIFFs of heights",
-        ) from None
+        stack.enter_context(rasterio.Env(GTIFF_REPORT_COMPD_CS=True))
+        parts = None if url_of(file) is None else stack.enter_context(_Parts(file))
+        try:
+            if parts is None:
+                raster = open_raster(file, formats=FORMATS)
+            else:
+                stack.enter_context(rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"))
+                raster = rasterio.open(file.name, driver=FORMATS[0], opener=parts.opened)
+            with raster:
+                _refuse_other(raster, file)
+                yield raster
+        except RasterioError as error:
+            if parts is not None and parts.failure is not None:
+                raise parts.failure from None
+            raise InputError(
+                f"no GeoTIFF that can be read ({error})",
+                file=file,
+                remedy="check or replace the file; lidar takes LAS, LAZ, COPC, and GeoTIFFs of "
+                "heights",
+            ) from None
+
+
+class _Parts(io.RawIOBase):
+    """What a stand-in stands for, as GDAL reads it: an error ends the file, and is kept."""
+
+    def __init__(self, file: Path) -> None:
+        self._name, self._stream = file.name, open_stream(file, STREAM_BYTES)
+        self.failure: InputError | None = None
+
+    def opened(self, path: str, mode: str = "rb") -> _Parts:
+        """Itself by its own name; there is no other file."""
+        if path != self._name or mode != "rb":
+            raise FileNotFoundError(path)
+        return self
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def tell(self) -> int:
+        """The place of the next byte."""
+        return self._stream.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place, as of any stream."""
+        return self._stream.seek(offset, whence)
+
+    def read(self, size: int = -1) -> bytes:
+        """So many bytes; none after an error."""
+        try:
+            return b"" if self.failure else self._stream.read(size)
+        except InputError as error:
+            self.failure = error
+            return b""
 
 
 def _refuse_other(raster: rasterio.DatasetReader, file: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from ..numerics.degrees import DEGREE_M
-from ..products.remote_files import size_of
 from .footprint import Footprint
 from .ingest import _bounds, _refuse_coarse, _to_lattice, touching
 from .point_files import open_points
@@ -93,6 +92,6 @@ def survey(
         system=transform.system.name,
         surface=transform.heights,
         notes=tuple(notes),
-        bytes=size_of(file),
+        bytes=points.bytes,
         read=(part.points, part.bytes),
     )

@@ -25,7 +25,8 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from ..errors import InputError
-from .web_requests import WEB, WebStream, info_of, read_whole, too_large
+from .ranges import Ranges, RangeStream, WebRanges, changed
+from .web_requests import WEB, info_of, read_whole, too_large
 
 FOLDER = Path("results", "remote")
 SCHEMES = ("s3", *WEB)
@@ -359,9 +360,12 @@ def open_file(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
         return
     refuse_changed(path)
-    size = _held(path)["size"]
+    held = _held(path)
+    size = held["size"]
     if urlsplit(url).scheme in WEB:
-        with io.BufferedReader(WebStream(url, size, hosts_of(path)), READ_BYTES) as file:
+        ranges = WebRanges(url, allow_hosts=hosts_of(path))
+        same_as_stand_in(ranges, size, held["content"])
+        with io.BufferedReader(RangeStream(ranges, READ_BYTES)) as file:
             yield file
         return
     storage, name = bucket(url)
@@ -380,11 +384,18 @@ def refuse_changed(path: str | Path) -> None:
     """Raise InputError if the file that a path stands for is another one by now."""
     url = url_of(path)
     if url is not None and _look(url, hosts_of(path)) != Path(path).read_text():
-        raise InputError(
-            "changed on its server since this run began",
-            file=url,
-            remedy="run again, and leave it alone until the run has ended",
-        )
+        raise changed(url)
+
+
+def same_as_stand_in(ranges: Ranges, size: int, content: str) -> Ranges:
+    """What a server gives, if that is what a stand-in says. Raises InputError if it is not.
+
+    Some servers name no content, or not with every answer.
+    """
+    other = ranges.content and content and ranges.content != content
+    if ranges.size != size or other:
+        raise changed(ranges.name)
+    return ranges
 
 
 def gdal_name(path: str | Path) -> tuple[str, dict[str, str]]:

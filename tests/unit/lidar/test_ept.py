@@ -20,6 +20,7 @@ from stereotruth.lidar.declared_crs import header_crs, interpret
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.survey import survey
 
 from ...synthetic.copc_server import CORNER, UTM
 from ...synthetic.ept import FAULTS, _about, make_ept
@@ -167,3 +168,34 @@ def test_nodes_have_the_scales_of_all(whole):
     assert header.point_count == about["points"]
     assert np.allclose(header.mins, about["boundsConforming"][:3])
     assert isinstance(header, laspy.LasHeader) and header.scales[0] == 0.01
+
+
+def stand_in(url: str, file: Path, content: str) -> Path:
+    place = Path("results", "remote", *url.replace("://", "/").split("/"))
+    place.parent.mkdir(parents=True)
+    place.write_text(json.dumps({"size": file.stat().st_size, "content": content}) + "\n")
+    return place
+
+
+def test_a_second_run_asks_for_nothing(dataset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with serving(dataset.parent) as (url, asked):
+        place = stand_in(f"{url}/ept.json", dataset, "Tue, 24 Nov 2026 10:00:00 GMT")
+        ingest(place, tmp_path / "a.points", footprint=ground())
+        assert asked
+        asked.clear()
+        ingest(place, tmp_path / "b.points", footprint=ground())
+        assert asked == []
+    ingest(dataset, tmp_path / "c.points", footprint=ground())
+    assert same(tmp_path / "a.points", tmp_path / "b.points")
+    assert same(tmp_path / "a.points", tmp_path / "c.points")
+
+
+def test_bytes_are_estimated_before_they_are_read(dataset, tmp_path):
+    surveyed = survey(dataset, footprint=ground())
+    nodes = list((dataset.parent / "ept-data").glob("*.laz"))
+    every = sum(file.stat().st_size for file in nodes)
+    assert 0 < surveyed.read[1] < surveyed.bytes
+    assert every / 4 < surveyed.bytes < 2 * every  # small nodes have large headers
+    summary = ingest(dataset, tmp_path / "a.points", footprint=ground())
+    assert summary["bytes"] == [surveyed.read[1], surveyed.bytes]

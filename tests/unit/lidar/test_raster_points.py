@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
 import numpy as np
 import pyproj
 import pytest
@@ -13,6 +17,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
 
+from ...synthetic.copc_server import serving
 from ...synthetic.las import FT, SOUTH, US_FT, WEST, everything, refused, write_gtx
 from ...synthetic.stores import tree_digest
 from ...synthetic.surface_rasters import UTM, write_raster
@@ -120,3 +125,66 @@ def test_a_raster_is_surveyed_without_its_cells(tmp_path):
     assert survey(empty).heights is None
     with pytest.raises(InputError, match="no such LiDAR file"):
         survey(tmp_path / "none.tif")
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """A surface model on a server: the server, its stand-in, its file on the disk."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    heights = rng.uniform(20, 60, (300, 400)).astype(np.float32)
+    tiled = {"tiled": True, "blockxsize": 128, "blockysize": 128, "compress": "deflate"}
+    file = write_raster(tmp_path / "tile.tif", heights, 1.0, **tiled)
+    monkeypatch.setattr(raster_points, "STREAM_BYTES", 1 << 15)
+    with serving(file.read_bytes()) as server:
+        server.url = server.url.replace("tile.copc.laz", "tile.tif")
+        place = Path("results", "remote", *server.url.replace("://", "/").split("/"))
+        place.parent.mkdir(parents=True)
+        state = {"size": file.stat().st_size, "content": '"one"', "hosts": []}
+        place.write_text(json.dumps(state) + "\n")
+        yield server, place, file
+
+
+def test_a_raster_of_a_server_is_that_of_the_disk_and_asked_for_once(served):
+    server, place, file = served
+    ingest(place, "web.points")
+    ingest(file, "disk.points")
+    assert tree_digest(Path("web.points")) == tree_digest(Path("disk.points"))
+    assert survey(place).read == survey(file).read
+    spans = [text.rpartition("=")[2] for text in server.requests]
+    spans = [span for span in spans if span != "0-16383"]  # which tell what the file is by now
+    assert len(spans) == len(set(spans)) > 5
+    assert server.sent < 1.4 * file.stat().st_size
+    server.requests.clear()
+    ingest(place, "again.points")
+    assert server.requests == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("redirect to another host", "another host, other.invalid"),
+        ("redirect to file:", "no file of a web server"),
+        ("replaced: ETag", "changed on its server"),
+        ("no ranges", "as a whole only"),
+        ("gone", "no such file there"),
+    ],
+)
+@pytest.mark.parametrize("when", [0, 2, 4])
+def test_a_raster_of_a_server_is_whole_or_refused(served, fault, words, when):
+    """GDAL asks through this package: it is led nowhere else, whatever comes first."""
+    server, place, _ = served
+    server.fault, server.when = fault, when
+    if fault.startswith("replaced") and not when:
+        return
+    with pytest.raises(InputError, match=words) as refused:
+        ingest(place, "web.points")
+    assert "secret" not in str(refused.value)
+    assert not Path("web.points").exists()
+
+
+def test_rasters_of_servers_are_surveyed_by_several_at_once(served):
+    _, place, file = served
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(survey, [place] * 16))
+    assert {one.heights for one in found} == {survey(file).heights}

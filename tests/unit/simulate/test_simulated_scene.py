@@ -71,6 +71,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.locks",
         "products.provenance",
         "products.atomic_outputs",
+        "products.ranges",
         "products.records",
         "products.remote_files",
         "products.web_requests",
