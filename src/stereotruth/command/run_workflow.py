@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..project import CONFIG, FILES, read_mapping, require_project
-from .targets import refuse_unknown
+from ..project import CONFIG, FILES, read_mapping, require_project, require_scenes
+from .targets import need_scenes, refuse_unknown
 
 EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
@@ -185,6 +185,9 @@ def run_workflow(given: Sequence[str]) -> int:
         read_mapping(file)
     if EXAMPLE not in given:
         refuse_unknown(given, files)
+        by_option = any(word.startswith("scenes=") for word in given)  # of --config
+        if not by_option and need_scenes(given, files):
+            require_scenes(files)
     command = [sys.executable, "-m", "snakemake", *arguments]
     if not sys.stderr.isatty() or {"--dry-run", "-n", "--dryrun"} & set(given):
         os.execv(sys.executable, command)
