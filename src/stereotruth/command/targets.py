@@ -72,7 +72,7 @@ IN_PATH = (
 
 # Targets that are made of a dataset by its name, or of built-in cities by their own.
 WITHOUT_SCENES = re.compile(
-    r"(benchmark|audit|submission|results/(train|match))/.+|training_cities"
+    r"(benchmark|audit|submission|results/(train|match|training_cities))/.+|training_cities"
 )
 
 
