@@ -173,6 +173,30 @@ def watch(lines: Iterable[str], progress: Progress) -> None:
             console.print(line, markup=False, soft_wrap=True)
 
 
+def follow(process: subprocess.Popen[str]) -> int:
+    """Watch a run until it ends; returns its exit status.
+
+    After Ctrl-C, which reaches Snakemake too, what its jobs say of their end is not shown.
+    """
+    is_stopped = False
+    while True:
+        try:
+            if is_stopped:
+                for _ in process.stdout or ():
+                    pass
+            else:
+                watch(process.stdout or (), Progress())
+            status = process.wait()
+            break
+        except KeyboardInterrupt:
+            if not is_stopped:
+                sys.stderr.write("Stopping the jobs that are at work …\n")
+            is_stopped = True
+    if is_stopped:
+        sys.stderr.write("Stopped. The same command carries on.\n")
+    return status
+
+
 def run_workflow(given: Sequence[str]) -> int:
     """Run the workflow; returns Snakemake's exit status.
 
@@ -201,14 +225,4 @@ def run_workflow(given: Sequence[str]) -> int:
         errors="replace",
     )
     signal.signal(signal.SIGTERM, lambda number, _: process.send_signal(number))
-    progress, is_stopped = Progress(), False
-    while True:
-        try:
-            watch(process.stdout, progress)
-            status = process.wait()
-            break
-        except KeyboardInterrupt:  # reached Snakemake too, which ends its jobs
-            is_stopped = True
-    if is_stopped:
-        sys.stderr.write("Stopped. The same command carries on.\n")
-    return status
+    return follow(process)
