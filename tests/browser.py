@@ -39,8 +39,20 @@ addEventListener("load", async () => {
   report.id = "probe-result";
   report.textContent = JSON.stringify({ found, wrong, requests });
   document.documentElement.append(report);
+  if (parent !== window) parent.postMessage(report.textContent, "*");
 });
 </script>"""
+NARROWEST = 500  # px, of a window; a narrower page is a frame in it
+FRAME = """<!DOCTYPE html><html><head></head><body style="margin: 0">
+<iframe src="%s" style="width: %dpx; height: 1000px; border: 0"></iframe>
+<script>
+addEventListener("message", (e) => {
+  const report = document.createElement("pre");
+  report.id = "probe-result";
+  report.textContent = e.data;
+  document.body.append(report);
+});
+</script></body></html>"""
 
 
 @dataclass
@@ -84,11 +96,23 @@ def look(page: Path, folder: Path, script: str, width: int = 1280) -> Seen:
     text = text.replace("<head>", f"<head>{WATCH}").replace("</body>", f"{PROBE % script}</body>")
     copy = folder / "probed.html"
     copy.write_text(text, encoding="utf-8")
-    dom = _run(copy, f"--window-size={width},1000", "--virtual-time-budget=20000", "--dump-dom")
+    if width < NARROWEST:
+        framed = folder / "framed.html"
+        framed.write_text(FRAME % (copy.as_uri(), width), encoding="utf-8")
+        copy = framed
+    size = f"--window-size={max(width, NARROWEST)},1000"
+    dom = _run(copy, size, "--virtual-time-budget=20000", "--dump-dom")
     result = re.search(r'<pre id="probe-result">(.*?)</pre>', dom, flags=re.DOTALL)
     assert result, "the page's script did not end"
     plain = result[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
     return Seen(**json.loads(plain))
+
+
+def as_printed(page: Path, file: Path) -> Path:
+    """A copy of the page that has on the screen the style that it has on paper."""
+    text = page.read_text(encoding="utf-8")
+    file.write_text(text.replace("@media print", "@media screen"), encoding="utf-8")
+    return file
 
 
 def screenshot(page: Path, file: Path, width: int, height: int) -> Path:

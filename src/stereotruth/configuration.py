@@ -225,10 +225,19 @@ def _with_remark(line: str, key: Key) -> str:
     return f"{line} # {textwrap.shorten(remark, room, placeholder=' …')}"
 
 
+USAGE = """\
+Usage: python -m stereotruth.configuration [FOLDER]
+Writes config.yaml with all defaults, and the tables of keys in README.md, in FOLDER (config).
+For developers, in a checkout: the reference is made of the classes that check a configuration.
+"""
+
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        sys.stdout.write(USAGE)
+        sys.exit()
     config = Path(*sys.argv[1:] or ["config"])
     guide = config / "README.md"
     if not guide.is_file():
-        sys.exit(f"no {guide}. Usage: python -m stereotruth.configuration [FOLDER]; FOLDER: config")
+        sys.exit(f"no {guide}. {USAGE.splitlines()[0]}")
     guide.write_text(with_tables(guide.read_text(encoding="utf-8")), encoding="utf-8")
     (config / "config.yaml").write_text(defaults_text(), encoding="utf-8")

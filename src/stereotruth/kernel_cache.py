@@ -25,7 +25,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).parent
-log = logging.getLogger("stereotruth")
+log = logging.getLogger("stereotruth.compiling")
 LONGEST_S = 120.0  # that another process is waited for: one whose compilation has failed holds on
 
 

@@ -79,6 +79,27 @@ def require_project(files: Sequence[str | Path] | None = None) -> None:
     raise InputError(f"no {CONFIG} here", file=Path.cwd(), remedy="; or ".join(remedies))
 
 
+def names_scenes(files: Sequence[str | Path] | None = None) -> bool:
+    """Whether the configuration of this folder, or of ``files``, names a sheet of scenes.
+
+    A clone always has one: that of the built-in cities.
+    """
+    read = [Path(file) for file in files or [CONFIG]]
+    return SHARED.is_file() or any("scenes" in read_mapping(file) for file in read)
+
+
+def require_scenes(files: Sequence[str | Path] | None = None) -> None:
+    """Raise InputError if the configuration names no sheet of scenes."""
+    require_project(files)
+    if not names_scenes(files):
+        raise InputError(
+            "names no sheet of scenes",
+            file=", ".join(map(str, files or [CONFIG])),
+            remedy="write scenes: scenes.tsv and cities: cities.tsv into it; or the built-in "
+            "cities: --example",
+        )
+
+
 def read_mapping(file: Path) -> dict[str, Any]:
     """The keys and values of a YAML file. Raises InputError, naming it, if it has none.
 

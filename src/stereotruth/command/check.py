@@ -16,6 +16,7 @@ from ..project import (
     names_in_pair,
     read_images,
     read_scenes,
+    require_scenes,
     sheet,
 )
 from ..sheets import Scene
@@ -62,6 +63,7 @@ def check_project(
     project = Findings("project")
     settings = scenes = None
     with project.of("configuration"):
+        require_scenes(configfiles)
         settings, files = configured(configfiles)
         project.say("configuration", Level.FACT, files)
         tiles = settings.tiles

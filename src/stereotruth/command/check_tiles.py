@@ -21,6 +21,7 @@ from .findings import Findings, Level
 
 SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
+SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
 Bools = NDArray[np.bool_]
@@ -148,9 +149,9 @@ def check_labels(
     found.say(
         "labels",
         Level.FACT,
-        f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {share:.0%} of what both "
-        f"images show: some {expected:.0%} of the pixels that neither image hides will have a "
-        f"label (project.recipe: {recipe}), "
+        f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {100 * share:.0f} % of "
+        f"what both images show: some {100 * expected:.0f} % of the pixels that neither image "
+        f"hides will have a label (project.recipe: {recipe}), "
         f"in {_tiles_in_words(nodes, covered, expected, settings)}",
     )
     _say_holes(nodes, density > 0, (lon, lat), found)
@@ -163,12 +164,12 @@ def _say_holes(
 ) -> None:
     """Name the ground that both images show and that lies in no file's bounds, with its area."""
     empty = nodes.seen & ~covered
-    if not empty.any():
+    area = empty.sum() * nodes.step**2 * pixel_m2(nodes.model)
+    if area < SMALL_HOLE_M2 and empty.sum() < SMALL_HOLE * nodes.seen.sum():
         return
     _, group, sizes, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
     largest = group == 1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
     lon, lat = (float(values[largest].mean()) for values in ground)
-    area = empty.sum() * nodes.step**2 * pixel_m2(nodes.model)
     found.say(
         "LiDAR",
         Level.FACT,

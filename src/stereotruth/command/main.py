@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import sys
 from functools import partial
 from pathlib import Path
@@ -332,6 +333,26 @@ def targets(configfile: Configured = None) -> None:
         typer.echo(line)
 
 
+@app.command(
+    epilog=examples(
+        "stereotruth profile",
+        "stereotruth profile slurm my-site",
+        "stereotruth run --profile my-site tiles/Marseille",
+    )
+)
+def profile(
+    name: Annotated[str, typer.Argument(help="The profile; without one, list them.")] = "",
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder to be written; else the profile's name.")
+    ] = None,
+) -> None:
+    """List the profiles of the package, or copy one here, to set account and partition in it."""
+    from .profiles import copy_profile, list_profiles
+
+    for line in [copy_profile(name, folder)] if name else list_profiles():
+        typer.echo(line)
+
+
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
 def status(
     cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
@@ -407,6 +428,9 @@ def main() -> None:
     """Entry point: an error of the input, or of the system, is one line, and exit status 1."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # ? for what LC_ALL=C cannot show
         sys.stdout.reconfigure(errors="replace")
+    compiling = logging.getLogger("stereotruth.compiling")
+    compiling.setLevel(logging.INFO)
+    compiling.addHandler(terminal := logging.StreamHandler(sys.stderr))
     try:
         app()
     except InputError as error:
@@ -417,6 +441,8 @@ def main() -> None:
             raise
         sys.stderr.write(f"error: {told}\n")
         raise SystemExit(1) from None
+    finally:
+        compiling.removeHandler(terminal)
 
 
 if __name__ == "__main__":

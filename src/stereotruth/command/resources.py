@@ -65,4 +65,4 @@ def check_resources(facts: Sequence[SceneFacts], settings: Configuration, found:
 
 
 def _gb(count: float) -> str:
-    return f"{count / 1e9:.1f} GB"
+    return f"{count / 1e9:.1f} GB" if count >= 5e7 else "less than 0.1 GB"

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..project import CONFIG, FILES, read_mapping, require_project
-from .targets import refuse_unknown
+from ..project import CONFIG, FILES, read_mapping, require_project, require_scenes
+from .targets import need_scenes, refuse_unknown
 
 EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
@@ -173,6 +173,30 @@ def watch(lines: Iterable[str], progress: Progress) -> None:
             console.print(line, markup=False, soft_wrap=True)
 
 
+def follow(process: subprocess.Popen[str]) -> int:
+    """Watch a run until it ends; returns its exit status.
+
+    After Ctrl-C, which reaches Snakemake too, what its jobs say of their end is not shown.
+    """
+    is_stopped = False
+    while True:
+        try:
+            if is_stopped:
+                for _ in process.stdout or ():
+                    pass
+            else:
+                watch(process.stdout or (), Progress())
+            status = process.wait()
+            break
+        except KeyboardInterrupt:
+            if not is_stopped:
+                sys.stderr.write("Stopping the jobs that are at work …\n")
+            is_stopped = True
+    if is_stopped:
+        sys.stderr.write("Stopped. The same command carries on.\n")
+    return status
+
+
 def run_workflow(given: Sequence[str]) -> int:
     """Run the workflow; returns Snakemake's exit status.
 
@@ -185,6 +209,9 @@ def run_workflow(given: Sequence[str]) -> int:
         read_mapping(file)
     if EXAMPLE not in given:
         refuse_unknown(given, files)
+        by_option = any(word.startswith("scenes=") for word in given)  # of --config
+        if not by_option and need_scenes(given, files):
+            require_scenes(files)
     command = [sys.executable, "-m", "snakemake", *arguments]
     if not sys.stderr.isatty() or {"--dry-run", "-n", "--dryrun"} & set(given):
         os.execv(sys.executable, command)
@@ -198,14 +225,4 @@ def run_workflow(given: Sequence[str]) -> int:
         errors="replace",
     )
     signal.signal(signal.SIGTERM, lambda number, _: process.send_signal(number))
-    progress, is_stopped = Progress(), False
-    while True:
-        try:
-            watch(process.stdout, progress)
-            status = process.wait()
-            break
-        except KeyboardInterrupt:  # reached Snakemake too, which ends its jobs
-            is_stopped = True
-    if is_stopped:
-        sys.stderr.write("Stopped. The same command carries on.\n")
-    return status
+    return follow(process)

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from ..dataset.manifest import read_manifest
 from ..errors import InputError
-from ..project import configured, read_scenes, sheet
+from ..project import configured, read_scenes, require_scenes, sheet
 from ..report.index_page import PAGES
 from .run_workflow import arguments_for
 
@@ -143,6 +143,7 @@ def _made(city: str) -> str:
 
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
     """The status of cities, all of the sheet if none is named. Raises InputError for others."""
+    require_scenes(configfiles)
     settings, _ = configured(configfiles)
     known, scenes = read_scenes(settings)
     with_scenes = [city for city in known if any(s.city == city for s in scenes.values())]

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from ..project import FILES, configured, read_scenes
+from ..matching.benchmark.settings import DATASETS
+from ..project import FILES, configured, names_scenes, read_scenes
 
 TARGETS = {
     "tiles/<City>": "the benchmark tiles of a city (without a target: of all cities)",
@@ -35,6 +36,8 @@ def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
     """A line for each target, and the cities, scenes, datasets and methods to put into them."""
     settings, _ = configured(configfiles)
     cities, scenes = read_scenes(settings)
+    if not names_scenes(configfiles):  # the built-in cities are made with --example alone
+        cities, scenes = {}, {}
     with_scenes = [city for city in cities if any(s.city == city for s in scenes.values())]
     width = max(map(len, TARGETS))
     known = {
@@ -67,6 +70,28 @@ IN_PATH = (
 )
 
 
+# Targets that are made of a dataset by its name, or of built-in cities by their own.
+WITHOUT_SCENES = re.compile(
+    r"(benchmark|audit|submission|results/(train|match|training_cities))/.+|training_cities"
+)
+
+
+def need_scenes(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> bool:
+    """Whether the targets of a run are made of the scenes sheet."""
+    targets = words_before_options(given)
+    if targets == ["benchmark"]:
+        settings, _ = configured(configfiles)
+        return any(settings.benchmark.datasets.get(name) for name in DATASETS)
+    return not targets or not all(map(WITHOUT_SCENES.fullmatch, targets))
+
+
+def words_before_options(given: Sequence[str]) -> list[str]:
+    """The targets among the arguments of a run."""
+    words = list(given)
+    first_option = next((k for k, word in enumerate(words) if word.startswith("-")), len(words))
+    return [word.rstrip("/") for word in words[:first_option]]
+
+
 def _names_for(word: str, configfiles: Sequence[Path] | None) -> list[str]:
     """What a word that is no option may be: rules, or its path with each city or dataset in it.
 
@@ -90,9 +115,7 @@ def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = No
     ``given``: arguments of a run; targets are the words before the first option. Paths without a
     city or dataset at a known place are left to Snakemake.
     """
-    words = list(given)
-    first_option = next((k for k, word in enumerate(words) if word.startswith("-")), len(words))
-    for word in (word.rstrip("/") for word in words[:first_option]):
+    for word in words_before_options(given):
         names = _names_for(word, configfiles)
         if names and word not in names:
             close = difflib.get_close_matches(word, names, n=1)

@@ -75,7 +75,9 @@ class Axis:
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Places and texts."""
         if self.linear_to is None:
-            locator = LogLocator(10, (1, 2, 5)) if self.log else MaxNLocator(6)
+            locator = (
+                LogLocator(10, (1, 2, 5)) if self.log else MaxNLocator(6, steps=(1, 2, 2.5, 5, 10))
+            )
             values = [round(float(v), 10) for v in locator.tick_values(self.low, self.high)]
         else:
             sizes = [10.0**k for k in range(-3, 4) if 10.0**k >= self.linear_to]

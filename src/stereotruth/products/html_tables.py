@@ -59,7 +59,7 @@ def words(name: str) -> str:
     if "share" in text:  # shown in percent
         text = text.removeprefix("share_").removeprefix("of_")
     else:
-        for end in ("px", "m"):
+        for end in ("px", "m", "degrees"):
             if text.endswith(f"_{end}"):
                 text, unit = text.removesuffix(f"_{end}"), f", {end}"
     return " ".join(ABBREVIATIONS.get(word, word) for word in text.split("_")) + unit
@@ -104,6 +104,8 @@ def show(name: str, text: str) -> str:
         return minus(f"{int(value):,}".replace(",", " ") if len(whole) > 5 else whole)
     if name in ("lon", "lat"):
         return minus(f"{value:.5f}")
+    if name == "days" or name.endswith("_degrees"):
+        return minus(f"{value:.1f}")
     return minus(f"{value:.3f}")
 
 

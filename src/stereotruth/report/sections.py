@@ -244,9 +244,14 @@ def quality_gates(record: Mapping[str, Any]) -> dict[str, Any] | None:
         {"scene": scene, **{k: "" if v is None else str(v) for k, v in figures.items()}}
         for scene, figures in scenes.items()
     ]
+    shown = [
+        name
+        for name in dict.fromkeys(["scene", "quality", *rows[0]])
+        if name != "lidar" and any(row.get(name) for row in rows)  # what was read has its own card
+    ]
     limits = [limit(name, v) for name, v in record.get("limits", {}).items() if v is not None]
     return {
-        "table": table(rows, list(dict.fromkeys(["scene", "quality", *rows[0]]))),
+        "table": table(rows, shown),
         "limits": limits,
         "doubts": [
             f"{scene}: {doubt['text']}"

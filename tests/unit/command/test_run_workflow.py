@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from stereotruth.command.run_workflow import (
     arguments_for,
     config_files,
     duration,
+    follow,
     run_workflow,
 )
 from stereotruth.errors import InputError
@@ -122,3 +125,18 @@ def test_a_configuration_that_is_no_utf_8_is_named_before_the_run(tmp_path, monk
     Path("config.yaml").write_text("seed: 1\n", encoding="utf-16")
     with pytest.raises(InputError, match=r"config\.yaml: is no UTF-8"):
         run_workflow(["--dry-run"])
+
+
+def test_after_ctrl_c_nothing_is_shown_but_how_to_carry_on(monkeypatch, capfd):
+    def watch(lines, progress):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stereotruth.command.run_workflow.watch", watch)
+    program = "import sys; print('Traceback (most recent call last):'); sys.exit(3)"
+    run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert follow(run) == 3
+    out, err = capfd.readouterr()
+    assert out == "" and err.splitlines() == [
+        "Stopping the jobs that are at work …",
+        "Stopped. The same command carries on.",
+    ]

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
-from stereotruth.command.targets import TARGETS, list_targets, refuse_unknown, rules
+from stereotruth.command.check import check_project
+from stereotruth.command.run_workflow import run_workflow
+from stereotruth.command.status import show_status
+from stereotruth.command.targets import (
+    TARGETS,
+    list_targets,
+    need_scenes,
+    refuse_unknown,
+    rules,
+)
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.project import FILES
@@ -62,3 +72,40 @@ def test_built_in_datasets_are_there_unless_others_are_named():
     assert named({}) == ["synthetic"]
     assert named({"mine": mine}) == ["mine"]
     assert sorted(named({"mine": mine, "synthetic": {}})) == ["mine", "synthetic"]
+
+
+def test_a_folder_without_a_sheet_of_scenes_has_no_built_in_cities(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("strict: true\n")
+    assert not any(line.startswith(("<City>:", "<scene>:")) for line in list_targets())
+    with pytest.raises(InputError, match=r"config\.yaml: names no sheet of scenes.*--example"):
+        run_workflow(["--cores", "1"])
+    with pytest.raises(InputError, match="names no sheet of scenes"):
+        show_status([], None)
+    assert check_project()[-1][-1].text == "config.yaml: names no sheet of scenes"
+
+
+@pytest.mark.parametrize(
+    ("targets", "needed"),
+    [
+        ([], True),
+        (["report", "-n"], True),
+        (["benchmark/us3d/sgm", "audit/us3d/", "-n"], False),
+        (["benchmark/us3d/sgm", "dataset"], True),
+        (["training_cities"], False),
+    ],
+)
+def test_targets_of_named_datasets_need_no_scenes(tmp_path, monkeypatch, targets, needed):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").touch()
+    assert need_scenes(targets) == needed
+
+
+def test_all_benchmarks_need_scenes_where_a_built_in_dataset_is_among_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").touch()
+    assert need_scenes(["benchmark"])
+    Path("config.yaml").write_text(
+        "benchmark: {datasets: {a: {root: a, layout: us3d, disparity_range: [0, 9]}}}"
+    )
+    assert not need_scenes(["benchmark"])

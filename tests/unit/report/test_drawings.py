@@ -60,4 +60,4 @@ def test_histograms_share_their_axis_and_keep_every_label():
     assert heights[20] == pytest.approx(drawings.HEIGHT * (1 - 10 / 30), abs=0.1)
     assert heights[22] == 0
     assert re.findall(r"H([\d.]+)", path)[0] == f"{bar:g}"
-    assert [text for _, text in first.y_ticks] == ["32"]  # % per px, of 75 in 2 px
+    assert [text for _, text in first.y_ticks] == ["30"]  # % per px, of 75 in 2 px

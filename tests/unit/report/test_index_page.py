@@ -102,6 +102,6 @@ def test_without_pages_there_is_no_index(tmp_path):
 @needs_chromium
 def test_it_asks_for_nothing_and_fits_its_window(folder, tmp_path):
     wide = "return document.documentElement.scrollWidth - innerWidth"
-    seen = look(write_index(folder), tmp_path, wide, 500)
+    seen = look(write_index(folder), tmp_path, wide, 390)
     assert seen.wrong == [] and seen.requests == []
     assert seen.found <= 0

@@ -15,7 +15,7 @@ from stereotruth.products.html_page import PAPER
 from stereotruth.report import page
 from stereotruth.report.city_files import CityFiles
 
-from ...browser import look, needs_chromium, screenshot
+from ...browser import as_printed, look, needs_chromium, screenshot
 from ...synthetic.reported_city import CITY, REASON, alignment, write_city
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -186,7 +186,7 @@ def test_a_refinement_is_shown_with_before_and_after(tmp_path, applied):
         tmp_path / "index.html",
     )
     text = (tmp_path / "index.html").read_text()
-    frames = re.findall(r"<figcaption>(.*? image, .*?)</figcaption>", text)
+    frames = re.findall(r"<figcaption>([^<]* image, [^<]*)</figcaption>", text)
     after = ["left image, after refinement: 0.81 px rms"] if applied else []
     assert frames[: len(frames) // 2] == [
         "left image, RPC alone: 7.91 px rms",
@@ -303,7 +303,7 @@ return {
 
 
 @needs_chromium
-@pytest.mark.parametrize("width", [1280, 500])
+@pytest.mark.parametrize("width", [1280, 390])
 def test_the_page_works_in_a_browser_without_a_network(made, tmp_path, width):
     seen = look(made, tmp_path, CHECKS, width)
     assert seen.wrong == []
@@ -363,6 +363,25 @@ def test_the_3d_view_draws_turns_and_comes_nearer(made, tmp_path):
     assert 0.1 < found["first"][0] < 0.9
     assert found["ArrowRight"][1] != found["first"][1]
     assert found["+"][0] > 1.1 * found["ArrowRight"][0]
+
+
+CONTROLS = """
+const controls = document.querySelectorAll("nav, .choice, .no-print, select, .choice button");
+return {
+  shown: [...controls].filter((e) => e.offsetParent).length, all: controls.length,
+  wide: document.documentElement.scrollWidth - innerWidth,
+};
+"""
+
+
+@needs_chromium
+def test_on_paper_it_has_no_controls_and_fits(made, tmp_path):
+    on_screen = look(made, tmp_path, CONTROLS)
+    assert on_screen.found["shown"] > 8
+    seen = look(as_printed(made, tmp_path / "printed.html"), tmp_path, CONTROLS, 720)
+    assert seen.wrong == []
+    assert seen.found["shown"] == 0 and seen.found["all"] == on_screen.found["all"]
+    assert seen.found["wide"] <= 0
 
 
 @needs_chromium

@@ -83,5 +83,5 @@ def test_sections_without_input_are_left_out(tmp_path):
 def test_nothing_sticks_out_of_the_page(tmp_path):
     page = written(tmp_path, ADJUSTED, CLOSURE, None)
     script = "return document.documentElement.scrollWidth - innerWidth"
-    seen = look(page, tmp_path, script, 500)
+    seen = look(page, tmp_path, script, 390)
     assert seen.wrong == [] and seen.requests == [] and seen.found <= 0

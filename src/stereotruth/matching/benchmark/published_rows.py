@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ...errors import in_number
 from ..kinds import KINDS
 from .published_scores import TABLE5
 from .tables import Table, nothing, plain_table
@@ -68,7 +69,7 @@ def beside_published(methods: Sequence[Row]) -> Table:
             "d1_percent": round(100 * of["all"]["filled_d1_3_px_share"], 4)
             if of["all"]["labelled"]
             else None,
-            "source": f"here, {of['tiles']} pairs",
+            "source": f"here, {in_number(of['tiles'], 'pair')}",
             "not_known": "",
         }
         for of in methods

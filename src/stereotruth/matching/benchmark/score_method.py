@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ...dataset.stereo_dataset import Pair, StereoDataset
-from ...errors import InputError
+from ...errors import InputError, in_number
 from ...job import progress
 from ...numerics.error_sums import ErrorSum
 from ...products.files import atomic_folder, write_table
@@ -236,7 +236,7 @@ def describe(summary: Mapping[str, Any]) -> str:
             f" of the {100 * total['valid_share']:.1f} % of pixels that are valid; holes filled: "
             f"EPE {total['filled_epe_px']:.3f} px, D1 {100 * total[f'filled_{d1}']:.2f} %"
         )
-    return f"{text}; {summary['tiles']} pairs"
+    return f"{text}; {in_number(summary['tiles'], 'pair')}"
 
 
 def choose(pairs: Sequence[Pair], most: int) -> list[Pair]:

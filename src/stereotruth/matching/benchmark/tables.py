@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
+from ...errors import InputError, in_number
 from ...products.files import atomic_file, write_table
 from ...products.html_tables import Cell, Column, metres, minus
 from ...products.html_tables import Table as Shown
@@ -427,6 +427,7 @@ def _what(methods: Sequence[Row]) -> str:
     exact = of.get("protocol", {}).get("truth") == "exact"
     more = " Labelled: by the exact truth, all that both views see." if exact else ""
     where = (
-        f"Dataset {of['dataset']}, {split}, {of['tiles']} pairs, disparities [{low}, {high}) px."
+        f"Dataset {of['dataset']}, {split}, {in_number(of['tiles'], 'pair')}, "
+        f"disparities [{low}, {high}) px."
     )
     return where + more

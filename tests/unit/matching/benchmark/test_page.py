@@ -160,7 +160,7 @@ return { up, down: values(), wide: document.documentElement.scrollWidth - innerW
 
 @needs_chromium
 def test_a_click_on_a_heading_sorts(compared, tmp_path):
-    seen = look(Path(compared / "compared/index.html"), tmp_path, SORT, 500)
+    seen = look(Path(compared / "compared/index.html"), tmp_path, SORT, 390)
     assert seen.wrong == [] and seen.requests == []
     found = seen.found
     assert len(found["up"]) > 1 and found["up"] == sorted(found["up"])
