@@ -59,7 +59,10 @@ SHARES = {
     "noise": {},
     "sun": {},
     "leaves": {},
-}
+    "mixed": {
+        "built": 0.15, "demolished": 0.15, "raised": 0.1, "felled": 0.2, "grown": 0.2, "crops": 0.3,
+    },
+}  # fmt: skip
 CONDITIONS = ("one day", "a year apart")
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
@@ -90,7 +93,7 @@ class Case:
             drawn.character, relief_m=8.0, valley=0.3, wavelength_m=700.0, max_slope_deg=15.0,
             river_m=70.0 if water else 0.0, lakes=0.0, zone_m=200.0, towers_m=(20.0, 45.0),
             zones={"fields": 4.0, "village": 1.0, "park": 0.5} if is_open else TOWN,
-            vehicles=8.0 if self.kind == "moved" else 0.0,
+            vehicles=8.0 if self.kind in ("moved", "mixed") else 0.0,
             canopy=Canopy(ground_m2=150.0) if self.kind == "leaves" else None,
             ground_look=(1.0, 0.3) if self.kind == "noise" else (1.0, 1.0),
         )  # fmt: skip
