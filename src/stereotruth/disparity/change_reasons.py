@@ -30,7 +30,7 @@ from .pixel_labels import Pixels
 from .reason import Reason
 from .seen_surface import box_max
 from .shifted_agreement import LEAST, WIDE_SHIFTS_PX, shifted_agreement
-from .status import WATER_CLASS, Status
+from .status import VEGETATION_CLASSES, WATER_CLASS, Status
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -39,7 +39,6 @@ Bytes = NDArray[np.uint8]
 
 UNCLASSED = (0, 1)  # ASPRS: never classified, and unclassified
 GROUND_CLASS, TREE_CLASS, BUILDING_CLASS = 2, 5, 6
-VEGETATION_CLASSES = (3, 4, TREE_CLASS)
 AROUND_PX = 16  # up to here the patch is measured, and ground and water beside it are looked for
 VOTES_PX, STRONG = 16, 4  # pixels up to here vote; with positive evidence one counts so many
 QUORUM = 0.03  # share of the pixels that must have a reason

@@ -233,7 +233,7 @@ def with_crowns(
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        changed, with_noise = contradicted(merged, window, comparison, new)
+        changed, with_noise = contradicted(merged, window, comparison, new, surface_class)
         correlation = np.where(new, with_noise, correlation)
         status[changed] = Status.CHANGED
         new &= ~changed
