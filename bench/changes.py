@@ -1,11 +1,12 @@
 """What changed between LiDAR and images: who notices, what is lost, which reason is told.
 
 python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
+                        [--figure docs/changes.png]
 
-Cities are drawn by seed, one for each kind of change, and each of them is made under two
-conditions: both images of one day three years after the LiDAR; or the right image a year after the
-left one, under another sun. Truth is exact: a ray through each pixel meets the worlds of both
-images and of the LiDAR.
+Cities are drawn by seed, one for each kind of change and one with many (mixed), and each of them is
+made under two conditions: both images of one day three years after the LiDAR; or the right image a
+year after the left one, under another sun. Truth is exact: a ray through each pixel meets the
+worlds of both images and of the LiDAR.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from synthetic_pairs import gain, noise, rectify_by
 
@@ -30,6 +35,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import require_complete
+from stereotruth.products.pictures import save_figure, stretch
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.changes import REASONS, changes_at
 from stereotruth.simulate.cities import Canopy, CitySpec, Dates, ViewSpec, lidar_files
@@ -44,6 +50,13 @@ SIDE_PX = 800
 CHANGED_M = 1.0  # of height
 YEAR = 365.0
 VIEWS = ("left", "right")
+BLOCK_PX = 220  # side of the figure's block
+COLOURS = {  # apart for all eyes
+    "unchanged": "#e9ecef", "built": "#d95f02", "demolished": "#7570b3",
+    "grown_or_felled": "#1b9e77", "moved": "#e7298a", "water": "#0259cb", "ground": "#e6ab02",
+    "unknown": "#222222", "label": "#e9ecef", "changed": "#c1121f",
+    "no label for another reason": "#adb5bd",
+}  # fmt: skip
 TOWN = {"slabs": 1.0, "lowrise": 2.0, "village": 1.5, "park": 1.0, "fields": 1.0}
 SHARES = {
     "built": {"built": 0.25},
@@ -59,7 +72,10 @@ SHARES = {
     "noise": {},
     "sun": {},
     "leaves": {},
-}
+    "mixed": {
+        "built": 0.15, "demolished": 0.15, "raised": 0.1, "felled": 0.2, "grown": 0.2, "crops": 0.3,
+    },
+}  # fmt: skip
 CONDITIONS = ("one day", "a year apart")
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
@@ -90,7 +106,7 @@ class Case:
             drawn.character, relief_m=8.0, valley=0.3, wavelength_m=700.0, max_slope_deg=15.0,
             river_m=70.0 if water else 0.0, lakes=0.0, zone_m=200.0, towers_m=(20.0, 45.0),
             zones={"fields": 4.0, "village": 1.0, "park": 0.5} if is_open else TOWN,
-            vehicles=8.0 if self.kind == "moved" else 0.0,
+            vehicles=8.0 if self.kind in ("moved", "mixed") else 0.0,
             canopy=Canopy(ground_m2=150.0) if self.kind == "leaves" else None,
             ground_look=(1.0, 0.3) if self.kind == "noise" else (1.0, 1.0),
         )  # fmt: skip
@@ -245,14 +261,80 @@ HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these 
           "right reason, %", "unchanged lost, %", "error, px"]  # fmt: skip
 
 
+def richest(changes: NDArray[np.uint8]) -> tuple[slice, slice]:
+    """The block of BLOCK_PX² that has most reasons of 150 px each, then most pixels of any."""
+    blocks = (
+        np.s_[row : row + BLOCK_PX, col : col + BLOCK_PX]
+        for row in range(40, changes.shape[0] - BLOCK_PX - 40, 20)
+        for col in range(40, changes.shape[1] - BLOCK_PX - 40, 20)
+    )
+
+    def worth(block: tuple[slice, slice]) -> tuple[int, int]:
+        counts = np.bincount(changes[block].ravel(), minlength=8)[1:7]
+        return int((counts >= 150).sum()), int(counts.sum())
+
+    return max(blocks, key=worth)
+
+
+def draw(case: Case, given: argparse.Namespace) -> None:
+    """One block in the worlds of both images and of the LiDAR, its reasons, status and labels."""
+    labelled = Labelled.of(case, given.folder)
+    layers, changes = labelled.layers, labelled.changes
+    with np.errstate(invalid="ignore"):
+        other = np.abs(changes["height"] - changes["height_other"])
+        differs = np.fmax(other, np.abs(changes["height"] - changes["height_lidar"])) > CHANGED_M
+    true = np.where(differs, changes["reason"], 0)
+    block = richest(true)
+    left, right = (require_complete(case.made(given.folder) / f"{v}.zarr")["image"] for v in VIEWS)
+    shift = round(float(np.nanmedian(layers["disparity"][block])))
+    there = slice(block[1].start - shift, block[1].stop - shift)
+    heights = changes["height_lidar"][block]
+    status = layers["status"][block]
+    meaning = np.select([is_labelled(status), status == Status.CHANGED], [0, 1], 2)
+    figure = Figure(figsize=(11.0, 8.2), layout="constrained")
+    axes = figure.subplots(2, 3)
+    low = float(np.nanmin(heights))
+    for axis, picture, title in (
+        (axes[0, 0], stretch(left[block]), "left image"),
+        (axes[0, 1], stretch(right[block[0], there]), "right image, the same day"),
+    ):
+        axis.imshow(picture, cmap="gray")
+        axis.set_title(title)
+    shades = axes[0, 2].imshow(heights - low, cmap="viridis")
+    figure.colorbar(shades, ax=axes[0, 2], label="m above the lowest", shrink=0.7)
+    axes[0, 2].set_title("what the LiDAR has there, three years before")
+    names = "unchanged", *REASONS.split()[1:7], "unknown"
+    change = layers["change"][block]
+    flags(axes[1, 0], true[block], names, "true reason of changes of more than 1 m")
+    flags(axes[1, 1], meaning, ("label", "changed", "no label for another reason"), "status")
+    flags(axes[1, 2], change, names, "layer change")
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    save_figure(given.figure, figure, dpi=80)
+
+
+def flags(axis: Axes, codes: NDArray, names: tuple[str, ...], title: str) -> None:
+    """A picture of codes that index ``names``, with those that occur beside it."""
+    axis.imshow(np.array([to_rgb(COLOURS[n]) for n in names])[codes], interpolation="nearest")
+    present = [names[k] for k in np.unique(codes)]
+    patches = [Patch(color=COLOURS[n], label=n.replace("_", " ")) for n in present]
+    axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3,
+                fontsize=8, frameon=False)  # fmt: skip
+    axis.set_title(title)
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the table, or draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--folder", type=Path, default=Path("results/changes"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--kinds", nargs="+", default=list(SHARES), choices=list(SHARES))
     parser.add_argument("--density", type=float, default=4.0)
+    parser.add_argument("--figure", type=Path, help="draw a block of the city mixed, no table")
     given = parser.parse_args()
+    if given.figure:
+        draw(Case("mixed", CONDITIONS[0], given.seeds[0], given.density), given)
+        return
     print("| " + " | ".join(HEADER) + " |")
     print("|---" * len(HEADER) + "|")
     for kind in given.kinds:

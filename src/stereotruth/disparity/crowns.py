@@ -225,13 +225,15 @@ def with_crowns(
     new = np.zeros(labels.status.shape, np.bool_)
     new[row[inside], col[inside]] = True
     status, correlation = labels.status.copy(), labels.correlation
+    height = np.where(new, crowns.height, labels.height)
+    surface_class = np.where(new, crowns.surface_class, labels.surface_class)
     merged = Labels(
         np.where(new, crowns.labels.disparity, labels.labels.disparity),
         np.where(new, crowns.labels.slope, labels.labels.slope),
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        changed, with_noise = contradicted(merged, window, comparison, new)
+        changed, with_noise = contradicted(merged, window, comparison, new, surface_class)
         correlation = np.where(new, with_noise, correlation)
         status[changed] = Status.CHANGED
         new &= ~changed
@@ -240,7 +242,7 @@ def with_crowns(
         labels,
         status=status,
         labels=merged,
-        height=np.where(new, crowns.height, labels.height),
-        surface_class=np.where(new, crowns.surface_class, labels.surface_class),
+        height=height,
+        surface_class=surface_class,
         correlation=correlation,
     )

@@ -52,6 +52,7 @@ def facet_labels(
         surface_class=np.where(measured, pixels.surface_class, visible.surface_class),
         point_count=np.where(measured, pixels.count, 0),
         correlation=np.full(status.shape, np.nan),
+        change=np.zeros(status.shape, np.uint8),
     )
 
 

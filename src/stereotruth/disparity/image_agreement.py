@@ -15,7 +15,7 @@ one surface only:
   failures among agreeing pixels, by noise or in shadow, do not;
 - :meth:`Agreement.unusual`: whether pixels together correlate less than is usual around them;
 - :mod:`.shifted_agreement`: whether the images agree better at another disparity. Of images that
-  share no light that alone counts;
+  share no light that alone counts. Crowns are compared over fewer pixels, too;
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
 - :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote.
@@ -36,8 +36,8 @@ from ..epipolar.surface_correlation import correlation_and_expected
 from ..numerics.summed_area import window_sums
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
-from .shifted_agreement import SIGNAL, shifted_agreement
-from .status import WATER_CLASS, Status, is_labelled
+from .shifted_agreement import SHIFTS_PX, SIGNAL, ShiftedAgreement, shifted_agreement
+from .status import VEGETATION_CLASSES, WATER_CLASS, Status, is_labelled
 from .surface_means import apart_from_steps, surface_mean, warp_to_left
 
 Floats = NDArray[np.float64]
@@ -51,6 +51,12 @@ NEARBY_SHARE = 0.35  # of which so many fail
 DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
 TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
+BESIDE_SHARE = 0.15  # of the pixels up to APART_PX around have changed: a pixel is in their rim,
+RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by less
+# Crowns that have been felled: both images see the ground below, over a few pixels
+CROWN_WINDOW_PX, CROWN_REACH_PX = 5, 2
+CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
+CROWN_AGREEMENT = 0.6  # of the images there, at least
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
 
@@ -180,16 +186,32 @@ def free_of_noise(
 
 
 def contradicted(
-    labels: Labels, window: PairWindow, comparison: Comparison, labelled: Bools
+    labels: Labels,
+    window: PairWindow,
+    comparison: Comparison,
+    labelled: Bools,
+    surface_class: NDArray[np.uint8],
 ) -> tuple[Bools, Singles]:
     """Which of the ``labelled`` pixels [h, w] the images contradict; the correlation of the images
-    over each pixel's surface."""
+    over each pixel's surface. ``surface_class`` [h, w] (ASPRS): of what the labels show."""
     agreement, correlation = window_agreement(labels, window, comparison)
-    if comparison.diachronic:
-        shifted = shifted_agreement(
-            labels, window, comparison.noise, comparison.window_px, APART_PX, labelled
-        )
-        return shifted.contradicts, correlation
+    compared = _contradicted_apart if comparison.diachronic else _contradicted_together
+    changed = compared(labels, window, comparison, labelled, agreement)
+    vegetation = labelled & ~changed & np.isin(surface_class, VEGETATION_CLASSES)
+    felled = shifted_agreement(
+        labels, window, comparison.noise, CROWN_WINDOW_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
+    )
+    return changed | felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT), correlation
+
+
+def _contradicted_together(
+    labels: Labels,
+    window: PairWindow,
+    comparison: Comparison,
+    labelled: Bools,
+    agreement: Agreement,
+) -> Bools:
+    """:func:`contradicted` of images of one light, by their ``agreement``."""
     changed = agreement.outvoted()
     doubtful = labelled & (agreement.together() < DOUBT)
     shifted = shifted_agreement(
@@ -202,7 +224,30 @@ def contradicted(
     if comparison.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window vote once more.
         changed |= agreement.outvoted_nearby()
-    return (changed | rim) & labelled, correlation
+    return (changed | rim) & labelled
+
+
+def _contradicted_apart(
+    labels: Labels,
+    window: PairWindow,
+    comparison: Comparison,
+    labelled: Bools,
+    _: Agreement,
+) -> Bools:
+    """:func:`contradicted` of images that share no light: at once by the surface up to APART_PX
+    around a pixel; beside such pixels, where that mixes what has changed with what has not, by the
+    surface up to TOGETHER_PX."""
+
+    def compared(reach: int, wanted: Bools) -> ShiftedAgreement:
+        return shifted_agreement(
+            labels, window, comparison.noise, comparison.window_px, reach, wanted
+        )
+
+    changed = compared(APART_PX, labelled).contradicts
+    side = 2 * APART_PX + 1
+    beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
+    rim = labelled & beside & ~changed
+    return changed | rim & (compared(TOGETHER_PX, rim).here < RIM_AGREEMENT)
 
 
 def without_changes(
@@ -211,7 +256,9 @@ def without_changes(
     """Labels without those that the images contradict, and without water; with the correlation of
     the images over each pixel's surface."""
     labelled = is_labelled(labels.status)
-    changed, correlation = contradicted(labels.labels, window, comparison, labelled)
+    changed, correlation = contradicted(
+        labels.labels, window, comparison, labelled, labels.surface_class
+    )
     changed |= labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
     status[changed] = Status.CHANGED

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..products.grids import Layer
 from .pair_window import PairWindow, WindowLabels
+from .reason import Reason
 from .right_view import Pair
 from .settings import Settings
 from .status import Status, is_labelled
@@ -37,6 +38,7 @@ def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str,
     layers["point_count"] = count.astype(np.uint16)
     layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
     layers["status"] = labels.status
+    layers["change"] = labels.change
     return layers
 
 
@@ -72,6 +74,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "correlation": Layer("float32", np.nan, _correlation(settings, view)),
         "uncertainty": Layer("float32", np.nan, _uncertainty(on_surface)),
         "surface_class": Layer("uint8", 0, surface_class),
+        "change": Layer("uint8", 0, _change()),
     }
 
 
@@ -131,6 +134,20 @@ def _status(settings: Settings, view: str, masked: bool) -> dict[str, object]:
             "into the windows that are compared around it"
         )
     return attributes
+
+
+def _change() -> dict[str, object]:
+    """Attributes of the layer change."""
+    return {
+        "units": "1",
+        "long_name": "what has changed between LiDAR and images, of pixels of the status changed",
+        "flag_values": [int(reason) for reason in Reason],
+        "flag_meanings": " ".join(reason.name.lower() for reason in Reason),
+        "grown_or_felled": "trees and other vegetation",
+        "moved": "vehicles, and what else is as small and low",
+        "ground": "the ground itself, as crops, earthworks",
+        "unknown": "the images contradict the LiDAR, and nothing tells what has changed",
+    }
 
 
 def _correlation(settings: Settings, view: str) -> dict[str, str]:

@@ -71,7 +71,7 @@ class WindowLabels:
 
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``point_count``: points used; ``correlation``:
-    coefficient of both images.
+    coefficient of both images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
     """
 
     status: Bytes
@@ -80,6 +80,7 @@ class WindowLabels:
     surface_class: Bytes
     point_count: Ints
     correlation: NDArray[np.floating]
+    change: Bytes
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -93,6 +94,7 @@ class WindowLabels:
             surface_class=self.surface_class[part],
             point_count=self.point_count[part],
             correlation=self.correlation[part],
+            change=self.change[part],
         )
 
     def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:

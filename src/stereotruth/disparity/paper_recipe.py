@@ -74,4 +74,5 @@ def paper_labels(
         surface_class=pixels.surface_class,
         point_count=pixels.count,
         correlation=pixels.correlation,
+        change=np.zeros(status.shape, np.uint8),
     )

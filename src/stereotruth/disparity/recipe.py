@@ -14,7 +14,9 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
 4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
    (:mod:`.image_agreement`). Rough surfaces, of which no triangle is a facet, get labels of their
    own, which the images confirm (:mod:`.crowns`).
-5. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
+5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
+   (:mod:`.change_reasons`).
+6. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
 
 The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_recipe`).
 """
@@ -26,6 +28,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .change_reasons import with_reasons
 from .crowns import crowns, with_crowns, without_contours
 from .facet_labels import facet_labels
 from .ground_in_view import ground_in_view
@@ -36,6 +39,7 @@ from .paper_recipe import paper_labels
 from .pixel_labels import own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
+from .status import Status
 from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
 
@@ -99,7 +103,11 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     labels = without_contours(labels, rough, visible, scale)
     labels = without_changes(labels, window, comparison)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
-    return with_crowns(labels, rough, window, comparison)
+    is_facet = labels.status != Status.EDGE_IN_PIXEL
+    labels = with_crowns(labels, rough, window, comparison)
+
+    # reasons of changes
+    return with_reasons(labels, ~is_facet, own.pixels, window, comparison, scale.px_per_m)
 
 
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:

@@ -75,6 +75,7 @@ class Settings:
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # here, since these load compiled code and a workflow plans with the settings
+        from .change_reasons import REASON_PX
         from .image_agreement import NEARBY_PX
         from .seen_surface import OUTER_RINGS
         from .surface_means import VOTE_PX
@@ -83,7 +84,8 @@ class Settings:
         reach = OUTER_RINGS + 3
         # steps beside pixels, windows, votes about them, and the votes nearby; in
         # the rim of a change, by the mean of what is not voted against
-        return reach + VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
+        reach += VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
+        return reach + REASON_PX  # of changes
 
 
 @settings

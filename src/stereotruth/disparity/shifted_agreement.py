@@ -26,6 +26,9 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 SHIFTS_PX = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
+# of what has changed already, over the heights of buildings
+WIDE_SHIFTS_PX = (-40.0, -34.0, -28.0, -23.0, -19.0, -15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0)
+WIDE_SHIFTS_PX += (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0, 19.0)
 SIGNAL = 0.6  # of both images, for absence of agreement to tell something
 LEAST = 0.3  # of agreement and advantage; chance has up to 0.3 at one of the shifts, and 0 here
 # Fisher's z of a correlation of n independent pixels has the variance 1 / n, a difference of two
@@ -33,7 +36,7 @@ LEAST = 0.3  # of agreement and advantage; chance has up to 0.3 at one of the sh
 SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all shifts reaches 2
 INDEPENDENT_PX2 = 4.0
 Z_LIMIT = 0.999
-SHIFTED_PX = 24  # by which these, and what their windows take in, reach beyond a pixel's match
+SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
 TILE_PX = 64  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
@@ -54,18 +57,23 @@ class ShiftedAgreement:
     pixels: int
 
     @property
+    def is_shifted(self) -> Bools:
+        """Where the images agree significantly better elsewhere [h, w]."""
+        z_here, z_elsewhere = (
+            np.arctanh(np.clip(value, -Z_LIMIT, Z_LIMIT)) for value in (self.here, self.elsewhere)
+        )
+        limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
+        return z_elsewhere - z_here > limit
+
+    @property
     def contradicts(self) -> Bools:
         """Where the images contradict the labels [h, w].
 
         That is, where they agree significantly better elsewhere; or, with more signal than noise,
         where the agreement and its advantage over that elsewhere sum up to less than LEAST.
         """
-        z_here, z_elsewhere = (
-            np.arctanh(np.clip(value, -Z_LIMIT, Z_LIMIT)) for value in (self.here, self.elsewhere)
-        )
         is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < LEAST)
-        limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
-        return is_none | (z_elsewhere - z_here > limit)
+        return is_none | self.is_shifted
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +98,12 @@ def shifted_agreement(
     window_px: int,
     reach: int,
     wanted: Bools,
+    shifts: tuple[float, ...] = SHIFTS_PX,
 ) -> ShiftedAgreement:
     """At the ``wanted`` pixels [h, w] of a window, over its ``labels``' surfaces.
 
     ``noise``: variances of both images, DN²; ``window_px``: side of the correlation's window;
-    ``reach``: px up to which the surface is averaged.
+    ``reach``: px up to which the surface is averaged; ``shifts`` of the disparity, px.
     """
     shape = wanted.shape
     out = np.full((4, *shape), np.nan, np.float32)
@@ -113,7 +122,7 @@ def shifted_agreement(
                 top - first[0] : top - first[0] + TILE_PX,
                 side - first[1] : side - first[1] + TILE_PX,
             ]
-            part = _means(labels, window, images, around, window_px, reach)
+            part = _means(labels, window, images, around, window_px, reach, shifts)
             for k, values in enumerate(part):
                 out[k][tile] = np.where(wanted[tile], values[inside], np.nan)
     return ShiftedAgreement(*out, (2 * reach + window_px) ** 2)
@@ -126,6 +135,7 @@ def _means(
     around: tuple[slice, slice],
     window_px: int,
     reach: int,
+    shifts: tuple[float, ...],
 ) -> tuple[Singles, Singles, Singles, Singles]:
     """The arrays of :class:`ShiftedAgreement` of a part of a window."""
     left, right = (image.patch for image in images)
@@ -145,7 +155,7 @@ def _means(
 
     elsewhere = np.full((rows, cols), np.nan, np.float32)
     shifted = np.full((rows, cols), np.nan, np.float32)
-    for shift in SHIFTS_PX:
+    for shift in shifts:
         here = mean(shift)
         better = here > np.where(np.isnan(elsewhere), -np.inf, elsewhere)
         elsewhere[better], shifted[better] = here[better], shift

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 WATER_CLASS = 9  # ASPRS
+VEGETATION_CLASSES = (3, 4, 5)
 
 
 class Status(IntEnum):

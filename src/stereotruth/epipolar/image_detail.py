@@ -48,16 +48,3 @@ def detail(
     parts = window_sums(share.astype(np.int64), SIGNAL_PX)
     signal[half:-half, half:-half] = parts / (PARTS * SIGNAL_PX**2)
     return out, signal
-    half, count = AROUND_PX // 2, AROUND_PX**2
-    whole = image.astype(np.int64)
-    total = window_sums(whole, AROUND_PX)  # exact, so that no block changes it
-    squares = count * window_sums(whole * whole, AROUND_PX) - total * total
-    empty = window_sums(whole == 0, AROUND_PX)
-    inner = np.s_[half:-half, half:-half]
-    deviation = (count * whole[inner] - total) / count
-    deviation /= np.sqrt(squares / count**2 + NOISE_SHARE * noise + LEAST_DN2)
-    out[inner] = np.where(empty > 0, 0.0, np.clip(deviation, -GREATEST, GREATEST) + MEAN)
-    mean = window_sums(squares, SIGNAL_PX) / (count**2 * SIGNAL_PX**2)
-    half += SIGNAL_PX // 2
-    signal[half:-half, half:-half] = 1.0 - noise / np.maximum(mean, max(noise, LEAST_DN2))
-    return out, signal

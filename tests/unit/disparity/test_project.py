@@ -402,7 +402,8 @@ def project_and_open(scene: Scene, folder: Path, left, right, **options):
 
 def test_attributes_and_summary(plane) -> None:
     grid = plane.project(recipe="paper", code="abc", scene="plane-1")
-    for name in ("disparity", "status", "height", "point_count", "correlation", "uncertainty"):
+    names = "disparity", "status", "height", "point_count", "correlation", "uncertainty", "change"
+    for name in names:
         assert grid[name].dims == ("y", "x")
         assert grid[name].attrs["units"] and grid[name].attrs["long_name"]
     status = grid["status"]

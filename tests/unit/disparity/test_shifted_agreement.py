@@ -16,6 +16,7 @@ SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
 FIELD = np.s_[40:80, 50:100]  # of the window
 LEVEL = Labels(np.full(SHAPE, 4.0), np.zeros((2, *SHAPE)), np.zeros(SHAPE))
 ALL = np.ones(SHAPE, np.bool_)
+GROUND = np.full(SHAPE, 2, np.uint8)  # ASPRS
 
 
 def texture(seed: int = 0) -> np.ndarray:
@@ -73,7 +74,7 @@ def test_what_has_grown_agrees_at_another_disparity(by: int, reach: int) -> None
 def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
     """Where images share no light, their brightness tells nothing."""
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
-    changed, _ = contradicted(LEVEL, shadowed(), comparison, ALL)
+    changed, _ = contradicted(LEVEL, shadowed(), comparison, ALL, GROUND)
     assert changed.any() != diachronic
 
 
@@ -81,7 +82,7 @@ def test_a_change_is_found_under_another_sun() -> None:
     window = grown(3)
     window.right.pixels[:, 60:] *= 0.2
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), True)
-    changed, _ = contradicted(LEVEL, window, comparison, ALL)
+    changed, _ = contradicted(LEVEL, window, comparison, ALL, GROUND)
     assert changed[47:73, 58:92].all() and not changed[:30].any()
 
 
@@ -101,3 +102,19 @@ def test_only_what_is_wanted_is_compared() -> None:
         values = getattr(part, name)
         assert np.isnan(values[~wanted]).all()
         assert (values[wanted] == getattr(whole, name)[wanted]).all()
+
+
+@pytest.mark.parametrize("diachronic", [False, True])
+def test_a_small_crown_that_was_felled(diachronic: bool) -> None:
+    """The images show the ground below it."""
+    crown, tree = np.s_[55:68, 70:83], 5
+    disparity, classes = np.full(SHAPE, 4.0), GROUND.copy()
+    disparity[crown], classes[crown] = 8.0, tree
+    labels = Labels(disparity, LEVEL.slope, LEVEL.variance)
+    left = texture()
+    window = pair(left, right_of(left, np.full((160, 260), 4)))
+    comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
+    changed, _ = contradicted(labels, window, comparison, ALL, classes)
+    assert changed[57:66, 72:81].all()
+    changed[crown] = False
+    assert not changed.any()

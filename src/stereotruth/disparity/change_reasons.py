@@ -1,0 +1,194 @@
+"""What has changed where images and LiDAR show different surfaces: the layer ``change``.
+
+Each pixel of status ``changed`` gets a reason (:class:`.reason.Reason`). What stood there at the
+LiDAR's date its class says; what stands there in the images the shift says at which these agree
+better, and the size of the patch that has changed:
+
+1. *Evidence* (:func:`evidence_of`): the LiDAR's class, the rise of the surface from the LiDAR to
+   the images, how large the patch is, and what the LiDAR has beside it.
+2. *Reasons of pixels* (:func:`pixel_reasons`), by the first rule that holds; none where nothing
+   tells.
+3. *Votes* (:func:`by_votes`): the reason of most changed pixels around, of one surface class;
+   ``unknown`` where none of them has any.
+
+All follows from the pixels up to REASON_PX around a pixel and is counted in whole numbers, so that
+no block changes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..numerics.summed_area import window_sums
+from .image_agreement import TOGETHER_PX, Comparison
+from .pair_window import PairWindow, WindowLabels
+from .pixel_labels import Pixels
+from .reason import Reason
+from .seen_surface import box_max
+from .shifted_agreement import LEAST, WIDE_SHIFTS_PX, shifted_agreement
+from .status import VEGETATION_CLASSES, WATER_CLASS, Status
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+UNCLASSED = (0, 1)  # ASPRS: never classified, and unclassified
+GROUND_CLASS, TREE_CLASS, BUILDING_CLASS = 2, 5, 6
+AROUND_PX = 16  # up to here the patch is measured, and ground and water beside it are looked for
+VOTES_PX, STRONG = 16, 4  # pixels up to here vote; with positive evidence one counts so many
+QUORUM = 0.03  # share of the pixels that must have a reason
+REASON_PX = AROUND_PX + VOTES_PX  # by which these reach beyond the statuses that they follow from
+CROWN_PX, CROWN_PIXELS = 6, 5  # a tree has grown: up to here the LiDAR has so many pixels of one
+CROP_M = 3.2  # no crop is higher, and no storey lower
+VEHICLE_M = 3.3  # no vehicle is higher
+SHORE_M = 4.0  # above the water, what a flood reaches
+# Of the pixels up to AROUND_PX around, the share that a crown and a vehicle take at most. Images of
+# one light are compared by votes, which widen a patch by some 8 px; others are not.
+CROWN_SHARE = 0.25
+VEHICLE_SHARE, VEHICLE_SHARE_APART = 0.28, 0.16
+
+
+class Evidence(NamedTuple):
+    """What tells why pixels have changed; arrays [h, w].
+
+    ``changed``; ``surface_class`` (ASPRS) of what the LiDAR shows; ``rise`` (m) of the surface from
+    the LiDAR to the images, NaN where these agree nowhere better. Whether the LiDAR's surface
+    ``is_low`` enough over the ground around for a vehicle; whether the patch ``is_small`` enough
+    for one; whether it ``is_crown``, small enough and with vegetation of the LiDAR in it; whether
+    it ``is_shore``, beside water of the LiDAR and not much higher.
+    """
+
+    changed: Bools
+    surface_class: Bytes
+    rise: Floats
+    is_low: Bools
+    is_small: Bools
+    is_crown: Bools
+    is_shore: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedSurface:
+    """What the LiDAR shows at the pixels of a window, arrays [h, w].
+
+    ``changed``; ``height`` (m) and ``surface_class`` (ASPRS) of the surface; ``is_rough``: whether
+    it is a rough surface; ``own``: the points in each pixel.
+    """
+
+    changed: Bools
+    height: Floats
+    surface_class: Bytes
+    is_rough: Bools
+    own: Pixels
+
+    def classes(self) -> Bytes:
+        """The surface's class [h, w]; without one, by its roughness and height over the lowest
+        point around."""
+        lowest = -box_max(np.where(self.own.count > 0, -self.own.highest, -np.inf), AROUND_PX)
+        is_high = self.height - lowest > VEHICLE_M
+        by_height = np.where(is_high, BUILDING_CLASS, GROUND_CLASS)
+        by_height = np.where(self.is_rough, TREE_CLASS, by_height)
+        unclassed = np.isin(self.surface_class, UNCLASSED)
+        return np.where(unclassed, by_height, self.surface_class).astype(np.uint8)
+
+
+def box_count(chosen: Bools, reach: int) -> NDArray[np.int64]:
+    """Number of ``chosen`` pixels [h, w] up to ``reach`` px around each."""
+    return window_sums(np.pad(chosen, reach), 2 * reach + 1)
+
+
+def evidence_of(surface: ChangedSurface, rise: Floats, vehicle_share: float) -> Evidence:
+    """From the ``surface`` of the LiDAR and the ``rise`` (m) [h, w] of what the images show over
+    it; ``vehicle_share``: of the pixels around, that a vehicle takes at most."""
+    changed, own = surface.changed, surface.own
+    classes = np.where(own.count > 0, own.surface_class, 0)
+    ground = -box_max(np.where(classes == GROUND_CLASS, -own.highest, -np.inf), AROUND_PX)
+    water = box_max(np.where(classes == WATER_CLASS, own.highest, -np.inf), AROUND_PX)
+    vegetation = box_count(np.isin(classes, VEGETATION_CLASSES), CROWN_PX) >= CROWN_PIXELS
+    share = box_count(changed, AROUND_PX) / (2 * AROUND_PX + 1) ** 2
+    return Evidence(
+        changed=changed,
+        surface_class=surface.classes(),
+        rise=np.where(changed, rise, np.nan),
+        is_low=surface.height - ground <= VEHICLE_M,
+        is_small=share <= vehicle_share,
+        is_crown=vegetation & (share <= CROWN_SHARE),
+        is_shore=surface.height < water + SHORE_M,
+    )
+
+
+def pixel_reasons(evidence: Evidence) -> tuple[Bytes, Bools]:
+    """Reasons of pixels [h, w] by themselves, NONE where nothing tells; and whether more than the
+    absence of any agreement tells it."""
+    e = evidence
+    building = e.surface_class == BUILDING_CLASS
+    vegetation = np.isin(e.surface_class, VEGETATION_CLASSES)
+    ground = ~(building | vegetation)
+    is_level, is_open = np.abs(e.rise) <= CROP_M, np.isnan(e.rise)
+    rules = (
+        ((e.surface_class == WATER_CLASS) | (ground & e.is_shore), Reason.WATER),
+        (vegetation, Reason.GROWN_OR_FELLED),
+        (building & e.is_low & e.is_small, Reason.MOVED),
+        (building & (e.rise > 0), Reason.BUILT),
+        (building & (e.rise < 0), Reason.DEMOLISHED),
+        (building, Reason.NONE),
+        (e.is_crown & ~(e.rise < 0), Reason.GROWN_OR_FELLED),
+        (e.is_small & (is_open | is_level), Reason.MOVED),
+        (is_level, Reason.GROUND),
+        # higher than a crop; or so large that it is no vehicle, and where neither image agrees
+        (~(e.rise < 0), Reason.BUILT),
+    )
+    chosen = np.select([rule for rule, _ in rules], [reason for _, reason in rules], Reason.NONE)
+    chosen = np.where(e.changed, chosen, Reason.NONE).astype(np.uint8)
+    return chosen, vegetation | ~is_open | (chosen == Reason.WATER)
+
+
+def by_votes(reasons: Bytes, is_strong: Bools, evidence: Evidence) -> Bytes:
+    """For each changed pixel [h, w] the reason of most of those up to VOTES_PX around it that are
+    of its surface class; UNKNOWN where fewer than the share QUORUM of these have any. Strong ones
+    count STRONG votes."""
+    out = np.where(evidence.changed, Reason.UNKNOWN, Reason.NONE).astype(np.uint8)
+    for surface_class in np.unique(evidence.surface_class[evidence.changed]):
+        here = evidence.changed & (evidence.surface_class == surface_class)
+        most = np.zeros(here.shape, np.int64)
+        has_any = box_count(here & (reasons != Reason.NONE), VOTES_PX)
+        quorum = here & (has_any > QUORUM * box_count(here, VOTES_PX))
+        for reason in np.unique(reasons[here & (reasons != Reason.NONE)]):
+            votes = box_count(here & (reasons == reason), VOTES_PX)
+            votes += (STRONG - 1) * box_count(here & is_strong & (reasons == reason), VOTES_PX)
+            more = quorum & (votes > most)
+            out[more], most[more] = reason, votes[more]
+    return out
+
+
+def with_reasons(
+    labels: WindowLabels,
+    is_rough: Bools,
+    own: Pixels,
+    window: PairWindow,
+    comparison: Comparison,
+    px_per_m: float,
+) -> WindowLabels:
+    """Labels of a window with the reasons of its changed pixels.
+
+    ``is_rough`` [h, w]: whether a pixel shows a rough surface; ``own``: its points; ``px_per_m``:
+    disparity of a metre of height.
+    """
+    changed = labels.status == Status.CHANGED
+    if not changed.any():
+        return labels
+    shifted = shifted_agreement(
+        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, changed,
+        WIDE_SHIFTS_PX,
+    )  # fmt: skip
+    agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
+    rise = np.where(agrees, shifted.shift / px_per_m, np.nan)
+    surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
+    share = VEHICLE_SHARE_APART if comparison.diachronic else VEHICLE_SHARE
+    evidence = evidence_of(surface, rise, share)
+    return replace(labels, change=by_votes(*pixel_reasons(evidence), evidence))

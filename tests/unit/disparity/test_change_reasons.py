@@ -1,0 +1,156 @@
+"""What has changed, on small made fields: each reason by what the LiDAR and both images show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stereotruth.disparity.change_reasons import REASON_PX, VEHICLE_M, with_reasons
+from stereotruth.disparity.image_agreement import Comparison
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.pair_window import PairWindow, WindowLabels
+from stereotruth.disparity.pixel_labels import Labels, Pixels
+from stereotruth.disparity.reason import Reason
+from stereotruth.disparity.status import Status
+from stereotruth.simulate.changes import REASONS
+
+IMAGE = 200, 300
+ROWS, COLS = slice(10, 190), slice(50, 250)
+SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
+LARGE, SMALL = np.s_[60:110, 60:120], np.s_[80:92, 90:108]  # of the window
+GROUND, TREE, BUILDING, WATER = 2, 5, 6, 9  # ASPRS
+DISPARITY, HEIGHT_M, PX_PER_M = 4, 50.0, 1.0
+COMPARISON = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0))
+
+
+def texture(seed: int) -> np.ndarray:
+    return np.round(np.random.default_rng(seed).uniform(200, 1200, IMAGE))
+
+
+def images(patch: tuple[slice, slice], rise_px: int | None) -> PairWindow:
+    """A level ground of which a patch is higher in both images, or is another in each (None)."""
+    left, right = texture(0), texture(1)
+    disparity = np.full(IMAGE, DISPARITY)
+    disparity[ROWS, COLS][patch] += rise_px or 0
+    y, x = np.indices(IMAGE)
+    match = x - disparity
+    seen = (match >= 0) & (match < IMAGE[1])
+    right[y[seen], match[seen]] = left[seen]
+    if rise_px is None:
+        left[ROWS, COLS][patch] = texture(2)[ROWS, COLS][patch]
+    patches = read_patch(left, ROWS, COLS, 1), read_patch(right, ROWS, slice(0, 300), 1)
+    return PairWindow(ROWS, COLS, 0, *patches)
+
+
+def lidar(
+    patch: tuple[slice, slice], surface_class: int, above_m: float
+) -> tuple[WindowLabels, Pixels]:
+    """Labels and points of a level ground on which the patch is of a class, so high above it, and
+    has changed."""
+    zeros, level = np.zeros(SHAPE), np.zeros((2, *SHAPE))
+    status, classes = np.full(SHAPE, Status.LABELLED, np.uint8), np.full(SHAPE, GROUND, np.uint8)
+    height, disparity = zeros + HEIGHT_M, zeros + DISPARITY
+    status[patch], classes[patch] = Status.CHANGED, surface_class
+    height[patch] += above_m
+    disparity[patch] += above_m * PX_PER_M
+    labels = Labels(disparity, level, zeros)
+    count = np.ones(SHAPE, np.int64)
+    nothing = np.zeros(SHAPE, np.uint8)
+    found = WindowLabels(status, labels, height, classes, count, zeros, nothing)
+    moments = np.zeros((*SHAPE, 6))
+    return found, Pixels(count, zeros, zeros, disparity, height, zeros, classes, moments)
+
+
+def reasons(
+    patch: tuple[slice, slice], surface_class: int, above_m: float, now_m: int | None, **options
+) -> np.ndarray:
+    """Of a patch that stands ``above_m`` over the ground in the LiDAR and ``now_m`` in both
+    images, or is another surface in each (None)."""
+    labels, points = lidar(patch, surface_class, above_m)
+    return at(labels, points, images(patch, now_m), **options)
+
+
+def at(
+    labels: WindowLabels, points: Pixels, window: PairWindow, *, rough: bool = False
+) -> np.ndarray:
+    is_rough = np.full(labels.status.shape, rough)
+    return with_reasons(labels, is_rough, points, window, COMPARISON, PX_PER_M).change
+
+
+@pytest.mark.parametrize(
+    "patch, surface_class, above_m, now_m, reason",
+    [
+        (LARGE, GROUND, 0, 6, Reason.BUILT),
+        (LARGE, BUILDING, 6, 10, Reason.BUILT),  # raised
+        (LARGE, BUILDING, 8, 0, Reason.DEMOLISHED),
+        (LARGE, TREE, 8, 0, Reason.GROWN_OR_FELLED),
+        (SMALL, GROUND, 0, None, Reason.MOVED),
+        (SMALL, BUILDING, 2, None, Reason.MOVED),  # a class that vehicles have
+        (LARGE, WATER, 0, None, Reason.WATER),
+        (LARGE, GROUND, 0, 2, Reason.GROUND),
+        (LARGE, GROUND, 0, -2, Reason.GROUND),
+        (LARGE, BUILDING, 8, None, Reason.UNKNOWN),
+    ],
+)
+def test_the_reason_follows_from_lidar_and_images(patch, surface_class, above_m, now_m, reason):
+    change = reasons(patch, surface_class, above_m, now_m)
+    assert (change[patch] == reason).mean() > 0.95
+    change[patch] = Reason.NONE
+    assert not change.any()
+
+
+def test_a_tree_that_has_grown_has_one_of_the_lidar_in_it() -> None:
+    labels, points = lidar(SMALL, GROUND, 0)
+    points.surface_class[84:87, 97:101] = TREE
+    assert (at(labels, points, images(SMALL, None))[SMALL] == Reason.GROWN_OR_FELLED).all()
+
+
+@pytest.mark.parametrize("beside_m, reason", [(-3.0, Reason.WATER), (-9.0, Reason.BUILT)])
+def test_a_flood_reaches_what_is_low_beside_water(beside_m: float, reason: Reason) -> None:
+    labels, points = lidar(LARGE, GROUND, 0)
+    points.surface_class[:, 45:130] = WATER
+    points.surface_class[LARGE] = GROUND
+    points.highest[points.surface_class == WATER] += beside_m
+    change = at(labels, points, images(LARGE, None))
+    assert (change[62:108, 62:70] == reason).all()
+
+
+@pytest.mark.parametrize(
+    "above_m, rough, reason",
+    [
+        (8, False, Reason.DEMOLISHED),
+        (8, True, Reason.GROWN_OR_FELLED),
+    ],
+)
+def test_without_classes_roughness_and_height_decide(above_m, rough, reason) -> None:
+    patch = np.s_[70:95, 80:110]  # so that the ground is near
+    assert above_m > VEHICLE_M
+    change = reasons(patch, 1, above_m, 0, rough=rough)
+    assert (change[patch] == reason).mean() > 0.9
+
+
+def test_reasons_follow_from_what_is_near() -> None:
+    """A window has the reasons of a larger one, but within REASON_PX and the reach of the
+    comparison of its rim."""
+    labels, points = lidar(LARGE, GROUND, 0)
+    window = images(LARGE, 6)
+    whole = at(labels, points, window)
+    part, margin = np.s_[30:150, 40:180], REASON_PX + 10
+    cut = {name: getattr(points, name)[part] for name in Pixels.__dataclass_fields__}
+    small = replace(
+        window,
+        rows=slice(ROWS.start + 30, ROWS.start + 150),
+        cols=slice(COLS.start + 40, COLS.start + 180),
+    )
+    inner = np.s_[margin:-margin, margin:-margin]
+    change = at(labels.within(part), Pixels(**cut), small)[inner]
+    assert change.any() and np.array_equal(change, whole[part][inner])
+
+
+def test_codes_are_those_of_the_simulator_but_for_texture() -> None:
+    """A change of texture alone is none of height; where nothing tells, the reason is unknown."""
+    names = [reason.name.lower() for reason in Reason]
+    assert names[:-1] == REASONS.split()[:-1]
+    assert (names[-1], REASONS.split()[-1]) == ("unknown", "texture")
