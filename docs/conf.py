@@ -95,13 +95,18 @@ def complete(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 EXAMPLES = re.compile(r"^\[bold\]Examples\[/bold\]\n((?:\n\[cyan\].*\[/cyan\]\n)+)", re.MULTILINE)
+CYAN = re.compile(r"\[cyan\](.*?)\[/cyan\]")
 
 
 def command_line() -> str:
     """Help of all commands, as Markdown."""
     click = typer.main.get_command(command)
     context = click.make_context("stereotruth", [], resilient_parsing=True)
+    for group in [click, *click.commands.values()]:  # their lists cut what has no short help
+        for one in getattr(group, "commands", {}).values():
+            one.short_help = " ".join((one.help or "").split()).partition(". ")[0].rstrip(".") + "."
     text = get_docs_for_click(obj=click, ctx=context, name="stereotruth")
+    text = re.sub(r"(?m)^(?!\[cyan\])(.*)$", lambda line: CYAN.sub(r"`\1`", line[1]), text)
 
     def examples(found: re.Match[str]) -> str:
         lines = re.findall(r"\[cyan\](.*)\[/cyan\]", found[1])

@@ -145,3 +145,21 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"results/predict/.*_dsm\.tif": _look,
     r"score_dsm/[^/]+/([^/]+)/([^/]+)": _surface_model,
 }
+
+
+REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
+DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
+
+
+def complaints(snakemake_logs: Iterable[str]) -> str:
+    """The errors that the failed jobs of a run have logged; of a defect its last line."""
+    text = "".join(Path(file).read_text("utf-8", "replace") for file in snakemake_logs)
+    logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
+    found = []
+    for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
+        said = file.read_text("utf-8", "replace")
+        found += [message.rstrip() for message in REFUSED.findall(said)]
+        for what, trace in DEFECT.findall(said):
+            lines = trace.strip().splitlines()
+            found.append(f"{what}: {lines[-1] if lines else ''}. The traceback is in {file}")
+    return "\n".join(found)

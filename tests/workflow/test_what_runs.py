@@ -1,4 +1,4 @@
-"""What runs again after an edit: the rows of the first table of docs/explanation/reruns.md."""
+"""What runs again after an edit: the rows of the table of edits in docs/explanation/reruns.md."""
 
 from __future__ import annotations
 

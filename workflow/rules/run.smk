@@ -1,6 +1,5 @@
 """One run at a time, and its last lines."""
 
-import re
 import sys
 
 from stereotruth.products.locks import FileLock
@@ -39,16 +38,6 @@ onstart:
     if BUCKET:
         keep_in_bucket(BUCKET)
     begin_run()
-
-
-def complaints(snakemake_logs):
-    """The errors that the failed jobs of a run have logged, one line each."""
-    text = "".join(Path(file).read_text("utf-8", "replace") for file in snakemake_logs)
-    logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
-    found = []
-    for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
-        found += re.findall(r"ERROR (.*?: error: .*)", file.read_text("utf-8", "replace"))
-    return "\n".join(found)
 
 
 def made():
@@ -94,4 +83,6 @@ onerror:
     if BUCKET:
         BUCKET.keep_states(Run().name)
     list_pages()
+    from stereotruth.last_lines import complaints
+
     say(complaints(log))

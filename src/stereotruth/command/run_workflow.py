@@ -63,7 +63,7 @@ def arguments_for(given: Sequence[str]) -> list[str]:
 def _with_profiles(given: Sequence[str]) -> list[str]:
     """Arguments with the path of a profile that comes with the package in place of its name.
 
-    Raises InputError if the executor or the storage of that profile is not installed.
+    Raises InputError if the executor or the storage of a profile is not installed.
     """
     words = list(given)
     for k, word in enumerate(words):
@@ -73,15 +73,18 @@ def _with_profiles(given: Sequence[str]) -> list[str]:
         at = k if equals else k + 1
         name = value if equals else words[at] if at < len(words) else ""
         shipped = FILES / "profiles" / name
-        if not name or "/" in name or Path(name).exists() or not shipped.is_dir():
+        of_package = "/" not in name and not Path(name).exists() and shipped.is_dir()
+        file = next((shipped if of_package else Path(name)).glob("config*.yaml"), None)
+        if not name or file is None:  # left to Snakemake, which has more places for profiles
             continue
-        for package in _plugins(read_mapping(next(shipped.glob("config*.yaml")))):
+        for package in _plugins(read_mapping(file)):
             if find_spec(package.replace("-", "_")) is None:
                 raise InputError(
                     f"profile {name!r} needs the package {package}",
                     remedy=f"pip install {package}",
                 )
-        words[at] = f"{option}={shipped}" if equals else str(shipped)
+        if of_package:
+            words[at] = f"{option}={shipped}" if equals else str(shipped)
     return words
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
+from ..errors import in_number
 from ..products import pictures
 from ..products.pictures import colours, save_figure
 from ..products.rasters import read_disparity, read_image
@@ -37,7 +38,8 @@ def draw_coverage(
         for r in rows
     ]
     count = sum(tile[5] for tile in tiles)
-    title = f"{city}: {count} labelled pairs, {len(tiles) - count} without complete labels"
+    more = f"{len(tiles) - count} without complete labels"
+    title = f"{city}: {in_number(count, 'labelled pair')}, {more}"
     coverage_figure(path, title, scenes, tiles)
 
 

@@ -250,5 +250,5 @@ def need_pytorch(name: str, kind: str) -> None:
     if not all(map(find_spec, ("torch", "tqdm"))):
         raise InputError(
             f"{kind} needs PyTorch and tqdm, which are not installed",
-            remedy=f"pip install '.[{KINDS[kind].extra}]'",
+            remedy=f"pip install 'stereotruth[{KINDS[kind].extra}]'",
         )

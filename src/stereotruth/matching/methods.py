@@ -38,7 +38,7 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
             raise
         raise InputError(
             f"{settings['kind']} needs {error.name}, which is not installed",
-            remedy=f"pip install '.[{kind.extra}]'" if kind.extra else "install it",
+            remedy=f"pip install 'stereotruth[{kind.extra}]'" if kind.extra else "install it",
         ) from error
     made = module.make(name, settings["kind"], options, workers)
     return with_polarity(name, made, **moved)

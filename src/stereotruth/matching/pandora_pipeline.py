@@ -147,7 +147,7 @@ def _steps_of(pipeline: str | None) -> dict[str, Any]:
     if missing := [name for name in MCCNN_MODULES if not find_spec(name)]:
         raise InputError(
             f"pipeline mccnn needs {', '.join(missing)}, which is not installed",
-            remedy="pip install '.[mccnn]'",
+            remedy="pip install 'stereotruth[mccnn]'",
         )
     (weights,) = mccnn_weights()
     optimization = {**PIPELINE["optimization"], "penalty": MCCNN_PENALTY}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from stereotruth.command.profiles import copy_profile
 from stereotruth.command.run_workflow import (
     TRUSTED,
     Progress,
@@ -55,6 +56,9 @@ def test_a_profile_of_the_package_is_named_without_its_path(tmp_path, monkeypatc
         arguments_for(["--profile", "slurm"])
     with pytest.raises(InputError, match="pip install snakemake-storage-plugin-s3"):
         arguments_for(["--profile", "s3"])
+    copy_profile("slurm", Path("my-site"))
+    with pytest.raises(InputError, match="'my-site' needs the package snakemake-executor-plugin"):
+        arguments_for(["--profile", "my-site"])
 
 
 def test_the_built_in_cities_are_asked_for_by_name(tmp_path, monkeypatch):

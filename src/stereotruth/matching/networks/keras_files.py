@@ -35,7 +35,7 @@ def read_weights(path: str | Path) -> list[Arrays]:
         raise InputError(
             "h5py is needed to read Keras weights",
             file=path,
-            remedy="pip install '.[networks]'",
+            remedy="pip install 'stereotruth[networks]'",
         ) from error
     try:
         with h5py.File(path, "r") as file:
