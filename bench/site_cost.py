@@ -1,8 +1,8 @@
 """What one more pair of a site costs, and the first one beside the decoding of its LiDAR.
 
-Draws a site, runs the workflow as a user does up to the labels of one pair, then of all others, and
-adds up the processor time, memory and disk that the jobs' own records tell. See README.md beside
-this.
+Draws a site, runs the workflow as a user does up to the labels of its first pair in a project of
+that pair alone, then of all pairs in another, and adds up the processor time, memory and disk that
+the jobs' own records tell. See README.md beside this.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ import argparse
 import csv
 import json
 import logging
+import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from throughput import decode, fastest
 
@@ -25,6 +28,18 @@ from stereotruth.simulate.sites import drawn_site
 BEFORE = ("ingest", "surface", "align", "refine", "adjust", "adjusted_alignment", "rectify")
 RULES = (*BEFORE, "project")
 ONCE = ("ingest", "surface")
+# For all processes of a run: rule, script and file where a script of a rule opens LiDAR.
+TRACE = """
+import os, sys
+def opened(event, arguments):
+    if event == "open" and str(arguments[0]).endswith((".las", ".laz")):
+        folder, script = os.path.split(getattr(sys, "argv", [""])[0])
+        if folder.endswith("scripts") and script.endswith(".py"):
+            job, rule, _ = script.split(".")
+            with os.fdopen(os.open({file!r}, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a") as log:
+                print(rule, job, os.path.basename(arguments[0]), sep="\\t", file=log)
+sys.addaudithook(opened)
+"""
 
 
 def make_project(folder: Path, arguments: argparse.Namespace, spacing_m: float) -> str:
@@ -43,9 +58,10 @@ def make_project(folder: Path, arguments: argparse.Namespace, spacing_m: float) 
     return city
 
 
-def stereotruth(folder: Path, *words: str) -> None:
+def stereotruth(folder: Path, *words: str, env: Mapping[str, str] | None = None) -> None:
     """The program, in a project."""
-    subprocess.run([Path(sys.executable).with_name("stereotruth"), *words], cwd=folder, check=True)
+    program = Path(sys.executable).with_name("stereotruth")
+    subprocess.run([program, *words], cwd=folder, env=env, check=True)
 
 
 def scenes_of(folder: Path) -> list[str]:
@@ -54,14 +70,54 @@ def scenes_of(folder: Path) -> list[str]:
         return [row["scene"] for row in csv.DictReader(sheet, delimiter="\t")]
 
 
+def alone(folder: Path) -> Path:
+    """A project of the same data whose sheet has the first pair alone."""
+    other = folder.with_name(f"{folder.name}_alone")
+    if not other.is_dir():
+        other.mkdir()
+        (other / "data").symlink_to(folder / "data")
+        (other / "gcps").symlink_to(folder / "gcps")
+        for name in ("config.yaml", "cities.tsv", "images.tsv", "scenes.tsv"):
+            shutil.copyfile(folder / name, other / name)
+        head, first, *_ = (other / "scenes.tsv").read_text(encoding="utf-8").splitlines()
+        (other / "scenes.tsv").write_text(f"{head}\n{first}\n", encoding="utf-8")
+    return other
+
+
 def label(folder: Path, city: str, scenes: Sequence[str]) -> None:
-    """Label pairs."""
+    """Label pairs, with a record of the jobs that open LiDAR files (:data:`TRACE`)."""
+    trace = folder / "trace"
+    trace.mkdir(exist_ok=True)
+    (trace / "sitecustomize.py").write_text(TRACE.format(file=str(trace / "opened.txt")), "utf-8")
+    paths = filter(None, [str(trace), os.environ.get("PYTHONPATH")])
     grids = (f"results/project/{city}/{scene}.zarr" for scene in scenes)
-    stereotruth(folder, "run", *grids, "--cores", "2", "--quiet", "all")
+    stereotruth(
+        folder,
+        *("run", *grids, "--cores", "2", "--quiet", "all"),
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+    )
 
 
-def spent(folder: Path) -> dict[str, tuple[int, float, float]]:
-    """Jobs, seconds of processor time and the greatest memory (MiB), by rule."""
+def opened(folder: Path) -> dict[str, dict[str, int]]:
+    """How many jobs of each rule opened each LiDAR file."""
+    lines = (folder / "trace" / "opened.txt").read_text(encoding="utf-8").splitlines()
+    found: dict[str, dict[str, int]] = {}
+    for rule, _, file in (line.split("\t") for line in sorted(set(lines))):
+        files = found.setdefault(rule, {})
+        files[file] = files.get(file, 0) + 1
+    return found
+
+
+class Spent(NamedTuple):
+    """Of the jobs of a rule: how many, seconds of processor time, the greatest memory (MiB)."""
+
+    jobs: int
+    cpu_s: float
+    memory: float
+
+
+def spent(folder: Path) -> dict[str, Spent]:
+    """By rule, from the records that the jobs leave."""
     out = {}
     for rule in RULES:
         jobs = []
@@ -69,43 +125,55 @@ def spent(folder: Path) -> dict[str, tuple[int, float, float]]:
             with file.open(encoding="utf-8") as stream:
                 jobs += list(csv.DictReader(stream, delimiter="\t"))
         seconds, memory = ([float(job[name]) for job in jobs] for name in ("cpu_time", "max_rss"))
-        out[rule] = len(jobs), sum(seconds), max(memory, default=0.0)
+        out[rule] = Spent(len(jobs), sum(seconds), max(memory, default=0.0))
     return out
 
 
 def megabytes(folder: Path) -> float:
-    """Of all files below."""
-    return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e6
+    """Of all files below; one that has two names counts once."""
+    files = {(s.st_ino, s.st_size) for f in folder.rglob("*") if (s := f.lstat()) and f.is_file()}
+    return sum(size for _, size in files) / 1e6
+
+
+def figures(folder: Path, first: dict[str, Spent]) -> dict[str, object]:
+    """Memory and disk of a project's stages."""
+    return {
+        "memory, MiB": {rule: round(of.memory) for rule, of in first.items()},
+        "disk, MB": {
+            name: round(megabytes(folder / "results" / name)) for name in (*ONCE, "project")
+        },
+    }
 
 
 def measure(folder: Path, arguments: argparse.Namespace, spacing_m: float) -> dict[str, object]:
     """The figures of one site."""
     city = make_project(folder, arguments, spacing_m)
-    pairs = scenes_of(folder)
-    label(folder, city, pairs[:1])
-    first = spent(folder)
-    label(folder, city, pairs)
-    every = spent(folder)
-    further = {rule: (every[rule][1] - first[rule][1]) / max(len(pairs) - 1, 1) for rule in RULES}
+    pairs, one = scenes_of(folder), alone(folder)
+    label(one, city, pairs[:1])
+    if others := len(pairs) - 1:
+        label(folder, city, pairs)
+    else:
+        folder = one
+    first, every = spent(one), spent(folder)
+    further = {rule: (every[rule].cpu_s - first[rule].cpu_s) / max(others, 1) for rule in RULES}
     files = sorted((folder / "data" / "lidar").glob("*.la[sz]"))
     _, bare = fastest(lambda: decode(files), 2)
-    alone = sum(first[rule][1] for rule in RULES)
-    with_points = sum(first[rule][1] for rule in (*ONCE, "project"))
+    with_points = sum(first[rule].cpu_s for rule in (*ONCE, "project"))
     return {
         "spacing_m": spacing_m,
         "points": decode(files),
+        "images": arguments.images,
         "pairs": len(pairs),
-        "files": len(files),
-        "jobs of ingest, of surface": [every[rule][0] for rule in ONCE],
-        "first pair, s": {rule: round(first[rule][1], 1) for rule in RULES},
-        "a further pair, s": {rule: round(further[rule], 1) for rule in RULES},
-        "further / first": round(sum(further.values()) / alone, 3),
+        "LiDAR files": len(files),
+        "jobs that opened LiDAR, by rule and file": opened(folder),
+        "jobs of surface": every["surface"].jobs,
+        "first pair alone, s": {rule: round(of.cpu_s, 1) for rule, of in first.items()},
+        "a further pair, s": {rule: round(s, 1) for rule, s in further.items()},
+        "further / first": round(sum(further.values()) / sum(of.cpu_s for of in first.values()), 3),
         "bare decoding, s": round(bare, 2),
         "ingest, surface and project of the first / decoding": round(with_points / bare, 2),
-        "memory, MiB": {rule: round(every[rule][2]) for rule in RULES},
-        "disk, MB": {
-            name: round(megabytes(folder / "results" / name)) for name in (*ONCE, "project")
-        },
+        "first pair alone": figures(one, first),
+        "all pairs": figures(folder, every),
     }
 
 

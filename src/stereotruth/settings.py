@@ -93,7 +93,12 @@ def acquisition_time(text: str) -> datetime | date:
         return date.fromisoformat(text)
     if not re.match(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", text):
         raise ValueError("is not of the form 2020-10-25T03:12:45Z")
-    time = datetime.fromisoformat(text)
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        if "Invalid isoformat" not in str(error):
+            raise
+        raise ValueError("is not of the form 2020-10-25T03:12:45Z") from error
     if time.tzinfo is None:
         raise ValueError("has no time zone: Z of UTC, or an offset such as +08:00")
     return time.astimezone(UTC)

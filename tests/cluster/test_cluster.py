@@ -1,4 +1,4 @@
-"""Two cities through a real SLURM of three nodes: the same bytes as a local run.
+"""Two cities and a site through a real SLURM of three nodes: the same bytes as a local run.
 
 East is higher than a shard, and made in two strips by jobs of their own, on two nodes; one of these
 is lost in the midst. A job that asks for too little memory is tried again with more.
@@ -51,8 +51,9 @@ TOO_LITTLE = "50 if wildcards.city == 'West' and attempt < 2 else 4300 * attempt
 
 @dataclass
 class Runs:
-    """The same two cities, made here and by SLURM."""
+    """The same two cities, made here and by SLURM, and the ``data`` of both."""
 
+    data: Path
     local: Project
     slurm: Project
     jobs: list[Job]
@@ -96,7 +97,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     assert run.status == 0, run.text[-8000:]
     assert lost, "no strip of project was seen at work"
     start_node(lost[0].node)
-    return Runs(local, slurm, jobs(), lost[0])
+    return Runs(folder / "data", local, slurm, jobs(), lost[0])
 
 
 def lose_a_node(slurm: Project, lost: list[Job]) -> None:
@@ -164,6 +165,29 @@ def test_small_jobs_share_one_submission(runs: Runs) -> None:
         jobs = [job for job in runs.jobs if f"_{rule}" in job.comment]
         assert [job.state for job in jobs] == ["COMPLETED"]
     assert all(job.state == "COMPLETED" for job in runs.jobs if "project" not in job.comment)
+
+
+def test_two_pairs_of_a_site_run_on_two_nodes_after_one_surface(runs: Runs, tmp_path: Path) -> None:
+    """Left with right and right with left: each LiDAR file is read once, too."""
+    earlier = {job.number for job in jobs()}
+    project = copy_project(tmp_path / "site")
+    shutil.copytree(runs.data / "West", project.folder / "in")
+    one = row_of(Path("in"), scene="Site-1", city="Site")
+    turned = {"left_image": one["right_image"], "right_image": one["left_image"], "gcps": ""}
+    project.add_scene("site", [one, one | turned | {"scene": "Site-2"}], **SIZE)
+    grids = [f"results/project/Site/Site-{k}.zarr" for k in (1, 2)]
+    run = project.snakemake(*grids, "--configfile", "site.yaml", *SLURM)
+    assert run.status == 0, run.text[-8000:]
+
+    made = [job for job in jobs() if job.number not in earlier]
+    assert all(job.state == "COMPLETED" for job in made)
+    (surface,) = (job for job in made if "rule_surface" in job.comment)
+    labels = [job for job in made if "rule_project" in job.comment]
+    assert len({job.node for job in labels}) == len(labels) == 2
+    assert all(job.number > surface.number for job in labels)
+    assert len([job for job in made if "_ingest" in job.comment]) == 1
+    stores = [path.name for path in (project.folder / "results/ingest").rglob("*.points")]
+    assert len(stores) == len(set(stores)) == len(list((runs.data / "West/lidar").glob("*.laz")))
 
 
 SMALL = 128  # px, of the blocks that Dask workers make

@@ -53,7 +53,8 @@ class SitePoints(NamedTuple):
 
     ``col``, ``row`` px [n] from the upper-left pixel of the site's wide box, ``height`` m [n];
     ``firm`` bool[n]: no vegetation or water by its class, and the only return of its pulse;
-    ``first`` int[rows * cols + 1]: index of the first point of each pixel; ``shape`` of the box;
+    ``first`` int[rows * cols + 1]: index of the first point of each pixel, whose points are sorted
+    by height; ``heights`` of the lowest and the highest point, m; ``shape`` of the box;
     ``parallax`` [2] px/m: by how much a point is displaced in the right image against the plane
     per metre that it lies above the plane, in px of the left image.
     """
@@ -63,6 +64,7 @@ class SitePoints(NamedTuple):
     height: Floats
     firm: Bools
     first: Integers
+    heights: tuple[float, float]
     shape: tuple[int, int]
     parallax: Floats
 
@@ -81,10 +83,14 @@ class SitePoints(NamedTuple):
         inside = (col > -0.5) & (col < cols - 0.5) & (row > -0.5) & (row < rows - 0.5)
         col, row, height, firm = (values[inside] for values in (col, row, height, firm))
         pixel = np.rint(row).astype(np.int64) * cols + np.rint(col).astype(np.int64)
-        order = np.lexsort((height, pixel))  # whatever the order of files
         first = np.zeros(rows * cols + 1, np.int64)
         np.cumsum(np.bincount(pixel, minlength=rows * cols), out=first[1:])
-        return cls(col[order], row[order], height[order], firm[order], first, shape, parallax)
+        order = np.empty(pixel.size, np.int64)  # whatever the order of files
+        _sort_by_height(pixel, height, first[:-1].copy(), order)
+        heights = float(height.min(initial=np.inf)), float(height.max(initial=-np.inf))
+        return cls(
+            *(values[order] for values in (col, row, height, firm)), first, heights, shape, parallax
+        )
 
     def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
         """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
@@ -95,9 +101,25 @@ class SitePoints(NamedTuple):
     def clear_pixels(self, centre: Integers, plane: Floats, guard: Guard) -> Bools:
         """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
         clear = np.empty((SIDE, SIDE), bool)
-        heights = float(self.height.min()), float(self.height.max())
-        _clear_pixels(self, heights, guard, centre, plane, clear)
+        _clear_pixels(self, guard, centre, plane, clear)
         return clear
+
+
+@kernel
+def _sort_by_height(pixel: Integers, height: Floats, end: Integers, order: Integers) -> None:
+    """Fill ``order`` [n]: points by ``pixel``, those of a pixel by height, equal ones as they come.
+
+    ``end`` [pixels]: where the points of each pixel begin; overwritten. A pixel has few points.
+    """
+    first = end.copy()
+    for k in range(pixel.size):
+        p = pixel[k]
+        at = end[p]
+        while at > first[p] and height[order[at - 1]] > height[k]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = k
+        end[p] += 1
 
 
 @inner
@@ -235,7 +257,6 @@ def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float
 @kernel
 def _clear_pixels(
     points: SitePoints,
-    heights: tuple[float, float],
     guard: Guard,
     centre: Integers,
     plane: Floats,
@@ -246,8 +267,7 @@ def _clear_pixels(
     A point off the plane, by height or because it is not firm, is seen at its own pixel in the left
     image, and in the right image displaced by its parallax; both places, what lies between them and
     a guard around all are not clear. Neither is a pixel without points of the plane nearby.
-    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``heights`` of the lowest and the
-    highest point, m; ``guard``: one of GUARDS.
+    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``guard``: one of GUARDS.
     """
     first, (rows, cols) = points.first, points.shape
     parallax = points.parallax
@@ -264,23 +284,35 @@ def _clear_pixels(
     middle = HALF + margin
     length = np.hypot(parallax[0], parallax[1])
     # Points of other pixels are displaced into the window if they are high enough.
-    most = max(abs(heights[0] - plane[0]), abs(heights[1] - plane[0])) + np.hypot(
+    most = max(abs(points.heights[0] - plane[0]), abs(points.heights[1] - plane[0])) + np.hypot(
         plane[1] * cols, plane[2] * rows
     )
     reach = middle + int(most * length) + 1
+    spare = middle + 1.01  # half a pixel here, half a pixel there, and roundings
+    over_pixel = 0.5 * (abs(plane[1]) + abs(plane[2]))
     for y in range(max(centre[1] - reach, 0), min(centre[1] + reach + 1, rows)):
-        start = first[y * cols + max(centre[0] - reach, 0)]
-        for k in range(start, first[y * cols + min(centre[0] + reach + 1, cols)]):
-            above = _above(points, plane, centre, k)
-            x = points.col[k] - centre[0] + middle
-            v = points.row[k] - centre[1] + middle
-            if points.firm[k] and abs(above) <= limit:
-                _mark(held, x, v)
+        for i in range(max(centre[0] - reach, 0), min(centre[0] + reach + 1, cols)):
+            start, end = first[y * cols + i], first[y * cols + i + 1]
+            if start == end:
                 continue
-            steps = int(abs(above) * length / 1.5) + 1
-            for s in range(steps + 1):
-                t = above * s / steps
-                _mark(off, x + t * parallax[0], v + t * parallax[1])
+            level = plane[0] + plane[1] * (i - centre[0]) + plane[2] * (y - centre[1])
+            above = max(abs(points.height[start] - level), abs(points.height[end - 1] - level))
+            above += over_pixel
+            if abs(i - centre[0]) > spare + above * abs(parallax[0]):
+                continue
+            if abs(y - centre[1]) > spare + above * abs(parallax[1]):
+                continue
+            for k in range(start, end):
+                above = _above(points, plane, centre, k)
+                x = points.col[k] - centre[0] + middle
+                v = points.row[k] - centre[1] + middle
+                if points.firm[k] and abs(above) <= limit:
+                    _mark(held, x, v)
+                    continue
+                steps = int(abs(above) * length / 1.5) + 1
+                for s in range(steps + 1):
+                    t = above * s / steps
+                    _mark(off, x + t * parallax[0], v + t * parallax[1])
     for j in range(SIDE):
         for i in range(SIDE):
             near_off = _near(off, j + margin, i + margin, away)

@@ -1,8 +1,9 @@
 """The surface of a site, made once for all its pairs, block by block.
 
 A block is a square of ground cells on the global lattice, and has the triangles whose first vertex
-lies in it. Its bytes follow from the points up to :attr:`.scale.SurfaceScale.halo_cells` around it,
-whatever blocks are made beside it, in which order and by how many workers. Blocks are small, since
+lies in the part of it that images show (:mod:`.shown_blocks`). Its bytes follow from this part and
+the points up to :attr:`.scale.SurfaceScale.halo_cells` around it, whatever blocks are made beside
+it, in which order and by how many workers. Blocks are small, since
 windows read them whole, and are made by groups that are wide against their halo. Finished groups
 outlive a killed job, and one more LiDAR file leaves those that it does not touch
 (:mod:`stereotruth.products.finished_pieces`).
@@ -15,10 +16,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..job import progress
 from ..lidar.density import points_per_m2
@@ -31,31 +31,18 @@ from ..products.inputs import refuse_replaced
 from ..products.locks import FileLock
 from ..products.provenance import describe, digest
 from .scale import PART, SurfaceScale
+from .shown_blocks import Box, Number, ShownBlocks, ShownGround
 from .surface import Core, GroundSurface, ground_surface
 from .surface_store import ARRAYS, ATTRIBUTES, BLOCKS, FORMAT, write_block
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Number = tuple[int, int]
 Group = tuple[Number, ...]  # of blocks, in their order
 
 BLOCK_SPACINGS = 128  # spacings of points along a block's side, at least,
 BLOCK_CELLS = 512  # and cells
 HALOS = 12  # a group is so many halos wide: these cost a third more
 MOST_CELLS = 4096  # along a group's side
-
-
-class ShownGround(Protocol):
-    """The ground that the images of a site show."""
-
-    def shows(self, lon: Floats, lat: Floats, height: Floats) -> Bools:
-        """Whether an image shows places [n] (degrees, degrees, m)."""
-
-    def may_show(self, boxes: Floats) -> Bools:
-        """Whether an image may show something of boxes [n, 6] (west, south, lowest, east, north,
-        highest)."""
 
 
 def block_side(scale: SurfaceScale) -> int:
@@ -80,6 +67,7 @@ class _Maker:
 
     scale: SurfaceScale
     side: int
+    imaged: ShownBlocks
     stores: tuple[PointStore, ...]
     folder: Path
     code: str
@@ -88,33 +76,37 @@ class _Maker:
         """Of a block."""
         return self.folder / BLOCKS / f"{number[0]}_{number[1]}.npz"
 
-    def corners(self, group: Group) -> tuple[Number, Number]:
-        """Lattice (lon, lat) of the first and last point around that determine blocks."""
+    def parts(self, group: Group) -> dict[Number, Box]:
+        """What images show of blocks: the first (col, row) of their cells and that after the last
+        one."""
+        return {number: self.imaged.part(number) for number in group}
+
+    def corners(self, parts: Iterable[Box]) -> Box:
+        """Lattice (lon, lat) of the first and last point around that determine parts of blocks."""
         halo, cell = self.scale.halo_cells, self.scale.cell
-        (rows, cols), side = zip(*group), self.side
-        first, last = (min(cols), min(rows)), (max(cols) + 1, max(rows) + 1)
-        low = tuple((k * side - halo) * size for k, size in zip(first, cell))
-        high = tuple((k * side + halo) * size - 1 for k, size in zip(last, cell))
+        first, last = _around(parts)
+        low = (first[0] - halo) * cell[0], (first[1] - halo) * cell[1]
+        high = (last[0] + halo) * cell[0] - 1, (last[1] + halo) * cell[1] - 1
         return low, high
 
-    def key(self, group: Group) -> str:
+    def key(self, parts: Mapping[Number, Box]) -> str:
         """Digest of all that blocks follow from."""
-        low, high = self.corners(group)
+        low, high = self.corners(parts.values())
         box = [(q + off) * LATTICE_DEG for q, off in zip((*low, *high), (-0.5, -0.5, 0.5, 0.5))]
         touched = [store for store in self.stores if store.height_range(*box) is not None]
         return digest(
             {
                 "scale": asdict(self.scale),
                 "side": self.side,
-                "blocks": group,
+                "blocks": list(parts.items()),
                 "points": sorted(store.attrs["cells_crc32"] for store in touched),
                 "code": self.code,
             }
         )
 
-    def surfaces(self, group: Group) -> Iterator[tuple[Number, GroundSurface]]:
+    def surfaces(self, parts: Mapping[Number, Box]) -> Iterator[tuple[Number, GroundSurface]]:
         """The triangles of each block that has any."""
-        low, high = self.corners(group)
+        low, high = self.corners(parts.values())
         bounds = np.array([store.bounds[:4] for store in self.stores]) / LATTICE_DEG
         low = tuple(max(q, int(b) - 1) for q, b in zip(low, bounds[:, :2].min(axis=0)))
         high = tuple(min(q, int(b) + 1) for q, b in zip(high, bounds[:, 2:].max(axis=0)))
@@ -131,17 +123,14 @@ class _Maker:
             return
         first = [q // size for q, size in zip(low, self.scale.cell)]
 
-        def core(blocks: Group) -> Core:
-            """The box of blocks, in parts of a cell from the first one on."""
-            rows, cols = zip(*blocks)
-            ends = (min(cols), min(rows)), (max(cols) + 1, max(rows) + 1)
-            return Core(
-                *(tuple((k * self.side - f) * PART for k, f in zip(end, first)) for end in ends)
-            )
+        def core(box: Box) -> Core:
+            """The same in parts of a cell from the first one on."""
+            low, high = (tuple((k - f) * PART for k, f in zip(end, first)) for end in box)
+            return Core(low, high)
 
-        every = ground_surface(builder.built(), self.scale, core(group))
-        for number in group:
-            surface = every.within(core((number,)))
+        every = ground_surface(builder.built(), self.scale, core(_around(parts.values())))
+        for number, box in parts.items():
+            surface = every.within(core(box))
             if len(surface.facet) + len(surface.undecided) + len(surface.tops.corner):
                 yield number, surface
 
@@ -160,16 +149,24 @@ class _Maker:
         """Of blocks, by name."""
         return {self.file(number).stem: self.file(number) for number in group}
 
-    def make(self, group: Group, key: str, done: Ledger) -> None:
+    def make(self, group: Group, parts: Mapping[Number, Box], key: str, done: Ledger) -> None:
         """Blocks and their record."""
         written = {}
-        for number, surface in self.surfaces(group):
+        for number, surface in self.surfaces(parts):
             corner = [k * self.side * size for k, size in zip(number[::-1], self.scale.cell)]
             with atomic_file(self.file(number)) as scratch:
                 facts = write_block(scratch, surface, (corner[0], corner[1]))
             written[self.file(number).stem] = facts
         refuse_replaced(marks_of_inputs())
         done.put(_name(group), key, self.files(group), written)
+
+
+def _around(boxes: Iterable[Box]) -> Box:
+    """The box around some, one at least."""
+    low, high = zip(*boxes)
+    west, south = map(min, zip(*low))
+    east, north = map(max, zip(*high))
+    return (west, south), (east, north)
 
 
 def _name(group: Group) -> str:
@@ -202,18 +199,19 @@ def make_surface(
     scale = SurfaceScale.of(density, cell)
     folder = out.with_name(f".{out.name}.work")
     side = block_side(scale)
-    maker = _Maker(scale, side, tuple(stores), folder, code)
-    numbers = _blocks_of(stores, scale, side, ground)
-    groups = _groups(numbers, blocks_at_once or group_blocks(scale, side))
+    imaged = ShownBlocks.of(stores, scale, side, ground)
+    maker = _Maker(scale, side, imaged, tuple(stores), folder, code)
+    groups = _groups(imaged.numbers(), blocks_at_once or group_blocks(scale, side))
     lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
     try:
         lock.take(out)
         (folder / BLOCKS).mkdir(exist_ok=True)
 
         def one(group: Group) -> None:
-            key = maker.key(group)
+            parts = maker.parts(group)
+            key = maker.key(parts)
             if done.find(_name(group), key, maker.files(group)) is None:
-                maker.make(group, key, done)
+                maker.make(group, parts, key, done)
 
         with ThreadPoolExecutor(workers) as pool:
             for _ in progress(pool.map(one, groups), len(groups), "parts of the surface"):
@@ -252,38 +250,6 @@ def make_surface(
         "%d blocks of %d cells of %.2f m, about %.2g points per m²",
         len(blocks), side, scale.cell_m, density,
     )  # fmt: skip
-
-
-def _blocks_of(
-    stores: Sequence[PointStore], scale: SurfaceScale, side: int, ground: ShownGround | None
-) -> list[Number]:
-    """The blocks that have points and may have triangles in the ground that images show, in their
-    order."""
-    cells = np.concatenate([np.stack([s.cell_col, s.cell_row], axis=1) for s in stores])
-    heights = np.concatenate([s.cell_heights for s in stores]) * LATTICE_M
-    low = cells << CELL_BITS
-    high = low + (1 << CELL_BITS) - 1
-    if ground is not None:
-        reach = np.ceil(scale.height_reach / PART) * np.array(scale.cell)
-        boxes = np.column_stack(
-            [
-                (low - reach) * LATTICE_DEG,
-                heights[:, 0],
-                (high + reach) * LATTICE_DEG,
-                heights[:, 1],
-            ]
-        )
-        wanted = ground.may_show(boxes)
-        low, high = low[wanted], high[wanted]
-    size = np.array(scale.cell) * side
-    numbers: set[Number] = set()
-    for first, last in zip((low // size).tolist(), (high // size).tolist()):
-        numbers |= {
-            (row, col)
-            for col in range(first[0], last[0] + 1)
-            for row in range(first[1], last[1] + 1)
-        }
-    return sorted(numbers)
 
 
 def _groups(numbers: Sequence[Number], blocks: int) -> list[Group]:

@@ -100,11 +100,11 @@ def test_finished_blocks_are_taken_over(stores, tmp_path, monkeypatch):
     def make(out, most):
         made, whole = [], module._Maker.make
 
-        def one(self, number, key, done):
+        def one(self, group, parts, key, done):
             if len(made) == most:
                 raise KeyboardInterrupt
-            made.append(number)
-            whole(self, number, key, done)
+            made.append(group)
+            whole(self, group, parts, key, done)
 
         monkeypatch.setattr(module._Maker, "make", one)
         try:
@@ -135,14 +135,36 @@ def test_points_that_no_image_shows_count_for_nothing(stores, tmp_path):
     assert SurfaceStore(tmp_path / "all").scale.spacing < alone.scale.spacing
 
 
-def test_half_of_the_ground_has_the_blocks_of_all(stores, tmp_path):
+def test_half_of_the_ground_has_the_triangles_of_all_there(stores, tmp_path):
+    """Blocks on the edge of what is shown have a part of their triangles, the others all."""
     middle = max(store.bounds[2] for store in stores) - 3e-4
     for name, ground in (("all", None), ("half", East(middle))):
         make_surface(stores, tmp_path / name, cell=CELL, ground=ground)
     every, half = (SurfaceStore(tmp_path / name) for name in ("all", "half"))
-    if every.scale == half.scale:
-        assert set(half.every) < set(every.every)
+    assert every.scale == half.scale
+    whole, cut = set(half.every) & set(every.every), set(half.every) - set(every.every)
+    assert whole and cut and len(half.every) < len(every.every)
+    assert {block.name for block in cut} < {block.name for block in every.every}
     assert min(b.box[2] for b in half.every) * LATTICE_DEG > middle - 0.002
+    reach = half.scale.height_reach / PART * CELL[0] * LATTICE_DEG
+    of_all, of_half = (
+        {facet for facet in facets_of(store) if facet[0][0] > middle + reach}
+        for store in (every, half)
+    )
+    assert of_all == of_half and of_all
+
+
+def facets_of(store: SurfaceStore) -> set[tuple]:
+    """Each facet as its vertices (lon, lat, degrees; height, steps), with its figures."""
+    found = set()
+    for block in store.every:
+        a = store.arrays(block, list(ARRAYS))
+        lon = (a["lon"] + np.int64(block.col * store.side * CELL[0])) * LATTICE_DEG
+        lat = (a["lat"] + np.int64(block.row * store.side * CELL[1])) * LATTICE_DEG
+        vertices = np.stack([lon, lat, a["height"]], axis=1)
+        for corner, *figures in zip(a["facet"], a["variance"], a["bulge"]):
+            found.add((*map(tuple, vertices[corner].tolist()), *map(float, figures)))
+    return found
 
 
 def test_a_damaged_block_is_named(stores, tmp_path):
