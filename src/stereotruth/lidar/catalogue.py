@@ -313,14 +313,15 @@ def _outline(geometry: Any, crs: CRS | None) -> tuple[Floats, ...]:
 
 
 def _boxed(box: list[Any], crs: CRS | None) -> tuple[Floats, ...]:
-    """The ring of a box, of two or three dimensions."""
+    """The ring of a box, of two or three dimensions; two of one across the antimeridian."""
     try:
         values = np.array(box, np.float64)
     except (TypeError, ValueError):
         return ()
     (west, south), (east, north) = values[:2], values[len(box) // 2 :][:2]
-    ring = np.array([[west, east, east, west], [south, south, north, north]])
-    return in_degrees([ring], crs)
+    sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]
+    rings = [np.array([[w, e, e, w], [south, south, north, north]]) for w, e in sides]
+    return in_degrees(rings, crs)
 
 
 def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
