@@ -169,7 +169,9 @@ def print_trace(file: Path, requests: Sequence[str]) -> None:
         first, last = map(int, text.rpartition("=")[2].split("-"))
         last = min(last, size - 1)
         nodes = [n for n in octree.nodes if first <= n.start and n.start + n.bytes - 1 <= last]
-        what = "chunk table" if last < hierarchy else "hierarchy"
+        what = "chunk table" if last + 1 < hierarchy else "hierarchy"
+        if last + 1 == hierarchy:
+            what = "head of the record of the hierarchy"
         if first == 0:
             what = "header, coordinate system, cube and place of the hierarchy"
         elif nodes:

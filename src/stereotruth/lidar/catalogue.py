@@ -24,7 +24,7 @@ from pyproj.exceptions import CRSError
 
 from ..errors import InputError
 from ..products.remote_files import SCHEMES, is_remote, read_bytes
-from ..sheets import LIDAR_SUFFIXES, RASTER_SUFFIXES
+from ..sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
 from .catalogue_tiles import MOST_TILES, Floats, Row, Tile, in_degrees
 
@@ -163,7 +163,7 @@ def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> T
         "" if crs is None else crs.to_wkt(),
         _day(first),
         _day(last),
-        points if isinstance(points, int) else None,
+        points if type(points) is int and 0 <= points < 10**15 else None,
     )
 
 
@@ -331,6 +331,10 @@ def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
     unless ``hosts`` has it, ``file:`` and other schemes, http where the catalogue came by https; of
     a catalogue on the disk, any host but those of ``hosts``.
     """
+    if not href.isprintable() or LIDAR_SEPARATOR in href:
+        raise _untrusted(
+            catalogue, "a name that no sheet can have", f"name no file with {LIDAR_SEPARATOR!r}"
+        )
     if not is_remote(catalogue) and not ELSEWHERE.match(href):
         return str(Path(catalogue).parent / href)
     try:

@@ -9,6 +9,7 @@ connections and servers that are busy or stall are asked again, in the server's 
 from __future__ import annotations
 
 import io
+import os
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -109,24 +110,33 @@ def merged(ranges: Sequence[Range]) -> list[list[Range]]:
 
 
 class LocalRanges(Ranges):
-    """A file on the disk."""
+    """A file on the disk, which has to stay the same."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise InputError(
                 "no such LiDAR file", file=path, remedy="correct the path in scenes.tsv"
             )
-        self.name, self.size, self._path = str(path), path.stat().st_size, path
+        state = path.stat()
+        self.name, self.size, self._path = str(path), state.st_size, path
+        self._state = _identity(state)
 
     def _get(self, start: int, end: int) -> bytes:
         with self._path.open("rb") as stream:
             stream.seek(start)
             content = stream.read(end - start)
-        if len(content) < end - start:
+            same = _identity(os.fstat(stream.fileno())) == self._state
+        if not same or len(content) < end - start:
             raise InputError(
-                "became shorter while it was read", file=self._path, remedy="run again"
+                "changed while it was read",
+                file=self._path,
+                remedy="run again, and leave it alone until the run has ended",
             )
         return content
+
+
+def _identity(state: os.stat_result) -> tuple[int, int, int]:
+    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 class WebRanges(Ranges):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import time
 import zlib
@@ -160,6 +161,23 @@ def test_files_of_other_software_are_read_whole(name):
     truth = cropped(file.read_bytes(), ground)
     assert truth.shape[1] > 0
     assert np.array_equal(read(str(file), ground), truth)
+
+
+@pytest.mark.parametrize("how", ["replaced", "written over", "cut"])
+def test_a_file_on_the_disk_that_changes_while_it_is_read_is_refused(made, tmp_path, how):
+    file = tmp_path / "tile.copc.laz"
+    file.write_bytes(made.content)
+    octree = open_octree(file)
+    records = octree.read(octree.plan(GROUND.touches))
+    if how == "replaced":
+        (tmp_path / "other").write_bytes(made.content)
+        (tmp_path / "other").replace(file)
+    else:
+        content = made.content if how == "written over" else made.content[:-100]
+        file.write_bytes(content)
+    os.utime(file, ns=(1, 1))
+    with pytest.raises(InputError, match="changed while it was read"):
+        list(records)
 
 
 def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path):
