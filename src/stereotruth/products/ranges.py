@@ -12,11 +12,12 @@ import io
 import os
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 from ..errors import InputError, without_secrets
 from .web_requests import (
@@ -32,6 +33,7 @@ from .web_requests import (
     web_parts,
 )
 
+Item, Result = TypeVar("Item"), TypeVar("Result")
 Range = tuple[int, int]  # first byte, and the one behind the last
 
 GAP_BYTES = 1 << 12  # between two ranges that one request serves
@@ -80,18 +82,23 @@ class Ranges(ABC):
         Neighbours are read together. At most :data:`AT_ONCE` requests run or wait to be taken.
         """
         groups = merged(ranges)
-        coming: deque = deque()
-        pool = ThreadPoolExecutor(AT_ONCE)
-        try:
-            ahead = iter(groups)
-            for group in groups:
-                while len(coming) < AT_ONCE and (other := next(ahead, None)) is not None:
-                    coming.append(pool.submit(self.get, other[0][0], max(e for _, e in other)))
-                content = coming.popleft().result()
-                for start, end in group:
-                    yield content[start - group[0][0] : end - group[0][0]]
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        contents = in_turn(groups, lambda group: self.get(group[0][0], max(e for _, e in group)))
+        for group, content in zip(groups, contents):
+            for start, end in group:
+                yield content[start - group[0][0] : end - group[0][0]]
+
+
+def in_turn(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
+    """``work(item)`` of each item, in their order; :data:`AT_ONCE` run or wait to be taken."""
+    coming: deque[Future[Result]] = deque()
+    pool = ThreadPoolExecutor(AT_ONCE)
+    try:
+        ahead = iter(items)
+        for _ in items:
+            coming.extend(pool.submit(work, item) for item in islice(ahead, AT_ONCE - len(coming)))
+            yield coming.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def merged(ranges: Sequence[Range]) -> list[list[Range]]:

@@ -22,6 +22,7 @@ from tests.synthetic.copc_server import (
     SERVER_FAULTS,
     damaged,
     make_copc,
+    points_of,
     serving,
 )
 from tests.synthetic.real_data import SHARED
@@ -50,12 +51,6 @@ GROUND = Ground(CORNER[:2] + np.array([610, 640]), CORNER[:2] + np.array([1180, 
 @pytest.fixture(scope="module")
 def made():
     return make_copc()
-
-
-def points_of(records) -> np.ndarray:
-    """What ingest takes of the points, in their order."""
-    names = ["X", "Y", "Z", "classification", "return_number", "number_of_returns", "gps_time"]
-    return np.array([np.concatenate([np.asarray(r[n]) for r in records]) for n in names])
 
 
 def cropped(content: bytes, ground: Ground) -> np.ndarray:
