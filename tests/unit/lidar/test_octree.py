@@ -210,6 +210,24 @@ def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path)
     assert refused > 10
 
 
+def test_a_node_that_stands_elsewhere_in_the_hierarchy_is_found_though_it_is_not_read(
+    made, tmp_path
+):
+    """On the disk: a leaf of the ground has the key of a place where no node is."""
+    file, keys = tmp_path / "tile.copc.laz", {entry[:4] for entry in made.entries}
+    leaves = [e for e in made.entries if e[0] == 4 and GROUND.touches(*boxes_of(e[:4])).all()]
+    free = [(4, x, y, z) for x in range(16) for y in range(16) for z in (7, 8)]
+    free = [key for key in free if key not in keys and not GROUND.touches(*boxes_of(key)).any()]
+    assert len(leaves) > 5 and len(free) > 100
+    for leaf, key in zip(leaves, free):
+        content = bytearray(made.content)
+        at = content.index(ENTRY.pack(*leaf), made.hierarchy_at)
+        ENTRY.pack_into(content, at, *key, *leaf[4:])
+        file.write_bytes(content)
+        with pytest.raises(InputError, match="outside of its cube"):
+            read(str(file), GROUND)
+
+
 def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Corners [1, 3] of a node's cube."""
     side = 2048.0 / 2 ** key[0]
