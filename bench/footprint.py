@@ -10,6 +10,7 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import struct
 import sys
 import tempfile
@@ -32,6 +33,7 @@ from tests.synthetic.copc_server import (
     make_copc,
     serving,
 )
+from tests.synthetic.ept import FAULTS, make_ept
 
 from stereotruth.errors import InputError, in_number
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
@@ -169,7 +171,9 @@ def print_trace(file: Path, requests: Sequence[str]) -> None:
         first, last = map(int, text.rpartition("=")[2].split("-"))
         last = min(last, size - 1)
         nodes = [n for n in octree.nodes if first <= n.start and n.start + n.bytes - 1 <= last]
-        what = "chunk table" if last < hierarchy else "hierarchy"
+        what = "chunk table" if last + 1 < hierarchy else "hierarchy"
+        if last + 1 == hierarchy:
+            what = "head of the record of the hierarchy"
         if first == 0:
             what = "header, coordinate system, cube and place of the hierarchy"
         elif nodes:
@@ -216,9 +220,37 @@ def plant(rounds: int) -> None:
             totals[outcome] += 1
             if outcome in ("silent", "traceback"):
                 print(f"{fault}, round {seed}: {outcome}")
-    kinds = len(SERVER_FAULTS) + len(FILE_FAULTS)
+    plant_in_ept(ground, totals)
+    kinds = len(SERVER_FAULTS) + len(FILE_FAULTS) + len(FAULTS)
     print(f"{sum(totals.values())} faults of {kinds} kinds: {totals}")
     print(f"longest {longest:.1f} s, patience {patience_s} s for each part of a file")
+
+
+def plant_in_ept(ground: Square, totals: dict[str, int]) -> None:
+    """Faults of a dataset of Entwine Point Tiles on the disk, added to the ``totals``."""
+    whole = make_ept(Path("set"))
+    las = laspy.read(whole.with_name("all.las"))
+    stored = np.stack([las.X, las.Y, las.Z])
+    truth = stored[:, ground.contains(np.stack([las.x, las.y]))]
+    for fault, plant_it in FAULTS.items():
+        shutil.copytree(whole.parent, "damaged")
+        plant_it(Path("damaged"))
+        try:
+            octree = open_octree("damaged/ept.json")
+            records = list(octree.read(octree.plan(ground.touches)))
+            got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
+            world = got.T * octree.header.scales + octree.header.offsets
+            right = np.array_equal(got[:, ground.contains(world.T)], truth)
+            outcome = "right" if right else "silent"
+        except InputError:
+            outcome = "refused"
+        except Exception as error:
+            outcome = "traceback"
+            print(f"{fault}: {error!r}")
+        totals[outcome] += 1
+        if outcome in ("silent", "traceback"):
+            print(f"{fault}: {outcome}")
+        shutil.rmtree("damaged")
 
 
 def main() -> None:

@@ -85,6 +85,12 @@ def make_copc(
     return MadeCopc(bytes(content), entries, hierarchy_at)
 
 
+def points_of(records) -> np.ndarray:
+    """What ingest takes of the points, in their order."""
+    names = ["X", "Y", "Z", "classification", "return_number", "number_of_returns", "gps_time"]
+    return np.array([np.concatenate([np.asarray(r[n]) for r in records]) for n in names])
+
+
 def _compressed(stream, packing, array, key) -> list[tuple[int, ...]]:
     """Write each node as a chunk; the entries of the hierarchy."""
     bounds = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1), True])

@@ -24,7 +24,7 @@ from pyproj.exceptions import CRSError
 
 from ..errors import InputError
 from ..products.remote_files import SCHEMES, is_remote, read_bytes
-from ..sheets import LIDAR_SUFFIXES, RASTER_SUFFIXES
+from ..sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
 from .catalogue_tiles import MOST_TILES, Floats, Row, Tile, in_degrees
 
@@ -163,7 +163,7 @@ def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> T
         "" if crs is None else crs.to_wkt(),
         _day(first),
         _day(last),
-        points if isinstance(points, int) else None,
+        points if type(points) is int and 0 <= points < 10**15 else None,
     )
 
 
@@ -313,14 +313,15 @@ def _outline(geometry: Any, crs: CRS | None) -> tuple[Floats, ...]:
 
 
 def _boxed(box: list[Any], crs: CRS | None) -> tuple[Floats, ...]:
-    """The ring of a box, of two or three dimensions."""
+    """The ring of a box, of two or three dimensions; two of one across the antimeridian."""
     try:
         values = np.array(box, np.float64)
     except (TypeError, ValueError):
         return ()
     (west, south), (east, north) = values[:2], values[len(box) // 2 :][:2]
-    ring = np.array([[west, east, east, west], [south, south, north, north]])
-    return in_degrees([ring], crs)
+    sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]
+    rings = [np.array([[w, e, e, w], [south, south, north, north]]) for w, e in sides]
+    return in_degrees(rings, crs)
 
 
 def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
@@ -330,6 +331,10 @@ def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
     unless ``hosts`` has it, ``file:`` and other schemes, http where the catalogue came by https; of
     a catalogue on the disk, any host but those of ``hosts``.
     """
+    if not href.isprintable() or LIDAR_SEPARATOR in href:
+        raise _untrusted(
+            catalogue, "a name that no sheet can have", f"name no file with {LIDAR_SEPARATOR!r}"
+        )
     if not is_remote(catalogue) and not ELSEWHERE.match(href):
         return str(Path(catalogue).parent / href)
     try:

@@ -77,6 +77,7 @@ class Copc(Octree):
             most = max(node.points for node in self.nodes) * layout.record_bytes
             _require(most <= MOST_RAW_BYTES, f"a node has {most} bytes of points")
             self._compare_chunks(layout)
+            self._look_at_first_points()
 
     def _layout(self) -> tuple[Layout, bytes]:
         """What the header says, and the bytes before the first point."""
@@ -168,6 +169,22 @@ class Copc(Octree):
             "its chunk table has other chunks than its hierarchy has nodes",
         )
         _require(first + int(held[:, 1].sum()) == table, "chunks do not end at their table")
+
+    def _look_at_first_points(self) -> None:
+        """The first point of each node, which a chunk begins with, lies in its cube.
+
+        So that a node whose key is another one's is found though it is not read. Of a file on the
+        disk; a server would be asked for each of them.
+        """
+        first = self._ranges.peek([node.start for node in self.nodes], 12)
+        if not first:
+            return
+        stored = np.frombuffer(b"".join(first), "<i4").reshape(-1, 3)
+        xyz = stored * np.asarray(self.header.scales) + np.asarray(self.header.offsets)
+        low, high = self.boxes(self.nodes)
+        outside = ((xyz < low) | (xyz > high)).any(axis=1)
+        if outside.any():
+            raise self._outside(int(outside.sum()), self.nodes[int(np.argmax(outside))])
 
     def _decoded(self, nodes: Sequence[Node]) -> Iterator[ScaleAwarePointRecord]:
         ranges = [(node.start, node.start + node.bytes) for node in nodes]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -27,7 +26,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..errors import InputError
-from ..products.ranges import AT_ONCE, LocalRanges, Ranges, WebRanges
+from ..products.ranges import AT_ONCE, LocalRanges, Ranges, WebRanges, in_turn
 from ..products.remote_files import hosts_of, is_remote, read_bytes, url_of
 from ..products.web_requests import WEB
 from .copc import FIELDS
@@ -201,20 +200,11 @@ class Ept(Octree):
         return header, content
 
     def _decoded(self, nodes: Sequence[Node]) -> Iterator[ScaleAwarePointRecord]:
-        coming: deque = deque()
-        pool = ThreadPoolExecutor(AT_ONCE)
-        try:
-            ahead = iter(nodes)
-            for node in nodes:
-                while len(coming) < AT_ONCE and (other := next(ahead, None)) is not None:
-                    coming.append(pool.submit(self._opened, other))
-                with _decoding(
-                    lambda error, n=node: self._refusal(f"node {_text(n.key)}: {error}")
-                ):
-                    points = self._points(node, *coming.popleft().result())
-                yield points
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        opened = in_turn(nodes, self._opened)
+        for node in nodes:
+            with _decoding(lambda error, n=node: self._refusal(f"node {_text(n.key)}: {error}")):
+                points = self._points(node, *next(opened))
+            yield points
 
     def _points(self, node: Node, header: laspy.LasHeader, content: bytes) -> ScaleAwarePointRecord:
         same = header.point_format.id == self.header.point_format.id

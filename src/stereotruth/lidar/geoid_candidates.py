@@ -7,6 +7,7 @@ that it is made for; a grid is looked at if it is on this machine, and is never 
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -62,6 +63,25 @@ class Candidate:
 
 def candidates_at(lon: float, lat: float) -> list[Candidate]:
     """The geoids of a place (degrees), one grid of each surface, those of least ground first."""
+    found = _every(lon, lat)
+    if len(found) > MOST:  # those of the whole Earth come last, and are worth a look
+        found = [*found[: MOST - 1], found[-2]]
+    return found
+
+
+def grid_of(datum: str, lon: float, lat: float) -> Candidate | None:
+    """The geoid of a place whose heights are called so; None if the register names none."""
+    wanted = _plain(datum)
+    named_so = (one for one in _every(lon, lat) if wanted and wanted in _plain(one.surface))
+    return next(named_so, None)
+
+
+def _plain(surface: str) -> str:
+    """A name of heights without what does not tell them from others."""
+    return re.sub(r"\bheights?\b|\(.*?\)|[\s_-]", "", surface.casefold())
+
+
+def _every(lon: float, lat: float) -> list[Candidate]:
     file = Path(pyproj.datadir.get_data_dir().split(os.pathsep)[0]) / "proj.db"
     try:
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as register:
@@ -77,8 +97,6 @@ def candidates_at(lon: float, lat: float) -> list[Candidate]:
         here = [(grid, place) for grid in grids if (place := _installed(grid)) is not None]
         grid, place = here[0] if here else (grids[0], None)
         found.append(Candidate(surface, grid, place))
-    if len(found) > MOST:  # those of the whole Earth come last, and are worth a look
-        found = [*found[: MOST - 1], found[-2]]
     return found
 
 

@@ -16,7 +16,7 @@ from ..kernels import inner, kernel
 from ..products.remote_files import size_of
 from .gps_times import GpsTimes, has_days
 from .las_layout import check_layout, wrong_count
-from .range_copies import open_stream
+from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -26,7 +26,6 @@ Bytes = NDArray[np.uint8]
 FAR_SHARE, FAR_M = 0.1, 10.0  # of points outside of the header's bounds: see compare_bounds
 _ANEW = "fetch the file again, or have its header written anew if that is what is wrong"
 SAMPLES = 16  # points all over a file that its header's bounds are held against
-SAMPLE_BYTES = 1 << 16  # that are read at once for them
 LAZ_CHUNK = 50_000  # points of a chunk, as all software writes it
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
 
@@ -47,15 +46,17 @@ def _decoding(refusal: Callable[[BaseException], InputError]) -> Iterator[None]:
         raise refusal(error) from error
 
 
-def read_header(file: str | Path) -> laspy.LasHeader:
+def read_header(file: str | Path, layers: bool = True) -> laspy.LasHeader:
     """Header of a LAS or LAZ file whose counts agree with what the file holds.
+
+    ``layers``: see :func:`.las_layout.check_layout`.
 
     Raises InputError: missing, no LAS, empty, truncated (both counts are named).
     """
     file = Path(file)
     if not file.is_file():
         raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
-    check_layout(file)
+    check_layout(file, layers)
     with (
         _decoding(
             lambda error: InputError(
@@ -64,7 +65,7 @@ def read_header(file: str | Path) -> laspy.LasHeader:
                 remedy="check or replace the file",
             )
         ),
-        open_stream(file) as stream,
+        open_stream(file, STREAM_BYTES if layers else GLANCE_BYTES) as stream,
     ):
         header = laspy.LasHeader.read_from(stream, read_evlrs=True)
     by_return = sum(map(int, header.number_of_points_by_return))
@@ -128,7 +129,7 @@ def is_outside_sampled(file: Path, header: laspy.LasHeader) -> bool:
     places = np.linspace(0, header.point_count, SAMPLES, endpoint=False).astype(np.int64)
     with (
         _decoding(lambda e: wrong_count(file, header.point_count, "decoding failed", e)),
-        open_stream(file, SAMPLE_BYTES) as stream,
+        open_stream(file, GLANCE_BYTES) as stream,
         laspy.open(
             stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False
         ) as reader,

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..products.remote_files import size_of
-from .range_copies import open_stream
+from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point data record format
@@ -167,7 +167,9 @@ class _Packing:
         )
 
 
-def _check_chunks(stream: BinaryIO, layout: Layout, packing: _Packing, file: Path) -> None:
+def _check_chunks(
+    stream: BinaryIO, layout: Layout, packing: _Packing, file: Path, layers: bool
+) -> None:
     """Hold the chunk table against the file, and each layered chunk against the table."""
     first = layout.first_point + 8
     stream.seek(layout.first_point)
@@ -203,7 +205,7 @@ def _check_chunks(stream: BinaryIO, layout: Layout, packing: _Packing, file: Pat
     )
     if variable and (held := sum(number for number, _ in chunks)) != points:
         raise wrong_count(file, points, f"its chunks hold {held}")
-    if packing.kind != LAYERED:
+    if packing.kind != LAYERED or not layers:
         return
     head, at = layout.record_bytes + 4 + 4 * packing.layers, first
     for k, (number, size) in enumerate(chunks):
@@ -221,14 +223,16 @@ def _check_chunks(stream: BinaryIO, layout: Layout, packing: _Packing, file: Pat
         at += size
 
 
-def check_layout(file: Path) -> Layout:
+def check_layout(file: Path, layers: bool = True) -> Layout:
     """The places and counts of a file's header, after all of them were found to fit into it.
+
+    ``layers``: look at the head of each chunk, too, and so all over the file.
 
     Raises InputError: no LAS, truncated, damaged, or never completed.
     """
     size = size_of(file)
     try:
-        with open_stream(file) as stream:
+        with open_stream(file, STREAM_BYTES if layers else GLANCE_BYTES) as stream:
             layout = Layout.of(stream, size)
             room = size - layout.first_point
             records = _records(
@@ -246,7 +250,7 @@ def check_layout(file: Path) -> Layout:
                 _require(len(found) == 1, f"it has {len(found)} LASzip records instead of one")
                 stream.seek(found[0][2])
                 packing = _Packing.of(stream.read(found[0][3]), layout.record_bytes)
-                _check_chunks(stream, layout, packing, file)
+                _check_chunks(stream, layout, packing, file, layers)
             elif room // layout.record_bytes < layout.points:
                 held = f"the file holds {room // layout.record_bytes}"
                 raise wrong_count(file, layout.points, held)

@@ -176,10 +176,7 @@ class Octree(ABC):
         low, high = (corner[0, :, None] for corner in self.boxes([node]))
         outside = ((xyz < low) | (xyz > high)).any(axis=0)
         if outside.any():
-            raise self._refusal(
-                f"{in_number(int(outside.sum()), 'point')} of node {_shown(node)} "
-                "outside of its cube: nodes that hold points of the footprint cannot be told"
-            )
+            raise self._outside(int(outside.sum()), node)
         return xyz
 
     def _complete(self) -> None:
@@ -191,6 +188,12 @@ class Octree(ABC):
             )
         if any(node.points > MOST_NODE_POINTS for node in self.nodes):
             raise self._refusal(f"a node has more than {MOST_NODE_POINTS} points")
+
+    def _outside(self, count: int, node: Node) -> InputError:
+        return self._refusal(
+            f"{in_number(count, 'point')}, as of node {_shown(node)}, "
+            "outside of its cube: nodes that hold points of the footprint cannot be told"
+        )
 
     def _refusal(self, problem: str) -> InputError:
         return InputError(f"truncated or damaged: {problem}", file=self.name, remedy=_WHOLE)

@@ -45,16 +45,16 @@ class Part:
 class PointFile:
     """A LAS, LAZ or COPC file whose header agrees with what the file holds.
 
-    ``header``: coordinate system, scales, offsets, count and bounds of the points. Raises
-    InputError if the file is missing or cannot be read.
+    ``header``: coordinate system, scales, offsets, count and bounds of the points. ``layers``: see
+    :func:`.las_layout.check_layout`. Raises InputError if the file is missing or cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, layers: bool = True) -> None:
         self.path = path
-        self.header = self._header()
+        self.header = self._header(layers)
 
-    def _header(self) -> laspy.LasHeader:
-        return las_files.read_header(self.path)
+    def _header(self, layers: bool) -> laspy.LasHeader:
+        return las_files.read_header(self.path, layers)
 
     @property
     def remark(self) -> str | None:
@@ -108,7 +108,7 @@ class PointFile:
 class OctreeFile(PointFile):
     """A COPC file, or EPT, of which nodes are read; see :mod:`.octree_nodes`."""
 
-    def _header(self) -> laspy.LasHeader:
+    def _header(self, layers: bool) -> laspy.LasHeader:
         self.octree = open_octree(self.path)
         return self.octree.header
 
@@ -136,7 +136,7 @@ class OctreeFile(PointFile):
 class RasterFile(PointFile):
     """A surface model as a raster; see :mod:`.raster_points`."""
 
-    def _header(self) -> laspy.LasHeader:
+    def _header(self, layers: bool) -> laspy.LasHeader:
         from .raster_points import raster_header  # GDAL, which few scenes need
 
         return raster_header(self.path)
@@ -173,11 +173,11 @@ class RasterFile(PointFile):
         return False
 
 
-def open_points(path: str | Path, *, by_nodes: bool = False) -> PointFile:
+def open_points(path: str | Path, *, by_nodes: bool = False, layers: bool = True) -> PointFile:
     """The file by its first bytes. Raises InputError if it cannot be read.
 
     ``by_nodes``: a file that is named ``.copc.laz`` is opened as an octree; else as any LAZ, whole.
-    ``ept.json`` always is one.
+    ``ept.json`` always is one. ``layers``: see :func:`.las_layout.check_layout`.
     """
     path = Path(path)
     name = path.name.lower()
@@ -186,4 +186,4 @@ def open_points(path: str | Path, *, by_nodes: bool = False) -> PointFile:
     first = b""
     with suppress(OSError), open_stream(path, FIRST_BYTES) as stream:  # which the reader names
         first = stream.read(4)
-    return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path)
+    return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path, layers)

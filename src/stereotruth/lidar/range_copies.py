@@ -35,6 +35,7 @@ from ..products.web_requests import WEB
 
 FOLDER = Path("results", "copies")
 STREAM_BYTES = 4 << 20  # of a file that is read as a whole, at once
+GLANCE_BYTES = 1 << 16  # of one of which the head is read, or some points
 CHECK_BYTES = 4  # CRC-32 behind a copy
 
 

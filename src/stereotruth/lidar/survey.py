@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..numerics.degrees import DEGREE_M
+from ..products.remote_files import url_of
 from .footprint import Footprint
 from .ingest import _bounds, _refuse_coarse, _to_lattice, touching
 from .point_files import open_points
@@ -55,14 +56,15 @@ def survey(
 ) -> SurveyedFile:
     """A LiDAR file as :func:`.ingest.ingest` will take it, from its header and layout alone.
 
-    Of an octree that is read by a footprint, the hierarchy is read as well.
+    Of an octree that is read by a footprint, the hierarchy is read as well; of files on the disk,
+    the heads of their chunks.
 
     Raises the InputErrors of ingest that need no points: missing, truncated or no LAS; no usable
     coordinate system; orthometric heights without a geoid; bounds off the geoid grid, off the Earth
     or far outside the area of the system; coordinates quantised too coarsely.
     """
     file = Path(file)
-    points = open_points(file, by_nodes=footprint is not None)
+    points = open_points(file, by_nodes=footprint is not None, layers=url_of(file) is None)
     header = points.header
     transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
     _refuse_coarse(points, transform)

@@ -192,6 +192,29 @@ def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: s
         )
 
 
+def _geoid_remedy(system: LidarCRS, header: laspy.LasHeader, datum: str) -> str:
+    """What to do about heights of a datum: the grid of the place that PROJ has of it."""
+    from .geoid_candidates import grid_of  # for refusals alone
+
+    text = "set geoid to a grid (GTX or GeoTIFF) of that datum for this scene"
+    geographic = _source(system.horizontal).geodetic_crs
+    if geographic is None:
+        return text
+    middle = (np.asarray(header.mins[:2]) + np.asarray(header.maxs[:2])) / 2
+    try:
+        degrees = pyproj.Transformer.from_crs(
+            _source(system.horizontal), geographic.to_2d(), always_xy=True
+        )
+    except ProjError:  # of a damaged system
+        return text
+    grid = grid_of(datum, *map(float, degrees.transform(*middle)))
+    if grid is None:
+        return text
+    if grid.path is not None:
+        return f"{text}: {grid.path}"
+    return f"{text}: {grid.grid}, which projsync --file {grid.grid} downloads"
+
+
 def to_wgs84(
     header: laspy.LasHeader,
     file: str | Path,
@@ -210,18 +233,18 @@ def to_wgs84(
     system, notes = resolve(header, lidar_crs or None, file)
     _refuse_degrees_as_metres(system, header, file)
     hint = DATUM_IN_NAME.search(Path(file).stem)
-    remedy = "set geoid to a grid (GTX or GeoTIFF) of that datum for this scene"
     if system.vertical_datum and not geoid:
         raise InputError(
             f"heights are orthometric ('{system.vertical_datum}'), not ellipsoidal",
             file=file,
-            remedy=remedy,
+            remedy=_geoid_remedy(system, header, system.vertical_datum),
         )
     if not system.has_vertical and hint and not geoid:
         raise InputError(
             f"declares no vertical datum, but its name says orthometric heights ({hint[1]})",
             file=file,
-            remedy=f"{remedy}, or name the file otherwise if its heights are ellipsoidal",
+            remedy=f"{_geoid_remedy(system, header, hint[1])}, or name the file otherwise if its "
+            "heights are ellipsoidal",
         )
     if system.ellipsoidal and geoid:
         notes.append("the file declares ellipsoidal heights: the geoid is not applied to it")

@@ -9,13 +9,15 @@ connections and servers that are busy or stall are asked again, in the server's 
 from __future__ import annotations
 
 import io
+import os
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 from ..errors import InputError, without_secrets
 from .web_requests import (
@@ -31,6 +33,7 @@ from .web_requests import (
     web_parts,
 )
 
+Item, Result = TypeVar("Item"), TypeVar("Result")
 Range = tuple[int, int]  # first byte, and the one behind the last
 
 GAP_BYTES = 1 << 12  # between two ranges that one request serves
@@ -73,24 +76,33 @@ class Ranges(ABC):
     @abstractmethod
     def _get(self, start: int, end: int) -> bytes: ...
 
+    def peek(self, starts: Sequence[int], length: int) -> list[bytes]:
+        """So many bytes at each of many places, where that costs no request; else none."""
+        return []
+
     def parts(self, ranges: Sequence[Range]) -> Iterator[bytes]:
         """Each of the ranges, in the given order.
 
         Neighbours are read together. At most :data:`AT_ONCE` requests run or wait to be taken.
         """
         groups = merged(ranges)
-        coming: deque = deque()
-        pool = ThreadPoolExecutor(AT_ONCE)
-        try:
-            ahead = iter(groups)
-            for group in groups:
-                while len(coming) < AT_ONCE and (other := next(ahead, None)) is not None:
-                    coming.append(pool.submit(self.get, other[0][0], max(e for _, e in other)))
-                content = coming.popleft().result()
-                for start, end in group:
-                    yield content[start - group[0][0] : end - group[0][0]]
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        contents = in_turn(groups, lambda group: self.get(group[0][0], max(e for _, e in group)))
+        for group, content in zip(groups, contents):
+            for start, end in group:
+                yield content[start - group[0][0] : end - group[0][0]]
+
+
+def in_turn(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
+    """``work(item)`` of each item, in their order; :data:`AT_ONCE` run or wait to be taken."""
+    coming: deque[Future[Result]] = deque()
+    pool = ThreadPoolExecutor(AT_ONCE)
+    try:
+        ahead = iter(items)
+        for _ in items:
+            coming.extend(pool.submit(work, item) for item in islice(ahead, AT_ONCE - len(coming)))
+            yield coming.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def merged(ranges: Sequence[Range]) -> list[list[Range]]:
@@ -109,24 +121,38 @@ def merged(ranges: Sequence[Range]) -> list[list[Range]]:
 
 
 class LocalRanges(Ranges):
-    """A file on the disk."""
+    """A file on the disk, which has to stay the same."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise InputError(
                 "no such LiDAR file", file=path, remedy="correct the path in scenes.tsv"
             )
-        self.name, self.size, self._path = str(path), path.stat().st_size, path
+        state = path.stat()
+        self.name, self.size, self._path = str(path), state.st_size, path
+        self._state = _identity(state)
 
     def _get(self, start: int, end: int) -> bytes:
         with self._path.open("rb") as stream:
             stream.seek(start)
             content = stream.read(end - start)
-        if len(content) < end - start:
+            same = _identity(os.fstat(stream.fileno())) == self._state
+        if not same or len(content) < end - start:
             raise InputError(
-                "became shorter while it was read", file=self._path, remedy="run again"
+                "changed while it was read",
+                file=self._path,
+                remedy="run again, and leave it alone until the run has ended",
             )
         return content
+
+    def peek(self, starts: Sequence[int], length: int) -> list[bytes]:
+        """So many bytes at each of many places; fewer at the end of the file."""
+        with self._path.open("rb") as stream:
+            return [os.pread(stream.fileno(), length, start) for start in starts]
+
+
+def _identity(state: os.stat_result) -> tuple[int, int, int]:
+    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 class WebRanges(Ranges):

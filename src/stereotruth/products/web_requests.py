@@ -10,6 +10,7 @@ Source: RFC 9110, sections 8.6, 10.2.3, 14.4 and 15.4.
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import socket
@@ -27,6 +28,7 @@ import urllib3
 
 from ..errors import InputError, without_secrets
 
+logging.getLogger("urllib3").setLevel(logging.CRITICAL)  # its lines have URLs with signatures
 WEB = ("http", "https")
 PORTS = {"http": 80, "https": 443}
 HOST = re.compile(r"[A-Za-z0-9._:-]+")

@@ -21,6 +21,7 @@ from stereotruth.command.check import check_project
 from stereotruth.command.list_tiles import list_of_scenes
 from stereotruth.errors import InputError
 from stereotruth.lidar.catalogue_list import read_list
+from stereotruth.lidar.ingest import ingest
 from stereotruth.products import web_requests
 from stereotruth.products.remote_files import open_file, url_of
 from stereotruth.project import configured, lidar_of, read_scenes
@@ -207,12 +208,12 @@ def serving(name: str = "127.0.0.1") -> Iterator[Site]:
             answer = site.answers.get(self.path, (404, {}, b""))
             status, headers, body = answer if isinstance(answer, tuple) else (200, {}, answer)
             span = self.headers.get("Range")
+            tag = f'"{hashlib.sha256(body).hexdigest()[:8]}"'
             if span and status == 200:
                 first, last = map(int, span.removeprefix("bytes=").split("-"))
                 last = min(last, len(body) - 1)
                 headers = {"Content-Range": f"bytes {first}-{last}/{len(body)}"} | headers
                 status, body = 206, body[first : last + 1]
-            tag = f'"{hashlib.sha256(body).hexdigest()[:8]}"' if not span else '"part"'
             self.send_response(status)
             for key, value in ({"Content-Length": str(len(body)), "ETag": tag} | headers).items():
                 self.send_header(key, value)
@@ -385,3 +386,38 @@ def test_a_server_that_stalls_is_left(folder, monkeypatch):
         site.answers["/a.json"] = (200, {"Content-Length": "900"}, b"{")
         with pytest.raises(InputError, match=r"nobody answers|came of"):
             listed(f"{site.url}/a.json")
+
+
+def test_no_file_and_no_line_has_a_signature(folder, caplog, capsys):
+    """Of a catalogue's URL, or of what servers redirect to: lists, stand-ins, stores, messages."""
+    caplog.set_level("DEBUG")
+    with serving() as site, serving("localhost") as other:
+        url = with_catalogue(site, folder)
+        signed = f"{url}?X-Amz-Signature=verysecret"
+        site.answers["/lidar/tiles.json?X-Amz-Signature=verysecret"] = site.answers.pop(
+            "/lidar/tiles.json"
+        )
+        for path in [path for path in site.answers if path.endswith(".laz")]:
+            to = {"Location": f"{other.url}{path}?signature=verysecret"}
+            other.answers[f"{path}?signature=verysecret"] = site.answers[path]
+            site.answers[path] = (307, to, b"")
+        lines = list_of_scenes(signed, "a.tsv", [], hosts=["localhost"])
+        write_sheet(folder, lidar="a.tsv")
+        found = check_project(names=["Good-1"])
+        settings = configured()[0]
+        _, scenes = read_scenes(settings)
+        for name, file in lidar_of(scenes["Good-1"], settings).items():
+            ingest(file, Path("results", f"{name}.points"), provenance={"lidar": str(file)})
+        for path in other.answers:
+            other.answers[path] = (403, {}, b"")
+        for copy in Path("results/copies").glob("*/*"):
+            copy.unlink()
+        with pytest.raises(InputError, match="no permission") as refused:
+            ingest(file, Path("results", "refused.points"))
+    assert any("verysecret" in asked for asked in other.asked + site.asked)
+    texts = [*lines, *(f.text + f.remedy for one in found for f in one), str(refused.value)]
+    texts += [caplog.text, *capsys.readouterr()]
+    written = [file for file in folder.rglob("*") if file.is_file()]
+    assert any(file.name == "store.json" for file in written)
+    assert not any("verysecret" in text for text in texts)
+    assert not any(b"verysecret" in file.read_bytes() for file in written)

@@ -107,6 +107,30 @@ def test_the_tiles_own_coordinates_come_before_degrees(tmp_path):
     assert pyproj.CRS(tile.crs).to_epsg() == 2154
 
 
+@pytest.mark.parametrize("count", [True, -5, 1.5, "9", None, 10**30])
+def test_a_count_of_points_that_is_none_is_not_known(tmp_path, count):
+    one = item(0, **{"pc:count": count})
+    assert read_catalogue(written(tmp_path, collection([one]))).tiles[0].points is None
+
+
+@pytest.mark.parametrize("href", ["a\nb.laz", "a\x1b[31m.laz", "a;b.laz", "https://x/a\u2028.laz"])
+def test_names_that_no_sheet_can_have_are_refused(href):
+    for catalogue in ("lidar/tiles.vpc", WEB):
+        with pytest.raises(InputError, match="no sheet can have") as refused:
+            resolved(href, catalogue, frozenset({"x"}))
+        assert href not in str(refused.value)
+
+
+def test_a_box_across_the_antimeridian_covers_nothing_but_itself(tmp_path):
+    """Its west is east of its east (RFC 7946, section 5.2)."""
+    one = item(0) | {"geometry": None, "bbox": [179.99, -17.0, -179.99, -16.9]}
+    tile = read_catalogue(written(tmp_path, collection([one]))).tiles[0]
+    assert len(tile.rings) == 2
+    far, near = around(5.0, -16.96, 5.01, -16.95), around(179.992, -16.96, 179.993, -16.95)
+    assert cover_of([tile], far).hole_m2 == pytest.approx(far.area_m2)
+    assert cover_of([tile], near).taken == (0,) and cover_of([tile], near).hole_m2 == 0
+
+
 def test_an_index_tells_its_column_of_locations(tmp_path):
     tiles = read_catalogue(written(tmp_path, index())).tiles
     assert [tile.href for tile in tiles] == [f"tiles/t{k}.laz" for k in range(3)]

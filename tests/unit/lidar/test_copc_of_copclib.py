@@ -13,9 +13,8 @@ from stereotruth.lidar.octree import open_octree
 from stereotruth.lidar.point_store import PointStore
 
 from ...synthetic.copc_of_copclib import page_count, write_copc
-from ...synthetic.copc_server import serving
-from .test_footprint import content_of, part_of
-from .test_octree import points_of
+from ...synthetic.copc_server import points_of, serving
+from ...synthetic.stores import content_of, part_of
 
 pytest.importorskip("copclib")
 LOW = np.array([500_000.0, 3_300_000.0, 30.0])

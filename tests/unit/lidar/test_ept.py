@@ -14,16 +14,19 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from scipy.spatial import cKDTree
 
 from stereotruth.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs, interpret
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
 
 from ...synthetic.copc_server import CORNER, UTM
-from ...synthetic.ept import FAULTS, _about, make_ept
+from ...synthetic.ept import FAULTS, _about, make_ept, write
+from ...synthetic.las import everything, write_gtx
 
 
 @pytest.fixture(scope="module")
@@ -199,3 +202,42 @@ def test_bytes_are_estimated_before_they_are_read(dataset, tmp_path):
     assert every / 4 < surveyed.bytes < 2 * every  # small nodes have large headers
     summary = ingest(dataset, tmp_path / "a.points", footprint=ground())
     assert summary["bytes"] == [surveyed.read[1], surveyed.bytes]
+
+
+@pytest.mark.parametrize("vertical", ["", "5773"])
+def test_heights_over_a_web_map_are_those_of_the_ground(whole, tmp_path, vertical):
+    """Places of EPSG:3857 are stretched by 1 / cos(latitude), heights in metres are not."""
+    las = laspy.read(whole.with_name("all.las"))
+    change = pyproj.Transformer.from_crs(UTM.to_2d(), 3857, always_xy=True)
+    xyz = np.stack([*change.transform(np.array(las.x), np.array(las.y)), np.array(las.z)], axis=1)
+    folder = tmp_path / "web"
+    (folder / "ept-data").mkdir(parents=True)
+    (folder / "ept-hierarchy").mkdir()
+    write(folder / "ept-data" / "0-0-0-0.laz", xyz, las.classification)
+    (folder / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps({"0-0-0-0": len(xyz)}))
+    low = xyz.min(axis=0) - 1
+    (folder / "ept.json").write_text(whole.read_text())
+    _about(
+        folder,
+        bounds=[*low.tolist(), *(low + 4000.0).tolist()],
+        boundsConforming=[*xyz.min(axis=0).tolist(), *xyz.max(axis=0).tolist()],
+        srs={"authority": "EPSG", "horizontal": "3857", "vertical": vertical},
+    )
+    geoid = None
+    if vertical:
+        with pytest.raises(InputError, match="heights are orthometric"):
+            ingest(folder / "ept.json", tmp_path / "web.points")
+        geoid = write_gtx(tmp_path / "g.gtx", np.full((3, 3), 12.5), 116.0, 29.0, 1.0)
+    ingest(folder / "ept.json", tmp_path / "web.points", geoid=geoid)
+    ingest(whole, tmp_path / "utm.points")
+    places = []
+    for name in ("web", "utm"):
+        points = everything(PointStore(tmp_path / f"{name}.points"))
+        at = np.stack([points.lon, points.lat, points.height])
+        places.append(at)
+    got, truth = places
+    assert got.shape == truth.shape
+    far = cKDTree(got[:2].T).query(truth[:2].T)
+    assert far[0].max() < 1.5e-7  # degrees: of coordinates in steps of 1 cm
+    off = got[2][far[1]] - truth[2] - (12.5 if vertical else 0.0)
+    assert np.abs(off).max() < 0.006

@@ -18,7 +18,7 @@ from stereotruth.numerics.degrees import metres_per_degree
 
 from ...synthetic.copc_server import CORNER, make_copc
 from ...synthetic.las import SOUTH, UTM, WEST, write_las
-from ...synthetic.stores import tree_digest
+from ...synthetic.stores import content_of, part_of, tree_digest
 from ...synthetic.surface_rasters import write_raster
 
 LON, LAT = 117.0, 29.83  # of WEST, SOUTH
@@ -28,22 +28,6 @@ def square(lon: float, lat: float, side_m: float) -> np.ndarray:
     """The outline [2, 4] of a square around a place."""
     half = side_m / 2 / metres_per_degree(lat)
     return np.array([[lon], [lat]]) + half[:, None] * [[-1, 1, 1, -1], [-1, -1, 1, 1]]
-
-
-def part_of(whole: PointStore, footprint: Footprint) -> tuple[bytes, bytes]:
-    """Points and cells of a whole file's store that lie in a footprint."""
-    at = np.stack([whole.cell_row - footprint.row, whole.cell_col - footprint.col])
-    good = ((at >= 0) & (at < np.array([footprint.held.shape]).T)).all(axis=0)
-    good[good] = footprint.held[tuple(at[:, good])]
-    points, cells = (np.load(whole.path / f"{name}.npy") for name in ("points", "cells"))
-    kept = np.repeat(good, whole.cell_counts)
-    cells = cells[good]
-    cells["first"] = np.cumsum(whole.cell_counts[good]) - whole.cell_counts[good]
-    return points[kept].tobytes(), cells.tobytes()
-
-
-def content_of(store: PointStore) -> tuple[bytes, bytes]:
-    return tuple(np.load(store.path / f"{name}.npy").tobytes() for name in ("points", "cells"))
 
 
 def ingested(file: Path, footprint: Footprint | None, **how) -> PointStore:

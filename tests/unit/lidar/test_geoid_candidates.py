@@ -7,7 +7,7 @@ import sqlite3
 import pytest
 
 from stereotruth.lidar import geoid_candidates
-from stereotruth.lidar.geoid_candidates import candidates_at, fits, named
+from stereotruth.lidar.geoid_candidates import candidates_at, fits, grid_of, named
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,19 @@ def test_a_register_that_cannot_be_read_gives_no_names(monkeypatch):
 
     monkeypatch.setattr(geoid_candidates.sqlite3, "connect", damaged)
     assert candidates_at(5.4, 43.3) == [] and fits(1.0, 5.4, 43.3) == ""
+
+
+@pytest.mark.parametrize(
+    ("datum", "place", "grid"),
+    [
+        ("NAVD88 height (ftUS)", (-122.6, 45.5), "us_noaa_g2018u0.tif"),
+        ("IGN69", (5.4, 43.3), "fr_ign_RAF20.tif"),
+        ("NN2000 height", (10.0, 60.0), "no_kv_HREF2018B_NN2000_EUREF89.tif"),
+        ("NAVD88 height", (5.4, 43.3), None),  # of another continent
+        ("height", (5.4, 43.3), None),
+        ("EGM96 height", (float("inf"), float("nan")), None),
+    ],
+)
+def test_the_grid_of_a_datum_that_is_declared(datum, place, grid):
+    found = grid_of(datum, *place)
+    assert (None if found is None else found.grid) == grid

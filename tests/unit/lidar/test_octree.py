@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import time
 import zlib
@@ -21,6 +22,7 @@ from tests.synthetic.copc_server import (
     SERVER_FAULTS,
     damaged,
     make_copc,
+    points_of,
     serving,
 )
 from tests.synthetic.real_data import SHARED
@@ -49,12 +51,6 @@ GROUND = Ground(CORNER[:2] + np.array([610, 640]), CORNER[:2] + np.array([1180, 
 @pytest.fixture(scope="module")
 def made():
     return make_copc()
-
-
-def points_of(records) -> np.ndarray:
-    """What ingest takes of the points, in their order."""
-    names = ["X", "Y", "Z", "classification", "return_number", "number_of_returns", "gps_time"]
-    return np.array([np.concatenate([np.asarray(r[n]) for r in records]) for n in names])
 
 
 def cropped(content: bytes, ground: Ground) -> np.ndarray:
@@ -162,6 +158,23 @@ def test_files_of_other_software_are_read_whole(name):
     assert np.array_equal(read(str(file), ground), truth)
 
 
+@pytest.mark.parametrize("how", ["replaced", "written over", "cut"])
+def test_a_file_on_the_disk_that_changes_while_it_is_read_is_refused(made, tmp_path, how):
+    file = tmp_path / "tile.copc.laz"
+    file.write_bytes(made.content)
+    octree = open_octree(file)
+    records = octree.read(octree.plan(GROUND.touches))
+    if how == "replaced":
+        (tmp_path / "other").write_bytes(made.content)
+        (tmp_path / "other").replace(file)
+    else:
+        content = made.content if how == "written over" else made.content[:-100]
+        file.write_bytes(content)
+    os.utime(file, ns=(1, 1))
+    with pytest.raises(InputError, match="changed while it was read"):
+        list(records)
+
+
 def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path):
     """A hierarchy with two nodes of one line of descent exchanged: refused, or nothing is lost."""
     file, nodes = tmp_path / "tile.copc.laz", made.entries
@@ -195,6 +208,24 @@ def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path)
             assert "outside of its cube" in str(error)
             refused += 1
     assert refused > 10
+
+
+def test_a_node_that_stands_elsewhere_in_the_hierarchy_is_found_though_it_is_not_read(
+    made, tmp_path
+):
+    """On the disk: a leaf of the ground has the key of a place where no node is."""
+    file, keys = tmp_path / "tile.copc.laz", {entry[:4] for entry in made.entries}
+    leaves = [e for e in made.entries if e[0] == 4 and GROUND.touches(*boxes_of(e[:4])).all()]
+    free = [(4, x, y, z) for x in range(16) for y in range(16) for z in (7, 8)]
+    free = [key for key in free if key not in keys and not GROUND.touches(*boxes_of(key)).any()]
+    assert len(leaves) > 5 and len(free) > 100
+    for leaf, key in zip(leaves, free):
+        content = bytearray(made.content)
+        at = content.index(ENTRY.pack(*leaf), made.hierarchy_at)
+        ENTRY.pack_into(content, at, *key, *leaf[4:])
+        file.write_bytes(content)
+        with pytest.raises(InputError, match="outside of its cube"):
+            read(str(file), GROUND)
 
 
 def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

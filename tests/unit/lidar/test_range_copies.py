@@ -17,8 +17,9 @@ from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.range_copies import FOLDER, open_ranges, open_stream, prune
+from stereotruth.lidar.survey import survey
 
-from ...synthetic.copc_server import make_copc, serving
+from ...synthetic.copc_server import CORNER, UTM, make_copc, serving
 from ...synthetic.stores import tree_digest
 
 LON, LAT = 117.006, 29.836
@@ -126,3 +127,24 @@ def test_a_laz_of_a_server_is_read_by_blocks_that_are_kept(made, monkeypatch):
                 assert reader.header.point_count == 40_000
         blocks = -(-len(made.content) // (1 << 15))
         assert len(server.requests) <= blocks + 1  # and the first look at the file
+
+
+def test_a_laz_of_a_server_is_surveyed_by_few_of_its_bytes(tmp_path):
+    """Of which its header, its chunk table and some points are read, not each chunk's head."""
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [0.01] * 3
+    header.add_crs(UTM)
+    las = laspy.LasData(header)
+    las.x, las.y = CORNER[:2, None] + np.random.default_rng(0).uniform(0, 900, (2, 400_000))
+    las.z = np.full(400_000, 40.0)
+    las.return_number = las.number_of_returns = np.ones(400_000, np.uint8)
+    las.write("whole.laz")
+    content = Path("whole.laz").read_bytes()
+    with serving(content) as server:
+        server.url = server.url.replace(".copc.laz", ".laz")
+        place = stand_in(server.url, len(content))
+        assert survey(place).points == 400_000
+        assert server.sent < 0.2 * len(content)
+        assert survey(place).box == survey("whole.laz").box
+        beside = Footprint.around([np.array([[118, 118.01, 118], [30, 30, 30.01]])], 50.0)
+        assert survey(place, footprint=beside).read == (0, 0)
