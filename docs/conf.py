@@ -17,6 +17,7 @@ from stereotruth.command.main import app as command
 LOG = logging.getLogger(__name__)
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
+COMMANDS = ROOT / "src" / "stereotruth" / "command"
 
 project = "stereotruth"
 author = "The stereotruth developers"
@@ -91,7 +92,11 @@ def complete(app: Sphinx, page: str, source: list[str]) -> None:
 
     text = with_links(source[0], here, page)
     text = INCLUDED.sub(include, text)
-    source[0] = text.replace("<!-- command line -->", command_line())
+    if "<!-- command line -->" in text:
+        for code in (Path(__file__), *COMMANDS.glob("*.py")):  # the page follows from these
+            app.env.note_dependency(str(code))
+        text = text.replace("<!-- command line -->", command_line())
+    source[0] = text
 
 
 EXAMPLES = re.compile(r"^\[bold\]Examples\[/bold\]\n((?:\n\[cyan\].*\[/cyan\]\n)+)", re.MULTILINE)

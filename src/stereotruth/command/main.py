@@ -42,14 +42,12 @@ app.add_typer(gcps_app, name="gcps")
 Text = Annotated[str, typer.Option()]
 Configured = Annotated[
     list[Path] | None,
-    typer.Option("--configfile", help="Instead of config.yaml; may be given more than once."),
+    typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),
 ]
 
 AllowedHosts = Annotated[
     list[str] | None,
-    typer.Option(
-        help="Host, beside the catalogue's own, that it may name tiles of; may be given again."
-    ),
+    typer.Option(help="Another host of which the catalogue may name tiles; may be given again."),
 ]
 
 
@@ -62,7 +60,10 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _callback(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Version, and end.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
     del version
@@ -78,13 +79,12 @@ def _callback(
 def init(
     folder: Annotated[
         Path | None,
-        typer.Argument(help="Folder to be made, or an empty one; else the example's name."),
+        typer.Argument(help="A new or an empty folder; default: the example's name."),
     ] = None,
     example: Annotated[
         str,
         typer.Option(
-            help="With a small synthetic city to try, made here: demo (a pair) or site (a stack of "
-            "images)."
+            help="Simulate a small city in it, to try: demo (a pair) or site (a stack of images)."
         ),
     ] = "",
 ) -> None:
@@ -114,11 +114,11 @@ def scene_add(
             help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights; or a catalogue."
         ),
     ],
-    gcps: Annotated[str, typer.Option(help="CSV of ground control points, if there are any.")] = "",
-    city: Annotated[str, typer.Option(help="City, made if new; else the delivery's name.")] = "",
-    scene: Annotated[str, typer.Option("--name", help="Of the scene; else City-1, City-2 …")] = "",
-    lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
-    geoid: Annotated[str, typer.Option(help="Geoid grid, for orthometric heights.")] = "",
+    gcps: Annotated[str, typer.Option(help="CSV of ground control points, if any.")] = "",
+    city: Annotated[str, typer.Option(help="City; default: the delivery's name.")] = "",
+    scene: Annotated[str, typer.Option("--name", help="Name of the scene; default: City-1 …")] = "",
+    lidar_crs: Annotated[str, typer.Option(help="CRS of LiDAR files without one.")] = "",
+    geoid: Annotated[str, typer.Option(help="Geoid grid of orthometric heights.")] = "",
     allow_host: AllowedHosts = None,
     configfile: Configured = None,
 ) -> None:
@@ -177,7 +177,7 @@ def gcps_import(
         Path | None,
         typer.Option(help="For .points: CSV (id or lon,lat; height) or a raster of heights."),
     ] = None,
-    crs: Annotated[str, typer.Option(help="Of the ground coordinates, if the file has none.")] = "",
+    crs: Annotated[str, typer.Option(help="CRS of a file that declares none.")] = "",
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
     ] = None,
@@ -205,13 +205,13 @@ def lidar_tiles(
         str, typer.Argument(help="VPC, STAC items, or a tile index (GeoJSON, GeoPackage); or URL.")
     ],
     scenes: Annotated[
-        list[str] | None, typer.Argument(help="Scenes or cities whose ground is asked for; all.")
+        list[str] | None, typer.Argument(help="Scenes or cities that need tiles; default: all.")
     ] = None,
-    to: Annotated[str, typer.Option(help="The list to be written, which rows may name.")] = "",
+    to: Annotated[str, typer.Option(help="List to write, for the column lidar.")] = "",
     allow_host: AllowedHosts = None,
-    column: Annotated[str, typer.Option(help="Of a tile index: the tiles' locations.")] = "",
+    column: Annotated[str, typer.Option(help="Of a tile index, with locations.")] = "",
     dates: Annotated[
-        tuple[str, str], typer.Option(help="Of a tile index: first and last day of acquisition.")
+        tuple[str, str], typer.Option(help="Columns of a tile index: first and last day.")
     ] = ("", ""),
     configfile: Configured = None,
 ) -> None:
@@ -241,7 +241,7 @@ def check(
     ] = None,
     configfile: Configured = None,
 ) -> None:
-    """Say in seconds what a run would fail of, what to expect, and what it will take."""
+    """Say in seconds what would make a run fail, how many tiles come, and the time it takes."""
     from .check import check_project
     from .check_table import show
 
@@ -258,24 +258,24 @@ def check(
 )
 def pairs(
     city: Annotated[str, typer.Argument(help="City of the images sheet.")],
-    most: Annotated[int | None, typer.Option(min=1, help="Write so many pairs.")] = None,
+    most: Annotated[int | None, typer.Option(min=1, help="Write the best so many.")] = None,
     convergence: Annotated[
-        tuple[float, float], typer.Option(help="Write pairs of so many degrees.")
+        tuple[float, float], typer.Option(help="Write pairs from … to degrees of convergence.")
     ] = (5.0, 45.0),
     days: Annotated[
-        tuple[float, float] | None, typer.Option(help="Write pairs so many days apart.")
+        tuple[float, float] | None, typer.Option(help="Write pairs from … to days apart.")
     ] = None,
     diachronic: Annotated[
-        bool, typer.Option("--diachronic", help="Write pairs of more than 30 days.")
+        bool, typer.Option("--diachronic", help="Write pairs more than 30 days apart.")
     ] = False,
     each: Annotated[
-        int | None, typer.Option(min=1, help="Each image in so many pairs at most.")
+        int | None, typer.Option(min=1, help="Write at most so many pairs of each image.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Write all pairs.")] = False,
-    lidar: Annotated[str, typer.Option(help="Of the rows; else as in the city's first.")] = "",
-    gcps: Annotated[str, typer.Option(help="Likewise.")] = "",
-    lidar_crs: Annotated[str, typer.Option(help="Likewise.")] = "",
-    geoid: Annotated[str, typer.Option(help="Likewise.")] = "",
+    lidar: Annotated[str, typer.Option(help="Of new rows; default: the city's first.")] = "",
+    gcps: Annotated[str, typer.Option(help="Control points of new rows; likewise.")] = "",
+    lidar_crs: Annotated[str, typer.Option(help="CRS of that LiDAR; likewise.")] = "",
+    geoid: Annotated[str, typer.Option(help="Geoid of that LiDAR; likewise.")] = "",
     configfile: Configured = None,
 ) -> None:
     """List the pairs of a site, best first; with a choice, write it to the scenes sheet."""
@@ -358,7 +358,7 @@ def status(
     cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
     configfile: Configured = None,
 ) -> None:
-    """What is made of each city, and what is out of date and why."""
+    """Say what is made of each city, and what is out of date and why."""
     from .status import show_status
 
     show_status(cities or [], configfile)
@@ -378,7 +378,7 @@ def score_surface_model(
     lidar: Annotated[
         str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
     ] = "",
-    reference: Annotated[Path | None, typer.Option(help="Or a raster of true heights.")] = None,
+    reference: Annotated[Path | None, typer.Option(help="Raster of true heights.")] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid, if the model's heights are orthometric.")
     ] = None,
@@ -412,7 +412,7 @@ def open_pages(
     words: Annotated[
         list[str] | None, typer.Argument(help="Only pages with one of these in their path.")
     ] = None,
-    listed: Annotated[bool, typer.Option("--list", help="Only say where they are.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="Print their paths, open none.")] = False,
 ) -> None:
     """Open the index of all pages (cities, benchmarks, audits), or those that are named."""
     from .pages import pages

@@ -127,7 +127,7 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     if doubted:
         note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
-    return Headline("quality gates", text, note, bool(bad or scenes or doubted))
+    return Headline("limits of quality", text, note, bool(bad or scenes or doubted))
 
 
 def _of_images(

@@ -91,6 +91,6 @@ def test_density_is_that_of_the_scenes():
 
 def test_a_doubt_stands_with_the_gates():
     quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
-    (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "quality gates")
+    (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "limits of quality")
     assert gates.bad
     assert "images and labels disagree in A-1" in gates.note

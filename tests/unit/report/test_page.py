@@ -258,7 +258,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
     assert sections == ["large", "map", "tiles", "disparities", "manifest", "provenance"]
     assert re.findall(r'<li><a href="#([a-z]+)">', text) == sections
     assert "exact truth" not in text.lower()
-    assert "quality gates" not in text.lower()
+    assert "limits of quality" not in text.lower()
 
 
 def test_without_a_manifest_it_says_what_to_do(tmp_path):

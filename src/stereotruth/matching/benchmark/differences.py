@@ -85,7 +85,7 @@ def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: 
         rows.append(row)
         lines.append(
             [
-                f"{row['method']} less {row['less']}",
+                f"{row['method']} minus {row['less']}",
                 with_interval(row, "epe_px", 1, "+.3f"),
                 with_interval(row, "epe_px_better_share", 100, ".0f"),
                 with_interval(row, "d1_share", 100, "+.2f"),

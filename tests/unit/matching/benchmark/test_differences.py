@@ -47,7 +47,7 @@ def test_a_small_gain_on_hard_and_easy_tiles_is_told(folders: list[Path]) -> Non
     assert row["epe_px_better_share"] == pytest.approx(11 / 12, abs=1e-6)
     assert row["d1_share"] == row["d1_share_low"] == row["d1_share_high"] == 0
     assert row["d1_share_better_share"] == 0
-    assert "| B less A | −0.1" in table.markdown() and "| 92 | +0.00 [" in table.markdown()
+    assert "| B minus A | −0.1" in table.markdown() and "| 92 | +0.00 [" in table.markdown()
     assert differences([of("A"), of("B")], folders, seed=1) == table
 
 
@@ -77,5 +77,5 @@ def test_the_interval_covers_a_true_difference() -> None:
 def test_three_methods_make_three_pairs_and_one_none(folders: list[Path]) -> None:
     names = [of(name) for name in "ABC"]
     table = differences(names, [*folders, folders[0]], seed=1)
-    assert [line[0] for line in texts(table.shown[0][1])] == ["B less A", "C less A", "C less B"]
+    assert [line[0] for line in texts(table.shown[0][1])] == ["B minus A", "C minus A", "C minus B"]
     assert "One method alone" in differences(names[:1], folders[:1], seed=1).markdown()
