@@ -300,6 +300,8 @@ def test_tiles_of_a_web_catalogue(href, where):
         "http://data.example.org/a.laz",
         "s3://data/a.laz",
         "ftp://data.example.org/a.laz",
+        "ftp://tiles.example.org/a.laz",  # an allowed host, by another scheme
+        "file://tiles.example.org/etc/a.laz",
         "gopher://x/",
         "data:text/plain,x",
         "https://[::1/a.laz",
