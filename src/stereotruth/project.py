@@ -21,6 +21,7 @@ from .lidar.catalogue_list import (
     files_of_list,
     is_catalogue,
     is_list,
+    read_list,
     remarks_on,
     unlisted_m2,
 )
@@ -289,7 +290,28 @@ def with_stand_ins(scene: sheets.Scene, *, ask: bool) -> sheets.Scene:
                 found[column] = sheets.LIDAR_SEPARATOR.join(files)
         elif is_remote(cell):
             found[column] = str(_place(cell, column, ask=ask))
+    if not scene.lidar_crs and (system := _system_of_lists(scene)):
+        found["lidar_crs"] = system
     return replace(scene, **found)
+
+
+def _system_of_lists(scene: sheets.Scene) -> str:
+    """What catalogues say of the coordinates of all LiDAR that a row names; empty if they do not.
+
+    Raises InputError where they say different things.
+    """
+    parts = _lidar_parts(scene)
+    if not all(map(is_list, parts)):
+        return ""
+    systems = {read_list(part).crs for part in parts}
+    if len(systems) > 1:
+        named = ", ".join(sorted(system or "none" for system in systems))
+        raise InputError(
+            f"lists of tiles in different systems by their catalogues ({named})",
+            file=scene.lidar,
+            remedy="set lidar_crs of the row to what holds for all of them, or make rows of each",
+        )
+    return systems.pop()
 
 
 def _lidar_part(part: str, *, ask: bool) -> list[str]:

@@ -48,8 +48,10 @@ def make_copc(
     xyz = np.round(xyz, 2)
     shares = 4.0 ** np.arange(levels)
     level = rng.choice(levels, points, p=shares / shares.sum())
-    place = np.minimum(xyz / (side / 2.0**level)[:, None], (2.0**level - 1)[:, None]).astype(int)
-    key = np.column_stack([level, place])
+    place = xyz / (side / 2.0**level)[:, None]
+    place = np.minimum(place, (2.0**level - 1)[:, None], out=place).astype(np.int16)
+    key = np.column_stack([level.astype(np.int16), place])
+    del level, place  # of files of many points
     order = np.lexsort(key.T[::-1])
     key, xyz = key[order], xyz[order]
     header = laspy.LasHeader(point_format=6, version="1.4")

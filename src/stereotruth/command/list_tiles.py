@@ -184,6 +184,11 @@ def _system_of(tiles: Sequence[Tile], catalogue: str) -> str:
     return crs.to_wkt() if code is None else f"EPSG:{code}"
 
 
+def _named(crs: str) -> str:
+    """A system as a line has it."""
+    return crs if crs.startswith("EPSG:") else CRS.from_user_input(crs).name
+
+
 def _heights(system: LidarCRS | None) -> str:
     """What heights count from, and their unit."""
     if system is None or not system.has_vertical:
@@ -210,6 +215,9 @@ def _lines(listed: TileList, every: int, places: Sequence[str], cover: Cover) ->
         f"tiles: {listed.tile_bytes / 1e6:.1f} MB{points}{dated}; of COPC and EPT a run reads what "
         "lies on that ground",
     ]
+    if listed.crs:
+        named = _named(listed.crs)
+        lines.append(f"coordinates by the catalogue, where files and lidar_crs say none: {named}")
     if listed.hole_m2 and cover.hole_at:
         at = ", ".join(f"{value:.4f}" for value in cover.hole_at)
         lines.append(f"{listed.hole_text}; most of it about {at}")

@@ -198,7 +198,9 @@ def _asset(assets: Any, number: int, location: str) -> str:
         str(asset["href"])
         for asset in every
         if isinstance(asset, Mapping) and isinstance(asset.get("href"), str)
-        if not NO_DATA_ROLES & set(map(str, asset.get("roles") or ()))
+        if not (
+            isinstance(roles := asset.get("roles"), list) and NO_DATA_ROLES & set(map(str, roles))
+        )
     ]
     for kind in (LIDAR_SUFFIXES, (EPT,), RASTER_SUFFIXES):
         if fitting := [href for href in held if _path(href).endswith(kind)]:
@@ -213,6 +215,11 @@ def _asset(assets: Any, number: int, location: str) -> str:
         if packed
         else "has no file of LAS, LAZ, COPC, EPT or GeoTIFF",
     )
+
+
+def _without_data(roles: Any) -> bool:
+    """Whether the roles of an asset say that it has no points."""
+    return isinstance(roles, list) and bool(NO_DATA_ROLES & set(map(str, roles)))
 
 
 def _path(href: str) -> str:
@@ -307,7 +314,7 @@ def _outline(geometry: Any, crs: CRS | None) -> tuple[Floats, ...]:
     polygons = [parts] if kind == "Polygon" else parts
     try:
         rings = [np.array([xy[:2] for xy in ring], np.float64).T for p in polygons for ring in p]
-    except (TypeError, ValueError, IndexError):
+    except (TypeError, ValueError, IndexError, OverflowError):
         return ()
     return in_degrees(rings, crs)
 
@@ -316,7 +323,7 @@ def _boxed(box: list[Any], crs: CRS | None) -> tuple[Floats, ...]:
     """The ring of a box, of two or three dimensions; two of one across the antimeridian."""
     try:
         values = np.array(box, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return ()
     (west, south), (east, north) = values[:2], values[len(box) // 2 :][:2]
     sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]

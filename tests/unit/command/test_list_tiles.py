@@ -161,6 +161,42 @@ def test_tiles_in_feet_and_metres_are_not_mixed(folder):
         list_of_scenes(catalogue(folder, items), "a.tsv", [])
 
 
+def test_what_a_catalogue_says_of_heights_holds_for_rows_that_name_its_list(folder):
+    """Files that declare a system without heights, orthometric by the catalogue: no guess."""
+    items = items_of(folder)
+    for one in items:
+        file = Path("tiles", one["assets"]["data"]["href"])
+        las = laspy.read(file)
+        las.vlrs = [vlr for vlr in las.vlrs if vlr.record_id not in (2112, 34735)]
+        las.header.add_crs(pyproj.CRS(SYSTEM))
+        las.write(file)
+        one["properties"]["proj:code"] = "EPSG:32650+5773"
+    lines = list_of_scenes(catalogue(folder, items), "a.tsv", [])
+    assert any(line.endswith("say none: EPSG:32650+5773") for line in lines)
+    write_sheet(folder, lidar="a.tsv")
+    texts = [f.text for found in check_project(names=["Good-1"]) for f in found]
+    assert any("heights are orthometric ('EGM96 height')" in text for text in texts)
+    settings = configured()[0]
+    _, scenes = read_scenes(settings)
+    assert scenes["Good-1"].lidar_crs == "EPSG:32650+5773"
+    name, file = next(iter(lidar_of(scenes["Good-1"], settings).items()))
+    with pytest.raises(InputError, match="heights are orthometric"):
+        ingest(file, f"{name}.points", lidar_crs=scenes["Good-1"].lidar_crs)
+    write_sheet(folder, lidar="a.tsv", lidar_crs=SYSTEM)  # the row's own word comes first
+    assert read_scenes(settings)[1]["Good-1"].lidar_crs == SYSTEM
+
+
+def test_lists_of_different_systems_are_not_mixed(folder):
+    items = items_of(folder)
+    list_of_scenes(catalogue(folder, items), "a.tsv", [])
+    for one in items:
+        one["properties"]["proj:code"] = "EPSG:32650+5773"
+    list_of_scenes(catalogue(folder, items), "b.tsv", [])
+    write_sheet(folder, lidar="a.tsv;b.tsv")
+    with pytest.raises(InputError, match=r"different systems .*EPSG:32650, EPSG:32650\+5773"):
+        read_scenes(configured()[0])
+
+
 def test_a_list_of_another_ground_is_told_by_check(folder):
     list_of_scenes(catalogue(folder, items_of(folder)), "a.tsv", [])
     write_sheet(folder, lidar="a.tsv")

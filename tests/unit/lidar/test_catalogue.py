@@ -107,6 +107,14 @@ def test_the_tiles_own_coordinates_come_before_degrees(tmp_path):
     assert pyproj.CRS(tile.crs).to_epsg() == 2154
 
 
+@pytest.mark.parametrize("roles", [True, 7, 1.5, "overview", {"overview": 1}, None])
+def test_roles_that_are_none_hide_no_tile(tmp_path, roles):
+    one = item(0)
+    del one["assets"]["overview"]
+    one["assets"]["data"]["roles"] = roles
+    assert len(read_catalogue(written(tmp_path, collection([one]))).tiles) == 1
+
+
 @pytest.mark.parametrize("count", [True, -5, 1.5, "9", None, 10**30])
 def test_a_count_of_points_that_is_none_is_not_known(tmp_path, count):
     one = item(0, **{"pc:count": count})
@@ -223,6 +231,14 @@ DAMAGED = {
     "properties of another kind": json.dumps(
         collection([item(0) | {"properties": 3, "assets": {"d": {"href": "a.zip"}}}])
     ).encode(),
+    "beyond all numbers": json.dumps(
+        collection(
+            [item(0) | {"geometry": {"type": "Polygon", "coordinates": [[[10**400, 1]] * 4]}}]
+        )
+    ).encode(),
+    "a box beyond all numbers": json.dumps(
+        collection([item(0) | {"geometry": None, "bbox": [10**400, 1, 2, 3]}])
+    ).encode(),
     "two files": json.dumps(
         collection([item(0) | {"assets": {"a": {"href": "a.laz"}, "b": {"href": "b.laz"}}}])
     ).encode(),
@@ -300,6 +316,8 @@ def test_tiles_of_a_web_catalogue(href, where):
         "http://data.example.org/a.laz",
         "s3://data/a.laz",
         "ftp://data.example.org/a.laz",
+        "ftp://tiles.example.org/a.laz",  # an allowed host, by another scheme
+        "file://tiles.example.org/etc/a.laz",
         "gopher://x/",
         "data:text/plain,x",
         "https://[::1/a.laz",

@@ -211,6 +211,7 @@ def test_what_no_server_should_answer_is_refused(kind):
         ("https://host/a", "http://host/b", False),
         ("https://host/a", "https://other/b", True),  # which is allowed
         ("https://host/a", "https://other:8443/b", True),
+        ("https://host/a", "http://other/b", False),
         ("https://host/a", "https://third/b", False),
         ("https://host/a", "//third/b", False),
         ("https://host/a", "https://host@third/b", False),
