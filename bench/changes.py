@@ -55,7 +55,7 @@ COLOURS = {  # apart for all eyes
     "unchanged": "#e9ecef", "built": "#d95f02", "demolished": "#7570b3",
     "grown_or_felled": "#1b9e77", "moved": "#e7298a", "water": "#0259cb", "ground": "#e6ab02",
     "unknown": "#222222", "label": "#e9ecef", "changed": "#c1121f",
-    "no label for another reason": "#adb5bd",
+    "no label else": "#adb5bd",
 }  # fmt: skip
 TOWN = {"slabs": 1.0, "lowrise": 2.0, "village": 1.5, "park": 1.0, "fields": 1.0}
 SHARES = {
@@ -291,8 +291,9 @@ def draw(case: Case, given: argparse.Namespace) -> None:
     heights = changes["height_lidar"][block]
     status = layers["status"][block]
     meaning = np.select([is_labelled(status), status == Status.CHANGED], [0, 1], 2)
-    figure = Figure(figsize=(11.0, 8.2), layout="constrained")
+    figure = Figure(figsize=(11.4, 8.6))
     axes = figure.subplots(2, 3)
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.96, bottom=0.1, wspace=0.04, hspace=0.1)
     low = float(np.nanmin(heights))
     for axis, picture, title in (
         (axes[0, 0], stretch(left[block]), "left image"),
@@ -301,12 +302,15 @@ def draw(case: Case, given: argparse.Namespace) -> None:
         axis.imshow(picture, cmap="gray")
         axis.set_title(title)
     shades = axes[0, 2].imshow(heights - low, cmap="viridis")
-    figure.colorbar(shades, ax=axes[0, 2], label="m above the lowest", shrink=0.7)
-    axes[0, 2].set_title("what the LiDAR has there, three years before")
+    scale = axes[0, 2].inset_axes((0.05, 0.06, 0.4, 0.03))
+    figure.colorbar(shades, cax=scale, orientation="horizontal")
+    scale.tick_params(colors="white", labelsize=7)
+    scale.set_title("m above the lowest", color="white", fontsize=8)
+    axes[0, 2].set_title("LiDAR, three years before")
     names = "unchanged", *REASONS.split()[1:7], "unknown"
     change = layers["change"][block]
-    flags(axes[1, 0], true[block], names, "true reason of changes of more than 1 m")
-    flags(axes[1, 1], meaning, ("label", "changed", "no label for another reason"), "status")
+    flags(axes[1, 0], true[block], names, "true reasons (more than 1 m)")
+    flags(axes[1, 1], meaning, ("label", "changed", "no label else"), "status")
     flags(axes[1, 2], change, names, "layer change")
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
@@ -318,8 +322,8 @@ def flags(axis: Axes, codes: NDArray, names: tuple[str, ...], title: str) -> Non
     axis.imshow(np.array([to_rgb(COLOURS[n]) for n in names])[codes], interpolation="nearest")
     present = [names[k] for k in np.unique(codes)]
     patches = [Patch(color=COLOURS[n], label=n.replace("_", " ")) for n in present]
-    axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3,
-                fontsize=8, frameon=False)  # fmt: skip
+    axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3,
+                fontsize=9, frameon=False)  # fmt: skip
     axis.set_title(title)
 
 

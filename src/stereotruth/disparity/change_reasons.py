@@ -18,6 +18,7 @@ no block changes it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +87,7 @@ class ChangedSurface:
     is_rough: Bools
     own: Pixels
 
+    @cached_property
     def classes(self) -> Bytes:
         """The surface's class [h, w]; without one, by its roughness and height over the lowest
         point around."""
@@ -113,7 +115,7 @@ def evidence_of(surface: ChangedSurface, rise: Floats, vehicle_share: float) -> 
     share = box_count(changed, AROUND_PX) / (2 * AROUND_PX + 1) ** 2
     return Evidence(
         changed=changed,
-        surface_class=surface.classes(),
+        surface_class=surface.classes,
         rise=np.where(changed, rise, np.nan),
         is_low=surface.height - ground <= VEHICLE_M,
         is_small=share <= vehicle_share,
@@ -182,13 +184,14 @@ def with_reasons(
     changed = labels.status == Status.CHANGED
     if not changed.any():
         return labels
+    surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
+    by_class = np.isin(surface.classes, (*VEGETATION_CLASSES, WATER_CLASS))
     shifted = shifted_agreement(
-        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, changed,
-        WIDE_SHIFTS_PX,
+        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX,
+        changed & ~by_class, WIDE_SHIFTS_PX,
     )  # fmt: skip
     agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
     rise = np.where(agrees, shifted.shift / px_per_m, np.nan)
-    surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
     share = VEHICLE_SHARE_APART if comparison.diachronic else VEHICLE_SHARE
     evidence = evidence_of(surface, rise, share)
     return replace(labels, change=by_votes(*pixel_reasons(evidence), evidence))

@@ -247,7 +247,8 @@ def _contradicted_apart(
     side = 2 * APART_PX + 1
     beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
     rim = labelled & beside & ~changed
-    return changed | rim & (compared(TOGETHER_PX, rim).here < RIM_AGREEMENT)
+    closer = compared(TOGETHER_PX, rim)
+    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT)
 
 
 def without_changes(

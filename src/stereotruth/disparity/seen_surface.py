@@ -302,14 +302,18 @@ def box_sum(values: NDArray) -> NDArray:
 
 def box_max(values: NDArray, reach: int) -> NDArray:
     """Maximum over squares of 2 * reach + 1 px, cut off at the edges."""
+    size = 2 * reach + 1
     for axis in (0, 1):
-        out = values.copy()
-        near, far = np.moveaxis(values, axis, 0), np.moveaxis(out, axis, 0)
-        for step in range(1, reach + 1):
-            np.maximum(far[step:], near[:-step], out=far[step:])
-            np.maximum(far[:-step], near[step:], out=far[:-step])
-        values = out
-    return values
+        # what is repeated beyond an edge lies in the same squares as the edge
+        pad = [(reach, reach) if a == axis else (0, 0) for a in (0, 1)]
+        out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)
+        width = 1
+        while width < size:
+            step = min(width, size - width)
+            out = np.maximum(out[:-step], out[step:])
+            width += step
+        values = np.moveaxis(out, 0, axis)
+    return np.ascontiguousarray(values)
 
 
 def seen_surface(

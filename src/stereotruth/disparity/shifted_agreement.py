@@ -111,20 +111,22 @@ def shifted_agreement(
     images: tuple[Detail, Detail] | None = None
     for top in range(0, shape[0], TILE_PX):
         for side in range(0, shape[1], TILE_PX):
-            tile = np.s_[top : top + TILE_PX, side : side + TILE_PX]
-            if not wanted[tile].any():
+            row, col = np.nonzero(wanted[top : top + TILE_PX, side : side + TILE_PX])
+            if row.size == 0:
                 continue
             if images is None:
                 images = tuple(map(Detail.of, (window.left, window.right), noise))
-            first = max(top - pad, 0), max(side - pad, 0)
-            around = np.s_[first[0] : top + TILE_PX + pad, first[1] : side + TILE_PX + pad]
+            rows = slice(top + row.min(), top + row.max() + 1)
+            cols = slice(side + col.min(), side + col.max() + 1)
+            first = max(rows.start - pad, 0), max(cols.start - pad, 0)
+            around = np.s_[first[0] : rows.stop + pad, first[1] : cols.stop + pad]
             inside = np.s_[
-                top - first[0] : top - first[0] + TILE_PX,
-                side - first[1] : side - first[1] + TILE_PX,
+                rows.start - first[0] : rows.stop - first[0],
+                cols.start - first[1] : cols.stop - first[1],
             ]
             part = _means(labels, window, images, around, window_px, reach, shifts)
             for k, values in enumerate(part):
-                out[k][tile] = np.where(wanted[tile], values[inside], np.nan)
+                out[k, rows, cols] = np.where(wanted[rows, cols], values[inside], np.nan)
     return ShiftedAgreement(*out, (2 * reach + window_px) ** 2)
 
 

@@ -15,6 +15,7 @@ import stereotruth.disparity.recipe as module
 from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
+from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
@@ -287,6 +288,8 @@ def test_water_is_masked_as_changed(plane, tmp_path) -> None:
     assert not (status == Status.LABELLED)[east > 1.0].any()
     assert not (status == Status.CHANGED)[east < -1.0].any()
     assert (grid["surface_class"].values == 0).all()
+    change = np.where(status == Status.CHANGED, Reason.WATER, Reason.NONE)
+    assert change.any() and np.array_equal(grid["change"].values, change)
 
 
 def test_correlation_removes_most_of_what_is_hidden(box) -> None:
