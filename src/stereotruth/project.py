@@ -406,10 +406,9 @@ def adjusted_scenes(
     """Scenes whose images are adjusted together with those of other scenes of their city.
 
     Each with the names of both images; one that is not in the images sheet is named by the path in
-    the scenes sheet. They are
-    the scenes that share an image with another one, or have an image whose correction is fixed;
-    none without refinement, and none whose own alignment is fixed. ``names``: see
-    :func:`names_in_pair`, by scene.
+    the scenes sheet. They are the scenes that share an image with another one, or have an image
+    whose correction is fixed; none without refinement, and none whose own alignment is fixed.
+    ``names``: see :func:`names_in_pair`, by scene.
     """
     fixed = settings.alignment.fixed
     if not settings.alignment.refine:

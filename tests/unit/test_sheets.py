@@ -364,6 +364,7 @@ def test_times_of_images(text, time):
         (["A\tQichun\ta.tif\t25.10.2020"], ["line 2: image 'A'", "25.10.2020", "2020-10-25T"]),
         (["A\tQichun\ta.tif\t2020-10-25T03:12:45"], ["image 'A'", "no time zone"]),
         (["A\tQichun\ta.tif\t2020-13-25"], ["image 'A'", "2020-13-25"]),
+        (["A\tQichun\ta.tif\t2020-10-25T03:12 CST"], ["image 'A'", "is not of the form"]),
         (["A\tQichun\ta.tif\t\t150\t"], ["image 'A'", "are not two numbers"]),
         (["A\tQichun\ta.tif\t\t150\t-5"], ["image 'A'", "is not in the sky"]),
         (["A b\tQichun\ta.tif"], ["line 2", "A b"]),

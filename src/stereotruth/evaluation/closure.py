@@ -7,11 +7,11 @@ its rows: the disparity of A-C by way of B less its label.
 All three labels rest on one point cloud and, where the images are adjusted together, on one
 correction per image. Whatever the three corrections and the heights of the ground are, the rays
 that they define close: for one height h of a point, d_AB, d_BC and d_AC are its projections by the
-same three sensors. So the alignment's covariance has no part in a closure, and of the points' only
-what the three labels do not share: h differs between pairs as far as their facets do, whose cells
-follow each pair's pixels. The stated uncertainty of a closure therefore has the points' part of
-each label's variance alone, as if the three were independent. That is an upper bound: all three
-have their heights from the same points, and no layer tells how much of their noise they share.
+same three sensors. So the alignment's covariance has no part in a closure. The points' noise has
+none either where all three draw the same facet of one surface: what is left is that labels are read
+between the centres of pixels. The stated uncertainty of a closure has the points' part of each
+label's variance alone, as if the three were independent. That is an upper bound: no layer tells how
+much of their noise three labels share.
 How good the corrections are shows the closure of the pairs' own refinements, each of which rests on
 tie points of its own: see :func:`closure_of_refinements`.
 """
