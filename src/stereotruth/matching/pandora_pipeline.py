@@ -85,7 +85,7 @@ class PandoraMethod(UncertainMatcher):
 
     def __init__(self, *, name: str, pipeline: str | None = None) -> None:
         steps = _steps_of(pipeline)
-        logging.getLogger("transitions").setLevel(logging.ERROR)
+        _keep_quiet()
         pandora.import_plugin()
         self._name, self._steps = name, steps
         blank = dataset(np.ones((16, 16), np.float32), (-1, 1))
@@ -136,6 +136,13 @@ class PandoraMethod(UncertainMatcher):
         disparity[~valid] = np.nan
         sigma = _uncertainty(found, steps["pipeline"])
         return disparity, None if sigma is None else np.where(valid, sigma, np.float32(np.nan))
+
+
+def _keep_quiet() -> None:
+    """Have Pandora log nothing to the terminal: it would open a handler of the root, through which
+    a job's own lines went a second time."""
+    if not logging.root.handlers:
+        logging.root.addHandler(logging.NullHandler())
 
 
 def _steps_of(pipeline: str | None) -> dict[str, Any]:
