@@ -16,12 +16,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import laspy
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.synthetic.copc_server import (
@@ -39,6 +41,7 @@ from stereotruth.errors import InputError, in_number
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.octree_nodes import Octree
 from stereotruth.lidar.point_store import PointStore
 
 DENSITY = 10.0  # points/m²
@@ -210,26 +213,36 @@ def plant(rounds: int) -> None:
             content = damaged(made, fault, rng) if in_file else made.content
             start = time.perf_counter()
             with serving(content, "" if in_file else fault, int(rng.integers(0, 6))) as server:
-                try:
-                    octree = open_octree(server.url, patience_s=patience_s)
-                    records = list(octree.read(octree.plan(ground.touches)))
-                    got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
-                    world = got.T * octree.header.scales + octree.header.offsets
-                    right = np.array_equal(got[:, ground.contains(world.T)], truth)
-                    outcome = "right" if right else "silent"
-                except InputError:
-                    outcome = "refused"
-                except Exception as error:
-                    outcome = "traceback"
-                    print(f"{fault}: {error!r}")
+                opened = partial(open_octree, server.url, patience_s=patience_s)
+                outcome = outcome_of(opened, ground, truth, f"{fault}, round {seed}")
             longest = max(longest, time.perf_counter() - start)
             totals[outcome] += 1
-            if outcome in ("silent", "traceback"):
-                print(f"{fault}, round {seed}: {outcome}")
     plant_in_ept(ground, totals)
     kinds = len(SERVER_FAULTS) + len(FILE_FAULTS) + len(FAULTS)
     print(f"{sum(totals.values())} faults of {kinds} kinds: {totals}")
     print(f"longest {longest:.1f} s, patience {patience_s} s for each part of a file")
+
+
+def outcome_of(
+    opened: Callable[[], Octree], ground: Square, truth: NDArray[np.int32], name: str
+) -> str:
+    """What reading a ``ground`` of a damaged octree ends in: right (the points are those of the
+    ``truth`` [3, n]), silent, refused or traceback. Bad ends are printed with the fault's name."""
+    try:
+        octree = opened()
+        records = list(octree.read(octree.plan(ground.touches)))
+        got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
+        world = got.T * octree.header.scales + octree.header.offsets
+        right = np.array_equal(got[:, ground.contains(world.T)], truth)
+        outcome = "right" if right else "silent"
+    except InputError:
+        return "refused"
+    except Exception as error:
+        outcome = "traceback"
+        print(f"{name}: {error!r}")
+    if outcome != "right":
+        print(f"{name}: {outcome}")
+    return outcome
 
 
 def plant_in_ept(ground: Square, totals: dict[str, int]) -> None:
@@ -241,21 +254,7 @@ def plant_in_ept(ground: Square, totals: dict[str, int]) -> None:
     for fault, plant_it in FAULTS.items():
         shutil.copytree(whole.parent, "damaged")
         plant_it(Path("damaged"))
-        try:
-            octree = open_octree("damaged/ept.json")
-            records = list(octree.read(octree.plan(ground.touches)))
-            got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
-            world = got.T * octree.header.scales + octree.header.offsets
-            right = np.array_equal(got[:, ground.contains(world.T)], truth)
-            outcome = "right" if right else "silent"
-        except InputError:
-            outcome = "refused"
-        except Exception as error:
-            outcome = "traceback"
-            print(f"{fault}: {error!r}")
-        totals[outcome] += 1
-        if outcome in ("silent", "traceback"):
-            print(f"{fault}: {outcome}")
+        totals[outcome_of(partial(open_octree, "damaged/ept.json"), ground, truth, fault)] += 1
         shutil.rmtree("damaged")
 
 

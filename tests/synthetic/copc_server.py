@@ -35,14 +35,14 @@ class MadeCopc:
     header_count_at: int = 247  # LAS 1.4: number of point records
 
 
-def make_copc(
-    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, paged: bool = True
-) -> MadeCopc:
-    """A surface of random points in an octree of so many levels, with pages below level 1.
+def thinned_surface(
+    rng: np.random.Generator, points: int, side: float, levels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (level, x, y, z) [points, 4] of random points on a surface in a cube of that ``side``
+    (m), and their coordinates [points, 3] (m) from its corner, both in the order of the nodes.
 
     A point stays at a level with a probability of 4**level, as in a thinned surface.
     """
-    rng = np.random.default_rng(seed)
     xyz = rng.uniform(0, side, (points, 3))
     xyz[:, 2] = 900 + 40 * np.sin(xyz[:, 0] / 90) + 30 * np.cos(xyz[:, 1] / 70)
     xyz = np.round(xyz, 2)
@@ -53,7 +53,15 @@ def make_copc(
     key = np.column_stack([level.astype(np.int16), place])
     del level, place  # of files of many points
     order = np.lexsort(key.T[::-1])
-    key, xyz = key[order], xyz[order]
+    return key[order], xyz[order]
+
+
+def make_copc(
+    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, paged: bool = True
+) -> MadeCopc:
+    """A :func:`thinned_surface` in an octree of so many levels, with pages below level 1."""
+    rng = np.random.default_rng(seed)
+    key, xyz = thinned_surface(rng, points, side, levels)
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = [0.01] * 3, CORNER
     header.are_points_compressed, header.point_count = True, points

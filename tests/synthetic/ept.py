@@ -8,7 +8,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from .copc_server import CORNER, UTM
+from .copc_server import CORNER, UTM, thinned_surface
 
 
 def make_ept(
@@ -19,15 +19,8 @@ def make_ept(
     The points of ``all.las`` are in the order of the nodes' keys. Returns the path of ept.json.
     """
     rng = np.random.default_rng(seed)
-    xyz = rng.uniform(0, side, (points, 3))
-    xyz[:, 2] = 900 + 40 * np.sin(xyz[:, 0] / 90) + 30 * np.cos(xyz[:, 1] / 70)
-    xyz = np.round(xyz, 2)
-    shares = 4.0 ** np.arange(levels)
-    level = rng.choice(levels, points, p=shares / shares.sum())
-    place = np.minimum(xyz / (side / 2.0**level)[:, None], (2.0**level - 1)[:, None]).astype(int)
-    key = np.column_stack([level, place])
-    order = np.lexsort(key.T[::-1])
-    key, xyz = key[order], xyz[order] + CORNER
+    key, xyz = thinned_surface(rng, points, side, levels)
+    xyz += CORNER
     classes = rng.integers(2, 7, points).astype(np.uint8)
     (folder / "ept-data").mkdir(parents=True)
     (folder / "ept-hierarchy").mkdir()
