@@ -27,6 +27,7 @@ from stereotruth.products.files import atomic_file, atomic_folder
 from stereotruth.products.inputs import checksum
 from stereotruth.products.records import contents_of, plain, read_record
 
+from .forked_snakemake import RUN
 from .project import Project, copy_project, row_of
 
 WAYS = ("kill", "refuse", "disk", "defect", "node")
@@ -145,7 +146,7 @@ def fault_of(rule: str) -> Callable[[str], None]:
         if fault["way"] == "defect":
             raise RuntimeError("asked to fail")
         if fault["way"] == "node":
-            os.kill(os.getppid(), signal.SIGKILL)  # Snakemake, which has forked this
+            os.kill(int(os.environ[RUN]), signal.SIGKILL)  # Snakemake, of which this is a job
         os.kill(os.getpid(), signal.SIGKILL)
         time.sleep(60)
 

@@ -15,7 +15,7 @@ from stereotruth.command.example_city import DEMO
 from stereotruth.simulate.__main__ import make_scene
 from stereotruth.simulate.cities import SceneSpec
 
-from .planner import planner
+from .forked_snakemake import planner, start_snakemake
 
 ROOT = Path(__file__).parents[2]
 SHEET_COLUMNS = [
@@ -86,7 +86,7 @@ class Project:
         return Run(done.returncode, done.stdout)
 
     def _ask(self, arguments: list[str], environment: dict[str, str]) -> Run:
-        status = planner().ask(self.folder, arguments, environment)
+        status = start_snakemake(planner(), self.folder, arguments, "plan.log", environment).wait()
         return Run(status, (self.folder / "plan.log").read_text())
 
     def refuse(self, *arguments: str) -> Run:

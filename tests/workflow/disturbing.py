@@ -14,17 +14,13 @@ stand there.
 from __future__ import annotations
 
 import argparse
-import ast
 import hashlib
-import importlib
 import json
 import os
 import random
 import re
-import runpy
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -32,10 +28,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..synthetic.disturbed_stages import STAGES, Stage, city_names, make_cities
-from ..synthetic.project import ROOT, Project
+from ..synthetic.forked_snakemake import planner, runner, start_snakemake
+from ..synthetic.forks import Fork, Forker
+from ..synthetic.project import Project
 from .killing import family, kill
 
 NOT_CONTENT = ".snakemake_timestamp"  # of Snakemake, in folders whose job has ended
@@ -127,103 +124,19 @@ def _content(file: Path) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-FORK_JOBS = False  # jobs are processes forked from Snakemake's, which spares them the imports, too
-
-
-OLD_STREAMS = []  # kept, since the end of one would close the file
-
-
-def _renew_streams() -> None:
-    OLD_STREAMS.extend((sys.stdout, sys.stderr))
-    sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
-
-
-def _fork_jobs() -> None:
-    """Have this Snakemake fork its scripts; what they import is imported by then."""
-    import snakemake.script
-
-    def execute(self: Any, fname: str, edit: bool = False) -> None:
-        begin = time.monotonic()
-        pid = os.fork()
-        if not pid:
-            status = 1
-            os.closerange(3, 4096)  # as another program would: the run's lock stays with the run
-            _renew_streams()  # another thread may have held their locks at the fork
-            try:
-                runpy.run_path(fname, run_name="__main__")
-                status = 0
-            except SystemExit as end:
-                status = int(bool(end.code))
-            finally:
-                os._exit(status)
-        status = os.waitpid(pid, 0)[1]
-        self.bench_record.running_time = time.monotonic() - begin
-        if status:
-            raise subprocess.CalledProcessError(1, fname)
-
-    snakemake.script.PythonScript.execute_script = execute
-
-
-def import_stages() -> None:
-    """Import what the scripts do, before they are forked."""
-    for script in (ROOT / "workflow" / "scripts").glob("*.py"):
-        for node in ast.walk(ast.parse(script.read_text())):
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("stereotruth"):
-                with suppress(ModuleNotFoundError):  # without PyTorch
-                    importlib.import_module(node.module)
-    for name in ("xarray", "rasterio", "matplotlib.figure", "rioxarray", "cv2", "scipy.optimize"):
-        importlib.import_module(name)
-
-
-class Run:
-    """Snakemake in a forked process and session of its own, which spares it the imports."""
-
-    def __init__(self, folder: Path, arguments: list[str]) -> None:
-        import snakemake.cli
-
-        self.returncode: int | None = None
-        self.pid = os.fork()
-        if self.pid:
-            return
-        try:
-            os.setsid()
-            out = os.open(folder / "run.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            for stream in (1, 2):
-                os.dup2(out, stream)
-            _renew_streams()
-            os.chdir(folder)
-            sys.argv = ["snakemake", *arguments]
-            if FORK_JOBS:
-                _fork_jobs()
-            snakemake.cli.main()
-        except SystemExit as end:
-            sys.stdout.flush()
-            os._exit(int(bool(end.code)))
-        finally:
-            os._exit(1)
-
-    def poll(self) -> int | None:
-        if self.returncode is None and (ended := os.waitpid(self.pid, os.WNOHANG))[0]:
-            self.returncode = os.waitstatus_to_exitcode(ended[1])
-        return self.returncode
-
-    def wait(self) -> None:
-        while self.poll() is None:
-            time.sleep(0.05)
-
-
 class Harness:
     """Disturbs one stage after the other in the cities of a folder."""
 
-    def __init__(self, project: Project, names: Sequence[str], seed: int) -> None:
+    def __init__(
+        self, project: Project, names: Sequence[str], seed: int, forker: Forker | None = None
+    ) -> None:
         self.project, self.folder, self.names = project, project.folder, list(names)
-        self.rng = random.Random(seed)
+        self.rng, self.forker = random.Random(seed), forker or planner()
 
-    def begin(self, *targets: str) -> Run:
+    def begin(self, *targets: str) -> Fork:
         cores = str(2 * len(self.names))
-        return Run(
-            self.folder, [*targets, "--configfile", "my.yaml", "--keep-going", "--cores", cores]
-        )
+        settings = ("--configfile", "my.yaml", "--keep-going", "--cores", cores)
+        return start_snakemake(self.forker, self.folder, [*targets, *settings], "run.log")
 
     def settle(
         self, *targets: str, free: Callable[[], None] = lambda: None, rest: bool = True
@@ -430,12 +343,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("stages", nargs="*", metavar="stage")
     given = parser.parse_args()
-    if given.fork_jobs:
-        global FORK_JOBS
-        FORK_JOBS = True
-        import_stages()
+    forker = runner() if given.fork_jobs else planner()
     project = make_cities(given.folder.absolute(), given.cities, given.data)
-    harness, found = Harness(project, city_names(given.cities), given.seed), []
+    harness, found = Harness(project, city_names(given.cities), given.seed, forker), []
     for one in harness.rounds(given.stages or list(STAGES), given.rounds, given.kinds):
         found.append(one)
         with (given.folder / "rounds.jsonl").open("a") as stream:

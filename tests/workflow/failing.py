@@ -32,6 +32,7 @@ from typing import Any
 
 from ..synthetic import faulty_workflow
 from ..synthetic.faulty_workflow import FaultyProject
+from ..synthetic.forked_snakemake import runner, start_snakemake
 from ..synthetic.hollow_workflow import (
     FAULT,
     GIVEN,
@@ -43,8 +44,7 @@ from ..synthetic.hollow_workflow import (
     set_seed,
     stale,
 )
-from ..synthetic.project import ROOT, Project, make_tiny
-from . import disturbing
+from ..synthetic.project import Project, make_tiny
 
 NO_RULES = ("all", "predict", "benchmark", "report", "evaluate")  # without a job of their own
 EDITS = (*(f"in/{name}" for name in GIVEN), "mine.py", "helper.py", "geoid.tif")
@@ -65,14 +65,12 @@ class Failures:
         self.rng = random.Random(seed)
         self.seed = self.version = 0
         self.reached: dict[str, list[str]] = {}  # rules by the edit that makes them due
-        disturbing.FORK_JOBS = True
-        sys.path.insert(0, str(ROOT))
 
     def run(self, *more: str) -> tuple[int, set[str]]:
         """A run's exit status, and the rules that it planned."""
-        run = disturbing.Run(self.folder, [*self.call, "--scheduler", "greedy", *more])
-        run.wait()
-        return run.returncode, self.planned()
+        call = [*self.call, "--scheduler", "greedy", *more]
+        status = start_snakemake(runner(), self.folder, call, "run.log").wait()
+        return status, self.planned()
 
     def said(self) -> str:
         return (self.folder / "run.log").read_text()
@@ -214,7 +212,6 @@ class RealFailures(Failures):
     def __init__(self, folder: Path, seed: int) -> None:
         self.faulty = FaultyProject(make_tiny(folder), folder)
         super().__init__(self.faulty.project, seed)
-        disturbing.import_stages()
 
     def prepare(self, edits: Sequence[str] | None = None) -> None:
         """Make all; every edit may come before every rule."""

@@ -41,14 +41,15 @@ def site(tmp_path_factory) -> Site:
 def made_again(site: Site, file: str) -> set[str]:
     """Stages and scenes whose products a run makes after an edit of a file."""
 
-    def products() -> dict[Path, int]:
-        found = (site.folder / "results").glob("*/Own/**/*")
-        return {path: path.stat().st_ino for path in found if path.is_file()}
+    def products() -> dict[Path, tuple[int, int]]:
+        found = (site.folder / "results").glob("*/Own/**/*")  # a number may be given again
+        states = {path: path.stat() for path in found if path.is_file()}
+        return {path: (state.st_ino, state.st_mtime_ns) for path, state in states.items()}
 
     before = products()
     site.edit(file)
     assert site.run()[0] == 0, site.said()[-4000:]
-    changed = [path for path, number in products().items() if before.get(path) != number]
+    changed = [path for path, state in products().items() if before.get(path) != state]
     names = [path.relative_to(site.folder / "results").parts for path in changed]
     return {f"{stage} {name.split('.')[0]}" for stage, _, name, *_ in names}
 
