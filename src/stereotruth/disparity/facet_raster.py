@@ -41,6 +41,22 @@ class RightPixels(NamedTuple):
     limit: Floats
 
 
+class Prisms(NamedTuple):
+    """Prisms over triangles ``corner`` [k, 3] of vertices [n], from the least to the greatest
+    height of ``height_range`` [k, 2], lattice steps.
+
+    ``xy`` [4, n]: positions of the vertices at their height ``h``; ``rise`` [4, n]: what a lattice
+    step of height adds. Over 100 m positions are linear in height within 0.02 px, a tenth of
+    OCCLUSION_TOLERANCE_PX.
+    """
+
+    corner: Steps
+    height_range: Ints
+    xy: Floats
+    rise: NDArray[np.float32]
+    h: Ints
+
+
 class FacetValues(NamedTuple):
     """Triangles ``corner`` [m, 3] of vertices [n] at ``xy`` [4, n], and what is interpolated in
     them.
@@ -79,6 +95,13 @@ class PixelValues(NamedTuple):
 @inner
 def _triple(values: Floats, t: Steps) -> tuple[float, float, float]:
     return values[t[0]], values[t[1]], values[t[2]]
+
+
+@inner
+def _between_rows(y: tuple, first: int, rows: int) -> bool:
+    """Whether a triangle meets none of the ``rows`` from the ``first`` one on, as most do."""
+    low, high = min(y[0], y[1], y[2]), max(y[0], y[1], y[2])
+    return max(np.ceil(low), first) > min(np.floor(high), first + rows - 1)
 
 
 @inner
@@ -132,9 +155,12 @@ def raster_facets(
     Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
     number.
     """
+    rows = z_buffer.shape[0]
     for t in range(len(corner)):
-        x, y = _triple(xy[0], corner[t]), _triple(xy[1], corner[t])
-        xr = _triple(xy[2], corner[t])
+        y = _triple(xy[1], corner[t])
+        if _between_rows(y, first[0], rows):
+            continue
+        x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         _raster_left(x, y, d, first, t, z_buffer, index)
 
@@ -173,31 +199,76 @@ def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools
 def hide_by_facets(xy: Floats, corner: Steps, pixels: RightPixels, hidden: Bools) -> None:
     """Marks the pixels that triangles hide from the right camera (eq. 8 of
     docs/explanation/surface.md)."""
+    rows = (pixels.start.size - 1) // pixels.width
     for t in range(len(corner)):
+        y = _triple(xy[3], corner[t])
+        if _between_rows(y, pixels.first[0], rows):
+            continue
         x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-        y = _triple(xy[3], corner[t])
         _hide_right(xr, y, d, pixels, hidden)
 
 
+@inner
+def _at_heights(prisms: Prisms, t: int, axis: int, out: Floats) -> None:
+    """Positions [6] of a prism's corners along an axis, px: first those at its top."""
+    low, high = prisms.height_range[t, 0], prisms.height_range[t, 1]
+    for k in range(3):
+        v = prisms.corner[t, k]
+        at, rise = prisms.xy[axis, v], prisms.rise[axis, v]
+        out[k] = at + (high - prisms.h[v]) * rise
+        out[3 + k] = at + (low - prisms.h[v]) * rise
+
+
+@inner
+def _range(values: Floats) -> tuple[float, float]:
+    """Least and greatest of a prism's corners."""
+    low, high = values[0], values[0]
+    for k in range(1, 6):
+        low, high = min(low, values[k]), max(high, values[k])
+    return low, high
+
+
 @kernel
-def raster_prisms(xy: Floats, first: tuple[int, int], z_buffer: Floats) -> None:
+def raster_prisms(prisms: Prisms, first: tuple[int, int], z_buffer: Floats) -> None:
     """Raises ``z_buffer`` to the greatest disparity that prisms may have (eq. 7 of
-    docs/explanation/surface.md); ``xy`` [4, prisms, 6]."""
+    docs/explanation/surface.md)."""
     any_prism = np.empty(z_buffer.shape, np.int32)
-    for t in range(xy.shape[1]):
-        x, y, xr = xy[0, t], xy[1, t], xy[2, t]
+    rows, cols = z_buffer.shape
+    x, y, xr = np.empty(6), np.empty(6), np.empty(6)
+    for t in range(len(prisms.corner)):
+        _at_heights(prisms, t, 1, y)
+        low, high = _range(y)
+        # most prisms lie between the centres of pixels
+        if max(np.ceil(low), first[0]) > min(np.floor(high), first[0] + rows - 1):
+            continue
+        _at_heights(prisms, t, 0, x)
+        low, high = _range(x)
+        if max(np.ceil(low), first[1]) > min(np.floor(high), first[1] + cols - 1):
+            continue
+        _at_heights(prisms, t, 2, xr)
         for a, b, c in _FACES:
             d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
             _raster_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, t, z_buffer, any_prism)
 
 
 @kernel
-def hide_by_prisms(xy: Floats, pixels: RightPixels, hidden: Bools) -> None:
+def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
     """Marks the pixels that prisms may hide from the right camera (eq. 8 of
-    docs/explanation/surface.md); ``xy`` [4, prisms, 6]."""
-    for t in range(xy.shape[1]):
-        x, xr, y = xy[0, t], xy[2, t], xy[3, t]
+    docs/explanation/surface.md)."""
+    first, width = pixels.first, pixels.width
+    rows = (pixels.start.size - 1) // width
+    x, y, xr = np.empty(6), np.empty(6), np.empty(6)
+    for t in range(len(prisms.corner)):
+        _at_heights(prisms, t, 3, y)
+        low, high = _range(y)
+        if max(np.ceil(low), first[0]) > min(np.floor(high), first[0] + rows - 1):
+            continue
+        _at_heights(prisms, t, 2, xr)
+        low, high = _range(xr)
+        if max(np.floor(low), first[1]) > min(np.floor(high), first[1] + width - 1):
+            continue
+        _at_heights(prisms, t, 0, x)
         for a, b, c in _FACES:
             d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
             _hide_right((xr[a], xr[b], xr[c]), (y[a], y[b], y[c]), d, pixels, hidden)

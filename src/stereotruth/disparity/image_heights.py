@@ -34,13 +34,13 @@ from ..products.grids import Layer, atomic_store, blocks, create_grid
 from ..products.provenance import digest
 from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import PART
-from ..surface.surface import GroundSurface
 from ..surface.surface_store import Box, SurfaceStore
 from ..surface.vertices import Vertices
 from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
+    Prisms,
     interpolate,
     raster_facets,
     raster_prisms,
@@ -52,7 +52,7 @@ Floats = NDArray[np.float64]
 IMAGE_CHUNK, IMAGE_SHARD = 256, 1024
 NO_POINTS, MEASURED, UNDECIDED = range(3)
 STATUSES = "no_points measured undecided"
-_PRISMS = 1 << 15  # prisms that are projected at once
+_RISE = 10_000  # lattice steps between two heights, for what one of them changes
 LAYERS = {
     "height": Layer("float32", np.nan, {
         "units": "m", "long_name": "height above the WGS 84 ellipsoid of what the pixel's centre "
@@ -179,17 +179,18 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     above, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
     raster_facets(xy, surface.facet, first, above, index)
     undecided = np.full(shape, -np.inf)
-    for start in range(0, len(surface.undecided), _PRISMS):
-        prisms = _prisms(inputs, surface, slice(start, start + _PRISMS))
-        raster_prisms(prisms, first, undecided)
+    higher = inputs.project(every.lon_q, every.lat_q, every.h_q + _RISE)
+    rise = ((higher - xy) / _RISE).astype(np.float32)
+    prisms = Prisms(surface.undecided, surface.height_range, xy, rise, every.h_q)
+    raster_prisms(prisms, first, undecided)
     values = PixelValues.none(shape)
     facets = FacetValues(
         xy, surface.facet, every.h_q, every.surface_class, every.count, surface.variance,
         surface.bulge,
     )  # fmt: skip
     interpolate(facets, index, first, values)
-    higher = undecided > above + OCCLUSION_TOLERANCE_PX * inputs.pixel_m
-    return _layers(inputs, (rows, cols), index, higher, values)
+    is_higher = undecided > above + OCCLUSION_TOLERANCE_PX * inputs.pixel_m
+    return _layers(inputs, (rows, cols), index, is_higher, values)
 
 
 def _region(inputs: ImageInputs, vertices: Vertices, box: Box) -> Region:
@@ -208,16 +209,6 @@ def _region(inputs: ImageInputs, vertices: Vertices, box: Box) -> Region:
         part.append(slice(max(first - 1, 0), max(last + 2, 0)))
     squares[part[0], part[1]] = True
     return Region(squares)
-
-
-def _prisms(inputs: ImageInputs, surface: GroundSurface, chosen: slice) -> Floats:
-    """Positions [4, prisms, 6] of undecided triangles at their greatest and least height."""
-    corner = surface.undecided[chosen]
-    heights = np.repeat(surface.height_range[chosen, ::-1], 3, axis=1)
-    vertices = surface.vertices
-    lon, lat = (np.tile(q[corner], 2) for q in (vertices.lon_q, vertices.lat_q))
-    corners = (values.reshape(-1) for values in (lon, lat, heights))
-    return inputs.project(*corners).reshape(4, -1, 6)
 
 
 def _layers(

@@ -1,10 +1,11 @@
 """Ground to epipolar pixels by polynomials, one for each cube of the points' lattice.
 
-RPCs and epipolar splines are smooth: over 105 m (117 m along a meridian) a cubic polynomial of
-longitude, latitude and height is off by 1e-6 px at most (on six scenes), and
-takes a tenth of the time. Cubes are those of the global lattice and a polynomial depends on nothing
-but the model, so that a point has the same position in whatever window it is worked on. Where a
-polynomial is off by more than POLYNOMIAL_ERROR_PX, the model itself is taken.
+RPCs and epipolar splines are smooth: over 52 m (58 m along a meridian) a cubic polynomial of
+longitude, latitude and height is off by 1e-8 px (on large images) to 2e-6 px (on images of 700 px,
+whose splines bend more), and takes a tenth of the time. Cubes are those of the global lattice and a
+polynomial depends on nothing but the model, so that a point has the same position in whatever
+window it is worked on. Where a polynomial is off by more than POLYNOMIAL_ERROR_PX, the model itself
+is taken.
 
 The polynomial is the least-squares fit to the model on 4 x 4 x 4 nodes (at 1/8, 3/8, 5/8 and 7/8 of
 each side), by the Gram polynomials of four equidistant nodes (Abramowitz & Stegun 22.17), which are
@@ -24,11 +25,13 @@ from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Singles = NDArray[np.float32]
 
 
+CUBE_BITS = CELL_BITS - 1  # lattice steps along a cube's side
 POLYNOMIAL_ERROR_PX = 1e-5  # at the corners and the middle of a cube
 _PER_DEG, _PER_M = round(1 / LATTICE_DEG), round(1 / LATTICE_M)
-_SCALE = 8.0 / (1 << CELL_BITS)  # nodes lie at -3, -1, 1 and 3
+_SCALE = 8.0 / (1 << CUBE_BITS)  # nodes lie at -3, -1, 1 and 3
 # Gram polynomials: their values at the nodes, the sums of their squares, their coefficients.
 _GRAM = np.array([[1, 1, 1, 1], [-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]], dtype=np.float64)
 _NORM = (_GRAM**2).sum(axis=1)
@@ -42,6 +45,7 @@ _NODES = np.stack(np.meshgrid(*[[-3.0, -1.0, 1.0, 3.0]] * 3, indexing="ij"), -1)
 _CHECKS = np.vstack(
     [np.stack(np.meshgrid(*[[-4.0, 4.0]] * 3, indexing="ij"), -1).reshape(-1, 3), np.zeros((1, 3))]
 )
+_RISE_M = 1.0  # between two heights, for the slope of the model itself
 _RUN = 512  # points that are worked on at once; see _at_points
 
 
@@ -60,6 +64,17 @@ def _cubic(c: Floats, i: int, x: float, y: float, z: float) -> float:
             + y * (c[i + 13] + z * c[i + 14] + y * c[i + 15])
             + x * (c[i + 16] + z * c[i + 17] + y * c[i + 18] + x * c[i + 19])
         )
+    )
+
+
+@inner
+def _rise(c: Floats, i: int, x: float, y: float, z: float) -> float:
+    """Slope of :func:`_cubic` along z."""
+    return (
+        c[i + 1]
+        + z * (2.0 * c[i + 2] + z * 3.0 * c[i + 3])
+        + y * (c[i + 5] + z * 2.0 * c[i + 6] + y * c[i + 8])
+        + x * (c[i + 11] + z * 2.0 * c[i + 12] + y * c[i + 14] + x * c[i + 17])
     )
 
 
@@ -119,27 +134,28 @@ def _at_points(
     lat_q: Ints,
     h_q: Ints,
     out: Floats,
+    rise: Singles,
 ) -> int:
-    """Returns how many points lie in cubes that are not ``good``.
+    """Returns how many points lie in cubes that are not ``good``; ``rise`` [4, n or 0].
 
     By runs of points in one cube, and blocks of these through small arrays: vectorised.
     """
     bad = 0
-    mask = (1 << CELL_BITS) - 1
+    mask = (1 << CUBE_BITS) - 1
     position = np.empty(3 * _RUN)
     values = np.empty(4 * _RUN)
     c = np.empty(80)
     n = lon_q.size
     start = 0
     while start < n:
-        i, j, k = lon_q[start] >> CELL_BITS, lat_q[start] >> CELL_BITS, h_q[start] >> CELL_BITS
+        i, j, k = lon_q[start] >> CUBE_BITS, lat_q[start] >> CUBE_BITS, h_q[start] >> CUBE_BITS
         end = start + 1
         last = min(n, start + _RUN)
         while (
             end < last
-            and lon_q[end] >> CELL_BITS == i
-            and lat_q[end] >> CELL_BITS == j
-            and h_q[end] >> CELL_BITS == k
+            and lon_q[end] >> CUBE_BITS == i
+            and lat_q[end] >> CUBE_BITS == j
+            and h_q[end] >> CUBE_BITS == k
         ):
             end += 1
         cube = ((i - low[0]) * shape[1] + j - low[1]) * shape[2] + k - low[2]
@@ -160,6 +176,15 @@ def _at_points(
             values[3 * _RUN + m] = _cubic(c, 60, x, y, z)
         for axis in range(4):
             out[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
+        if rise.size:
+            for m in range(size):
+                x, y, z = position[m], position[_RUN + m], position[2 * _RUN + m]
+                values[m] = _rise(c, 0, x, y, z) * _SCALE
+                values[_RUN + m] = _rise(c, 20, x, y, z) * _SCALE
+                values[2 * _RUN + m] = _rise(c, 40, x, y, z) * _SCALE
+                values[3 * _RUN + m] = _rise(c, 60, x, y, z) * _SCALE
+            for axis in range(4):
+                rise[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
         start = end
     return bad
 
@@ -182,7 +207,7 @@ def _at_means(
             continue
         cube = 0
         position = (0.0, 0.0, 0.0)
-        side = n << CELL_BITS
+        side = n << CUBE_BITS
         i, j, k = sums[p, 1] // side, sums[p, 2] // side, sums[p, 3] // side
         # Integers as far as they go: what is divided is the same wherever windows begin.
         position = (
@@ -217,10 +242,10 @@ class LocalProjection:
     @classmethod
     def of(cls, model: ViewGeometry, low: ArrayLike, high: ArrayLike) -> LocalProjection:
         """For points between two corners, lattice (lon, lat, height), both included."""
-        first = np.asarray(low, dtype=np.int64) >> CELL_BITS
-        shape = (np.asarray(high, dtype=np.int64) >> CELL_BITS) - first + 1
+        first = np.asarray(low, dtype=np.int64) >> CUBE_BITS
+        shape = (np.asarray(high, dtype=np.int64) >> CUBE_BITS) - first + 1
         corner = np.indices(shape).reshape(3, -1, 1) + first[:, None, None]
-        steps = np.array([LATTICE_DEG, LATTICE_DEG, LATTICE_M])[:, None, None] * (1 << CELL_BITS)
+        steps = np.array([LATTICE_DEG, LATTICE_DEG, LATTICE_M])[:, None, None] * (1 << CUBE_BITS)
 
         def at(positions: Floats) -> Floats:
             ground = (corner + (positions.T[:, None] + 4.0) / 8.0) * steps
@@ -249,12 +274,23 @@ class LocalProjection:
 
     def at_points(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
         """float64[4, n] = x_left, y_left, x_right, y_right (px) of lattice points in the box."""
-        out = np.empty((4, lon_q.size))
-        if _at_points(self.low, self.shape, self.coefficients, self.good, lon_q, lat_q, h_q, out):
-            bad = ~self.good[self._cube(*(q >> CELL_BITS for q in (lon_q, lat_q, h_q)))]
-            out[:, bad] = self.model.ground_to_epipolar(
-                lon_q[bad] / _PER_DEG, lat_q[bad] / _PER_DEG, h_q[bad] / _PER_M
-            )
+        return self._at(lon_q, lat_q, h_q, np.empty((4, 0), np.float32))
+
+    def with_rise(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> tuple[Floats, Singles]:
+        """:meth:`at_points`, and by how much a lattice step of height changes it, float32[4, n]."""
+        rise = np.empty((4, lon_q.size), np.float32)
+        return self._at(lon_q, lat_q, h_q, rise), rise
+
+    def _at(self, lon_q: Ints, lat_q: Ints, h_q: Ints, rise: Singles) -> Floats:
+        """:meth:`at_points`; fills ``rise`` unless it is empty."""
+        out, lattice = np.empty((4, lon_q.size)), (lon_q, lat_q, h_q)
+        if _at_points(self.low, self.shape, self.coefficients, self.good, *lattice, out, rise):
+            bad = ~self.good[self._cube(*(q >> CUBE_BITS for q in lattice))]
+            lon, lat, h = (q[bad] / per for q, per in zip(lattice, (_PER_DEG, _PER_DEG, _PER_M)))
+            out[:, bad] = self.model.ground_to_epipolar(lon, lat, h)
+            if rise.size:
+                higher = self.model.ground_to_epipolar(lon, lat, h + _RISE_M)
+                rise[:, bad] = (higher - out[:, bad]) / (_RISE_M * _PER_M)
         return out
 
     def at_means(self, sums: Ints) -> Floats:
@@ -265,7 +301,7 @@ class LocalProjection:
         out = np.empty((4, len(sums)))
         if _at_means(self.low, self.shape, self.coefficients, self.good, sums, out):
             n = np.maximum(sums[:, 0], 1)
-            lattice = [sums[:, axis] // (n << CELL_BITS) for axis in (1, 2, 3)]
+            lattice = [sums[:, axis] // (n << CUBE_BITS) for axis in (1, 2, 3)]
             bad = np.flatnonzero(sums[:, 0])
             bad = bad[~self.good[self._cube(*(q[bad] for q in lattice))]]
             lon, lat, h = (sums[bad, axis] / n[bad] for axis in (1, 2, 3))

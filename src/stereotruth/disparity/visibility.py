@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +23,7 @@ from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
+    Prisms,
     RightPixels,
     hide_by_facets,
     hide_by_prisms,
@@ -43,17 +43,17 @@ Bools = NDArray[np.bool_]
 # visible pixels and 0.2 of the hidden ones had labels, with 0.4 1.3 and 0.1 fewer).
 LEAST_FACET_WIDTH = 0.3
 NO_FACET, VISIBLE, PRISM_IN_LEFT, PRISM_IN_RIGHT, FACET_IN_RIGHT = range(5)
-_CHUNK = 1 << 15  # prisms that are projected at once
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedSurface:
     """A surface in both images: ``xy`` [4, n] of its vertices (px), in a window of the left grid
-    whose first pixel is (row, col) ``first``."""
+    whose first pixel is (row, col) ``first``; ``rise`` [4, n] of these by a lattice step of
+    height."""
 
     surface: GroundSurface
-    projection: LocalProjection
     xy: Floats
+    rise: NDArray[np.float32]
     first: tuple[int, int]
 
     @classmethod
@@ -62,37 +62,29 @@ class ProjectedSurface:
     ) -> ProjectedSurface:
         """``projection`` holds all that lies in the box of the vertices."""
         vertices = surface.vertices
-        xy = projection.at_points(vertices.lon_q, vertices.lat_q, vertices.h_q)
-        return cls(surface, projection, xy, first)
+        xy, rise = projection.with_rise(vertices.lon_q, vertices.lat_q, vertices.h_q)
+        return cls(surface, xy, rise, first)
 
     def raster_prisms(self, undecided: slice, z_buffer: Floats) -> None:
         """Raises ``z_buffer`` [rows, cols] to the greatest disparity of some prisms in the left
         view."""
-        for prisms in self._prisms(undecided):
-            raster_prisms(prisms, self.first, z_buffer)
+        raster_prisms(self._prisms(undecided), self.first, z_buffer)
 
     def hidden_by_prisms(self, undecided: slice, pixels: RightPixels) -> Bools:
         """Which pixels [n] some prisms may hide from the right camera."""
         hidden = np.zeros(pixels.limit.size, np.bool_)
-        for prisms in self._prisms(undecided):
-            hide_by_prisms(prisms, pixels, hidden)
+        hide_by_prisms(self._prisms(undecided), pixels, hidden)
         return hidden
 
     def hidden_by_facets(self, pixels: RightPixels) -> Bools:
         """Which pixels [n] lie behind a facet in the right view."""
         return hidden_by(self.xy, self.surface.facet, pixels)
 
-    def _prisms(self, undecided: slice) -> Iterator[Floats]:
-        """Positions [4, prisms, 6] (px) of the corners of prisms at their greatest and least
-        height."""
-        vertices = self.surface.vertices
-        for start in range(undecided.start, undecided.stop, _CHUNK):
-            chunk = slice(start, min(start + _CHUNK, undecided.stop))
-            corner = self.surface.undecided[chunk]
-            heights = np.repeat(self.surface.height_range[chunk, ::-1], 3, axis=1)
-            lon, lat = (np.tile(q[corner], 2) for q in (vertices.lon_q, vertices.lat_q))
-            corners = (values.reshape(-1) for values in (lon, lat, heights))
-            yield self.projection.at_points(*corners).reshape(4, -1, 6)
+    def _prisms(self, undecided: slice) -> Prisms:
+        """Over some undecided triangles."""
+        surface = self.surface
+        corner, heights = surface.undecided[undecided], surface.height_range[undecided]
+        return Prisms(corner, heights, self.xy, self.rise, surface.vertices.h_q)
 
 
 def hidden_by(xy: Floats, corner: Steps, pixels: RightPixels) -> Bools:
