@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.image_detail import detail
 from ..numerics.summed_area import window_sums
 
 USABLE, MASKED = 1, 2  # bits
@@ -52,6 +53,21 @@ class Patch:
     usable: NDArray[np.uint8]
     row: int
     col: int
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """Of an image: the ``patch`` with the detail in place of its pixels, the share of ``signal``
+    of each."""
+
+    patch: Patch
+    signal: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, patch: Patch, noise: float) -> Detail:
+        """By the variance of the ``noise``, DN²."""
+        pixels, signal = detail(patch.pixels, noise)
+        return cls(replace(patch, pixels=pixels), signal)
 
 
 def read_patch(image: Array2D, rows: slice, cols: slice, window: int) -> Patch:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .image_patches import MASKED, USABLE, Patch
+from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
 from .status import Status
 
@@ -40,6 +41,17 @@ class PairWindow:
     def shape(self) -> tuple[int, int]:
         """(rows, cols)."""
         return self.rows.stop - self.rows.start, self.cols.stop - self.cols.start
+
+    def details(self, noise: tuple[float, float]) -> tuple[Detail, Detail]:
+        """Of both images, by the variances of their ``noise``, DN²; kept for the next call."""
+        if noise not in self._details:
+            left, right = map(Detail.of, (self.left, self.right), noise)
+            self._details[noise] = left, right
+        return self._details[noise]
+
+    @cached_property
+    def _details(self) -> dict[tuple[float, float], tuple[Detail, Detail]]:
+        return {}
 
     @property
     def inner(self) -> tuple[slice, slice]:

@@ -9,16 +9,16 @@ noise, lower the correlation at all disparities alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.image_detail import detail
 from ..epipolar.surface_correlation import surface_correlation
-from .image_patches import Patch
+from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
+from .seen_surface import box_max
 from .surface_means import apart_from_steps, surface_mean, warp_to_left
 
 Floats = NDArray[np.float64]
@@ -37,7 +37,7 @@ SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all sh
 INDEPENDENT_PX2 = 4.0
 Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
-TILE_PX = 64  # side of the parts of a window that are worked on as far as any of it is wanted
+TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,21 +76,6 @@ class ShiftedAgreement:
         return is_none | self.is_shifted
 
 
-@dataclass(frozen=True, eq=False)
-class Detail:
-    """Of an image: the ``patch`` with the detail in place of its pixels, the share of ``signal``
-    of each."""
-
-    patch: Patch
-    signal: Singles
-
-    @classmethod
-    def of(cls, patch: Patch, noise: float) -> Detail:
-        """By the variance of the ``noise``, DN²."""
-        pixels, signal = detail(patch.pixels, noise)
-        return cls(replace(patch, pixels=pixels), signal)
-
-
 def shifted_agreement(
     labels: Labels,
     window: PairWindow,
@@ -115,7 +100,7 @@ def shifted_agreement(
             if row.size == 0:
                 continue
             if images is None:
-                images = tuple(map(Detail.of, (window.left, window.right), noise))
+                images = window.details(noise)
             rows = slice(top + row.min(), top + row.max() + 1)
             cols = slice(side + col.min(), side + col.max() + 1)
             first = max(rows.start - pad, 0), max(cols.start - pad, 0)
@@ -124,7 +109,9 @@ def shifted_agreement(
                 rows.start - first[0] : rows.stop - first[0],
                 cols.start - first[1] : cols.stop - first[1],
             ]
-            part = _means(labels, window, images, around, window_px, reach, shifts)
+            here = np.zeros_like(wanted[around])
+            here[inside] = wanted[rows, cols]
+            part = _means(labels, window, images, around, here, window_px, reach, shifts)
             for k, values in enumerate(part):
                 out[k, rows, cols] = np.where(wanted[rows, cols], values[inside], np.nan)
     return ShiftedAgreement(*out, (2 * reach + window_px) ** 2)
@@ -135,11 +122,13 @@ def _means(
     window: PairWindow,
     images: tuple[Detail, Detail],
     around: tuple[slice, slice],
+    wanted: Bools,
     window_px: int,
     reach: int,
     shifts: tuple[float, ...],
 ) -> tuple[Singles, Singles, Singles, Singles]:
-    """The arrays of :class:`ShiftedAgreement` of a part of a window."""
+    """The arrays of :class:`ShiftedAgreement` of a part of a window, of which some pixels are
+    ``wanted``."""
     left, right = (image.patch for image in images)
     disparity, slope = labels.disparity[around], labels.slope[:, *around]
     rows, cols = disparity.shape
@@ -147,13 +136,17 @@ def _means(
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
     clear = apart_from_steps(disparity)
     every = max(reach // 4, 1)
+    averaged = box_max(wanted, reach)
+    compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
 
     def mean(shift: float) -> Singles:
         at = slice(row, row + rows), slice(col, col + cols)
-        warped = warp_to_left(right, *at, disparity + shift)
+        warped = warp_to_left(right, *at, compared + shift)
         warped = np.where(original == 0.0, np.nan, warped)
-        correlation = surface_correlation(original, warped, disparity, slope, window_px, clear)
-        return surface_mean(correlation, disparity, slope, reach, every)
+        correlation = surface_correlation(
+            original, warped, disparity, slope, window_px, clear, averaged
+        )
+        return surface_mean(correlation, disparity, slope, reach, every, wanted)
 
     elsewhere = np.full((rows, cols), np.nan, np.float32)
     shifted = np.full((rows, cols), np.nan, np.float32)

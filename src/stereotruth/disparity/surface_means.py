@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
-from ..epipolar.surface_correlation import BLOCK, columns_inside, surface_of_row, tolerance_px
+from ..epipolar.surface_correlation import (
+    BLOCK,
+    columns_inside,
+    surface_of_row,
+    tolerance_px,
+    wanted_run,
+)
 from ..epipolar.warping import warp_rows
 from ..kernels import kernel
 from .image_patches import Patch
@@ -49,16 +55,23 @@ def _surface_mean(
     slope: Singles,
     reach: int,
     every: int,
+    wanted: Bools,
     out: Singles,
 ) -> None:
-    """``voters``: disparity of the pixels that count, else NaN."""
+    """``voters``: disparity of the pixels that count, else NaN. NaN where nothing is ``wanted``,
+    but for some gaps."""
     rows, cols = disparity.shape
+    out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     sums = np.empty(2 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
-        for x0 in range(0, cols, BLOCK):
-            size = min(BLOCK, cols - x0)
+        end_of_run = 0
+        while True:
+            x0, end_of_run = wanted_run(wanted, y, end_of_run)
+            if x0 == cols:
+                break
+            size = end_of_run - x0
             surface_of_row(disparity, slope, y, x0, size, surface)
             sums[:] = zero
             for step_down in range(-reach, reach + 1, every):
@@ -87,11 +100,13 @@ def surface_mean(
     slope: NDArray[np.floating],
     reach: int = VOTE_PX,
     every: int = VOTE_STEP,
+    wanted: Bools | None = None,
 ) -> Singles:
     """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
 
     ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
-    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value.
+    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value. Of the
+    ``wanted`` [h, w] pixels alone where these are given.
     """
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     known = np.isfinite(values)
@@ -103,6 +118,7 @@ def surface_mean(
         np.ascontiguousarray(slope, dtype=np.float32),
         reach,
         every,
+        np.ones(disparity.shape, np.bool_) if wanted is None else wanted,
         out,
     )
     return out

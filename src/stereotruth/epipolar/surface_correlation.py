@@ -12,11 +12,13 @@ from ..kernels import inner, kernel
 from .one_surface import BEND, SURFACE_PX
 
 Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 # Pixels of a row that are worked on at once, one per vector lane: each window's sums are added in
 # one order, whatever the block. 52 ns a pixel (window 9) against 240 window by window. What belongs
 # together lies at constant distances in one array: LLVM vectorises only if few may overlap.
 BLOCK = 256
+GAP = 8  # pixels that nobody wants and that end no run of wanted ones
 DECIDED = 2.0  # standard deviations of a chance correlation that an expected one must reach
 
 
@@ -29,6 +31,23 @@ def surface_of_row(
         c[k] = disparity[y, x0 + k]
         c[BLOCK + k] = slope[0, y, x0 + k]
         c[2 * BLOCK + k] = slope[1, y, x0 + k]
+
+
+@inner
+def wanted_run(wanted: Bools, y: int, x: int) -> tuple[int, int]:
+    """The next pixels [start, end) of a row from column ``x`` on that are worked on at once: all
+    ``wanted`` ones up to a gap, BLOCK at most; ``start`` is the number of columns if none is left.
+    """
+    cols = wanted.shape[1]
+    while x < cols and not wanted[y, x]:
+        x += 1
+    end = x
+    for k in range(x, min(x + BLOCK, cols)):
+        if wanted[y, k]:
+            end = k + 1
+        elif k - end >= GAP:
+            break
+    return x, end
 
 
 @inner
@@ -52,19 +71,25 @@ def _correlation(
     slope: Singles,
     half: int,
     noise: tuple[float, float],
+    wanted: Bools,
     out: Singles,
     expected: Singles,
 ) -> None:
     """``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both
-    images."""
+    images. NaN where nothing is ``wanted``, but for some gaps."""
     rows, cols = left.shape
+    out[:], expected[:] = np.nan, np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     centre = np.empty(2 * BLOCK, np.float32)
     sums = np.empty(6 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
-        for x0 in range(0, cols, BLOCK):
-            size = min(BLOCK, cols - x0)
+        end_of_run = 0
+        while True:
+            x0, end_of_run = wanted_run(wanted, y, end_of_run)
+            if x0 == cols:
+                break
+            size = end_of_run - x0
             surface_of_row(disparity, slope, y, x0, size, surface)
             centre[:size] = left[y, x0 : x0 + size]
             centre[BLOCK : BLOCK + size] = warped[y, x0 : x0 + size]
@@ -117,18 +142,21 @@ def surface_correlation(
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     window: int,
-    clear: NDArray[np.bool_] | None = None,
+    clear: Bools | None = None,
+    wanted: Bools | None = None,
 ) -> Singles:
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
 
-    Of these, the ``clear`` [h, w] ones alone where that is given.
+    Of these, the ``clear`` [h, w] ones alone where that is given; of the ``wanted`` [h, w] pixels
+    alone where these are.
 
     ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
     where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
     px) is wide; 0 where either image is constant. In float32, about the centre's values: within
     1e-5 of float64.
     """
-    return correlation_and_expected(left, warped, disparity, slope, window, (0.0, 0.0), clear)[0]
+    none = 0.0, 0.0
+    return correlation_and_expected(left, warped, disparity, slope, window, none, clear, wanted)[0]
 
 
 def correlation_and_expected(
@@ -138,7 +166,8 @@ def correlation_and_expected(
     slope: NDArray[np.floating],
     window: int,
     noise: tuple[float, float],
-    clear: NDArray[np.bool_] | None = None,
+    clear: Bools | None = None,
+    wanted: Bools | None = None,
 ) -> tuple[Singles, Singles]:
     """:func:`surface_correlation`, and the one that images of the same ground have on the average.
 
@@ -157,6 +186,7 @@ def correlation_and_expected(
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
         noise,
+        np.ones(left.shape, np.bool_) if wanted is None else wanted,
         out,
         expected,
     )
