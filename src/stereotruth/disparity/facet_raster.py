@@ -22,8 +22,6 @@ Bools = NDArray[np.bool_]
 
 # What lies in front of a surface by less is the surface itself.
 OCCLUSION_TOLERANCE_PX = 0.25
-# Faces of a prism, of its vertices 0, 1, 2 at the top and 3, 4, 5 below these.
-_FACES = ((0, 1, 2), (0, 1, 3), (1, 3, 4), (1, 2, 4), (2, 4, 5), (2, 0, 5), (0, 5, 3))
 
 
 class RightPixels(NamedTuple):
@@ -229,13 +227,31 @@ def _range(values: Floats) -> tuple[float, float]:
     return low, high
 
 
+@inner
+def _three(values: Floats, a: int, b: int, c: int) -> tuple[float, float, float]:
+    return values[a], values[b], values[c]
+
+
+@inner
+def _faces_camera(x: Floats, y: Floats, d: Floats, i: int) -> bool:
+    """Whether a camera sees the side of a prism from corner ``i`` of its triangle to the next one
+    from outside: then the third corner lies behind the side's plane. ``x``, ``y``, ``d`` [6]:
+    position in its image and disparity.
+
+    All corners at the top have one height, as those below have, so that sides are planes.
+    """
+    j, k = (i + 1) % 3, (i + 2) % 3
+    gx, gy = plane_slopes(_three(x, i, j, 3 + i), _three(y, i, j, 3 + i), _three(d, i, j, 3 + i))
+    return d[i] + gx * (x[k] - x[i]) + gy * (y[k] - y[i]) > d[k]
+
+
 @kernel
 def raster_prisms(prisms: Prisms, first: tuple[int, int], z_buffer: Floats) -> None:
     """Raises ``z_buffer`` to the greatest disparity that prisms may have (eq. 7 of
     docs/explanation/surface.md)."""
-    any_prism = np.empty(z_buffer.shape, np.int32)
     rows, cols = z_buffer.shape
-    x, y, xr = np.empty(6), np.empty(6), np.empty(6)
+    x, y, xr, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    to = first, 0, z_buffer, np.empty(z_buffer.shape, np.int32)
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 1, y)
         low, high = _range(y)
@@ -247,9 +263,14 @@ def raster_prisms(prisms: Prisms, first: tuple[int, int], z_buffer: Floats) -> N
         if max(np.ceil(low), first[1]) > min(np.floor(high), first[1] + cols - 1):
             continue
         _at_heights(prisms, t, 2, xr)
-        for a, b, c in _FACES:
-            d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
-            _raster_left((x[a], x[b], x[c]), (y[a], y[b], y[c]), d, first, t, z_buffer, any_prism)
+        for k in range(6):
+            d[k] = x[k] - xr[k]
+        _raster_left(_three(x, 0, 1, 2), _three(y, 0, 1, 2), _three(d, 0, 1, 2), *to)
+        for i in range(3):
+            j = (i + 1) % 3
+            if _faces_camera(x, y, d, i):
+                for a, b, c in ((i, j, 3 + i), (j, 3 + i, 3 + j)):
+                    _raster_left(_three(x, a, b, c), _three(y, a, b, c), _three(d, a, b, c), *to)
 
 
 @kernel
@@ -258,7 +279,8 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
     docs/explanation/surface.md)."""
     first, width = pixels.first, pixels.width
     rows = (pixels.start.size - 1) // width
-    x, y, xr = np.empty(6), np.empty(6), np.empty(6)
+    x, y, xr, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    to = pixels, hidden
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 3, y)
         low, high = _range(y)
@@ -269,9 +291,14 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         if max(np.floor(low), first[1]) > min(np.floor(high), first[1] + width - 1):
             continue
         _at_heights(prisms, t, 0, x)
-        for a, b, c in _FACES:
-            d = (x[a] - xr[a], x[b] - xr[b], x[c] - xr[c])
-            _hide_right((xr[a], xr[b], xr[c]), (y[a], y[b], y[c]), d, pixels, hidden)
+        for k in range(6):
+            d[k] = x[k] - xr[k]
+        _hide_right(_three(xr, 0, 1, 2), _three(y, 0, 1, 2), _three(d, 0, 1, 2), *to)
+        for i in range(3):
+            j = (i + 1) % 3
+            if _faces_camera(xr, y, d, i):
+                for a, b, c in ((i, j, 3 + i), (j, 3 + i, 3 + j)):
+                    _hide_right(_three(xr, a, b, c), _three(y, a, b, c), _three(d, a, b, c), *to)
 
 
 @kernel

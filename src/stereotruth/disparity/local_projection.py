@@ -136,7 +136,8 @@ def _at_points(
     out: Floats,
     rise: Singles,
 ) -> int:
-    """Returns how many points lie in cubes that are not ``good``; ``rise`` [4, n or 0].
+    """Returns how many points lie in cubes that are not ``good``: of these out[0] is NaN; ``rise``
+    [4, n or 0].
 
     By runs of points in one cube, and blocks of these through small arrays: vectorised.
     """
@@ -176,6 +177,8 @@ def _at_points(
             values[3 * _RUN + m] = _cubic(c, 60, x, y, z)
         for axis in range(4):
             out[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
+        if not good[cube]:
+            out[0, start:end] = np.nan
         if rise.size:
             for m in range(size):
                 x, y, z = position[m], position[_RUN + m], position[2 * _RUN + m]
@@ -285,7 +288,7 @@ class LocalProjection:
         """:meth:`at_points`; fills ``rise`` unless it is empty."""
         out, lattice = np.empty((4, lon_q.size)), (lon_q, lat_q, h_q)
         if _at_points(self.low, self.shape, self.coefficients, self.good, *lattice, out, rise):
-            bad = ~self.good[self._cube(*(q >> CUBE_BITS for q in lattice))]
+            bad = np.isnan(out[0])
             lon, lat, h = (q[bad] / per for q, per in zip(lattice, (_PER_DEG, _PER_DEG, _PER_M)))
             out[:, bad] = self.model.ground_to_epipolar(lon, lat, h)
             if rise.size:

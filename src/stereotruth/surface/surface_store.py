@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG
 from ..products.files import read_sealed
 from .region import Region
@@ -150,9 +151,20 @@ class WindowSurface:
         return out
 
 
+@kernel
+def _height_range(h: NDArray[np.int64], corner: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Least and greatest height [n, 2] of the vertices of triangles [n, 3]."""
+    out = np.empty((len(corner), 2), np.int64)
+    for t in range(len(corner)):
+        a, b, c = h[corner[t, 0]], h[corner[t, 1]], h[corner[t, 2]]
+        out[t, 0], out[t, 1] = min(a, b, c), max(a, b, c)
+    return out
+
+
 def _surface(vertices: Vertices, arrays: dict[str, NDArray]) -> GroundSurface:
-    h, whole, top = vertices.h_q, arrays["whole"], arrays["top"]
-    whole_range = np.stack([h[whole].min(axis=1), h[whole].max(axis=1)], axis=1)
+    whole, top = arrays["whole"], arrays["top"]
+    whole_range = _height_range(vertices.h_q, whole)
+    top_range = _height_range(vertices.h_q, top)
     residual = arrays["top_residual"].astype(np.float64)
     undecided = np.concatenate([whole, arrays["strip"]])
     return GroundSurface(
@@ -163,7 +175,7 @@ def _surface(vertices: Vertices, arrays: dict[str, NDArray]) -> GroundSurface:
         undecided=undecided,
         height_range=np.concatenate([whole_range, arrays["strip_range"].astype(np.int64)]),
         whole=len(whole),
-        tops=RoughTops(top, residual, np.ptp(h[top], axis=1), arrays["is_gentle"]),
+        tops=RoughTops(top, residual, top_range[:, 1] - top_range[:, 0], arrays["is_gentle"]),
         facet_origin=arrays["facet"][:, 0],
         undecided_origin=undecided[:, 0],
     )
