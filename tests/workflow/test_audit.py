@@ -6,6 +6,8 @@ import csv
 import json
 import shutil
 
+import pytest
+
 ARGUMENTS = ["--configfile", "tiny.yaml", "later.yaml"]
 
 
@@ -21,6 +23,7 @@ def test_the_workflow_s_own_dataset_has_no_faults(tiled, later):
     assert abs(found["pooled"]["label_bias_px"]["median"]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
     audited = later.copy(tmp_path / "audited")
     (audited.folder / "limit.yaml").write_text("audit: {parallax_px: 0.2}\n")

@@ -47,6 +47,7 @@ def own(made, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_project_is_checked_and_carried_on(own):
     """With tiles of another size; what was copied serves, and is not made again."""
     checked = call("check", folder=own)

@@ -33,6 +33,7 @@ def complete(made, tmp_path_factory):
     return project
 
 
+@pytest.mark.slow
 def test_the_dataset_has_the_forms_that_are_asked_for(complete):
     tiles = StereoDataset("t", complete.folder / "dataset", "stereotruth", RANGE)
     names = {pair.name for pair in tiles.pairs(labelled=True)}
@@ -49,6 +50,7 @@ def test_the_dataset_has_the_forms_that_are_asked_for(complete):
         assert look.crs.is_projected and look.count == 4
 
 
+@pytest.mark.slow
 def test_a_second_call_makes_nothing_again(complete):
     assert complete.plan("dataset", "--configfile", "tiny.yaml", "forms.yaml") == {}
 

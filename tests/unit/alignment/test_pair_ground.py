@@ -41,7 +41,7 @@ def strewn(half_m: float, spacing: float = 1.2) -> np.ndarray:
 def stores(tmp_path_factory) -> tuple[Path, Path, Footprint]:
     """Of the whole file, and of the pair's ground."""
     folder = tmp_path_factory.mktemp("far")
-    xyz = strewn(800.0)
+    xyz = strewn(550.0)
     write_las(folder / "a.laz", xyz=xyz, return_number=np.ones(len(xyz), np.uint8))
     model = surfaces_of(True)[0]
     outlines = pair_outlines(model.left, model.right, (SIZE, SIZE))

@@ -25,8 +25,8 @@ from ...synthetic.stores import tree
 def scene(tmp_path, monkeypatch) -> Scene:
     """Small blocks, so that there are many; stores that say what they are made of."""
     monkeypatch.setattr("stereotruth.disparity.project.SHARD", 128)
-    monkeypatch.setattr("stereotruth.disparity.project.CHUNK", 32)
-    monkeypatch.setattr("stereotruth.surface.make_surface.block_side", lambda scale: 64)
+    monkeypatch.setattr("stereotruth.disparity.project.CHUNK", 64)
+    monkeypatch.setattr("stereotruth.surface.make_surface.block_side", lambda scale: 256)
     monkeypatch.setattr("stereotruth.surface.make_surface.group_blocks", lambda *_: 1)
     (tmp_path / "scene").mkdir()
     scene = Scene(tmp_path / "scene", box=True)
