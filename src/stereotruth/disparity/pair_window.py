@@ -70,14 +70,16 @@ class WindowLabels:
     """Labels of a window and why its other pixels have none; arrays [h, w], margin included.
 
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
-    ``surface_class`` (ASPRS) of what a pixel shows; ``point_count``: points used; ``correlation``:
-    coefficient of both images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
+    ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
+    1970-01-01, 0 for not known (None with the recipe paper); ``point_count``: points used; ``correlation``: coefficient of both
+    images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
     """
 
     status: Bytes
     labels: Labels
     height: Floats
     surface_class: Bytes
+    day: NDArray[np.uint16] | None
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
@@ -92,6 +94,7 @@ class WindowLabels:
             labels=labels,
             height=self.height[part],
             surface_class=self.surface_class[part],
+            day=None if self.day is None else self.day[part],
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],

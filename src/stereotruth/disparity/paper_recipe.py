@@ -72,6 +72,7 @@ def paper_labels(
         labels=labels,
         height=pixels.highest,
         surface_class=pixels.surface_class,
+        day=None,
         point_count=pixels.count,
         correlation=pixels.correlation,
         change=np.zeros(status.shape, np.uint8),

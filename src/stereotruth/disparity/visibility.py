@@ -110,8 +110,8 @@ class VisibleSurface:
     ``visibility``: NO_FACET, VISIBLE (from both cameras), PRISM_IN_LEFT (an undecided triangle may
     be nearer to the left camera), PRISM_IN_RIGHT (to the right one), FACET_IN_RIGHT (a facet hides
     it from there). ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px² (of the points
-    alone), ``height`` m and ``surface_class`` (ASPRS, of the nearest vertex) of the nearest facet,
-    NaN (0) where there is none. ``bulging``: whether the surface bulges out of its facet.
+    alone), ``height`` m, ``surface_class`` (ASPRS) and ``day`` (both of the nearest vertex) of the
+    nearest facet, NaN (0) where there is none. ``bulging``: whether the surface bulges out of its facet.
     ``projected``: all of it in both images.
     """
 
@@ -121,6 +121,7 @@ class VisibleSurface:
     variance: Floats
     height: Floats
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint16]
     bulging: Bools
     projected: ProjectedSurface
 
@@ -148,10 +149,10 @@ def visible_surface(
         visibility[row[order], col[order]] = np.where(by_facet, FACET_IN_RIGHT, in_right)
 
     values = PixelValues.none(shape)
-    vertices = surface.vertices
-    classes, count = vertices.surface_class, vertices.count
+    of = surface.vertices
+    of_vertices = of.h_q, of.surface_class, of.day, of.count
     facets = FacetValues(
-        projected.xy, surface.facet, vertices.h_q, classes, count, surface.variance, surface.bulge
+        projected.xy, surface.facet, *of_vertices, surface.variance, surface.bulge
     )
     interpolate(facets, index, first, values)
     turned = (visibility == VISIBLE) & (1.0 - values.slope[0] < LEAST_FACET_WIDTH)
@@ -164,6 +165,7 @@ def visible_surface(
         variance=values.variance * step_px**2,
         height=(values.height + values.rise) * LATTICE_M,
         surface_class=values.surface_class,
+        day=values.day,
         bulging=values.rise > 0.0,
         projected=projected,
     )
