@@ -113,7 +113,8 @@ class Crowns:
 
     ``visible``: from both cameras. ``labels``: disparity px, slope, variance px² (of the points and
     of what is between them); ``height`` m, ``surface_class`` (ASPRS) and ``day`` of the nearest
-    point: NaN (0) where there is none. ``tops`` px: disparity of the nearest triangle of tops, steep ones too.
+    point: NaN (0) where there is none. ``tops`` px: disparity of the nearest triangle of tops,
+    steep ones too.
     """
 
     visible: Bools

@@ -45,8 +45,8 @@ class FacetValues(NamedTuple):
     """Triangles ``corner`` [m, 3] of vertices [n] at ``xy`` [4, n], and what is interpolated in
     them.
 
-    ``h`` (lattice steps), ``surface_class``, ``day``, ``count`` of each vertex; ``variance`` (lattice
-    steps²) and ``bulge`` (lattice steps) of each triangle.
+    ``h`` (lattice steps), ``surface_class``, ``day``, ``count`` of each vertex; ``variance``
+    (lattice steps²) and ``bulge`` (lattice steps) of each triangle.
     """
 
     xy: Floats

@@ -71,8 +71,9 @@ class WindowLabels:
 
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
-    1970-01-01, 0 for not known (None with the recipe paper); ``point_count``: points used; ``correlation``: coefficient of both
-    images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
+    1970-01-01, 0 for not known (None with the recipe paper); ``point_count``: points used;
+    ``correlation``: coefficient of both images; ``change``: why a pixel has changed
+    (:class:`.reason.Reason`).
     """
 
     status: Bytes

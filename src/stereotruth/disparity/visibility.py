@@ -111,8 +111,8 @@ class VisibleSurface:
     be nearer to the left camera), PRISM_IN_RIGHT (to the right one), FACET_IN_RIGHT (a facet hides
     it from there). ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px² (of the points
     alone), ``height`` m, ``surface_class`` (ASPRS) and ``day`` (both of the nearest vertex) of the
-    nearest facet, NaN (0) where there is none. ``bulging``: whether the surface bulges out of its facet.
-    ``projected``: all of it in both images.
+    nearest facet, NaN (0) where there is none. ``bulging``: whether the surface bulges out of its
+    facet. ``projected``: all of it in both images.
     """
 
     visibility: NDArray[np.uint8]
@@ -149,11 +149,9 @@ def visible_surface(
         visibility[row[order], col[order]] = np.where(by_facet, FACET_IN_RIGHT, in_right)
 
     values = PixelValues.none(shape)
-    of = surface.vertices
-    of_vertices = of.h_q, of.surface_class, of.day, of.count
-    facets = FacetValues(
-        projected.xy, surface.facet, *of_vertices, surface.variance, surface.bulge
-    )
+    vertices = surface.vertices
+    of_vertices = vertices.h_q, vertices.surface_class, vertices.day, vertices.count
+    facets = FacetValues(projected.xy, surface.facet, *of_vertices, surface.variance, surface.bulge)
     interpolate(facets, index, first, values)
     turned = (visibility == VISIBLE) & (1.0 - values.slope[0] < LEAST_FACET_WIDTH)
     visibility[turned] = FACET_IN_RIGHT

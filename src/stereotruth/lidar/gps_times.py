@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 
-Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint32]
 Days = NDArray[np.uint16]
 
 ADJUSTED_S = 1e9
@@ -43,7 +43,7 @@ def has_days(header: laspy.LasHeader) -> bool:
 
 
 @kernel
-def _encode(times: NDArray[np.float64], seen: NDArray[np.bool_], code: Bytes) -> None:
+def _encode(times: NDArray[np.float64], seen: NDArray[np.bool_], code: Words) -> None:
     """Fill ``code`` [n] from times (s, adjusted), and mark their days in ``seen``.
 
     0 and what is no time since 1980 were never filled in.
@@ -62,12 +62,9 @@ class GpsDays:
 
     seen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(1 << 16, np.bool_))
 
-    def take(self, points: laspy.ScaleAwarePointRecord) -> Bytes:
-        """Codes [n] of points."""
-        times = np.ascontiguousarray(points.array["gps_time"])
-        code = np.empty(times.size, np.uint8)
-        _encode(times, self.seen, code)
-        return code
+    def take(self, points: laspy.ScaleAwarePointRecord, code: Words) -> None:
+        """Fill ``code`` [n] with those of points."""
+        _encode(np.ascontiguousarray(points.array["gps_time"]), self.seen, code)
 
     @property
     def days(self) -> list[str]:

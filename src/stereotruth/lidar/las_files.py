@@ -166,15 +166,15 @@ class PointTally:
         drop_classes: Sequence[int],
     ) -> tuple[Floats, NDArray[np.uint32]]:
         """Coordinates [3, n] and attributes [n], see _unpack, of the points to keep."""
-        days = self.days.take(points) if has_days(header) else np.empty(0, np.uint8)
         unwanted = np.isin(np.arange(256), drop_classes)
         raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
-        xyz, attributes = np.empty((3, len(points))), np.empty(len(points), np.uint32)
+        xyz, attributes = np.empty((3, len(points))), np.zeros(len(points), np.uint32)
+        if has_days(header):
+            self.days.take(points, attributes)
         kept = _unpack(
             raw,
             header.point_format.id >= 6,
             unwanted,
-            days,
             np.asarray(header.scales, np.float64),
             np.asarray(header.offsets, np.float64),
             xyz,
@@ -288,7 +288,6 @@ def _unpack(
     raw: Bytes,
     extended: bool,
     unwanted: NDArray[np.bool_],
-    days: Bytes,
     scale: Floats,
     offset: Floats,
     xyz: Floats,
@@ -301,8 +300,8 @@ def _unpack(
 
     ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
     in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
-    class; ``days`` [n]: codes of the points' days, or [0]. Attributes are class + 256 return number
-    + 2**16 number of returns + 2**20 code of the day. ``counts`` [2, 257]: of kept and of dropped
+    class. Attributes are class + 256 return number + 2**16 number of returns + 2**20 code of the
+    day; of all points, ``attributes`` have this code. ``counts`` [2, 257]: of kept and of dropped
     points by class, the last of withheld ones; ``by_return`` [16]: of all points by return number.
     ``limits`` [2, 3]: lowest and highest stored coordinates of all.
     """
@@ -326,8 +325,7 @@ def _unpack(
         xyz[0, kept] = x * scale[0] + offset[0]
         xyz[1, kept] = y * scale[1] + offset[1]
         xyz[2, kept] = z * scale[2] + offset[2]
-        day = np.int64(days[i]) if days.size else 0
-        attributes[kept] = kind | returns | day << 20
+        attributes[kept] = kind | returns | np.int64(attributes[i]) << 20
         kept += 1 - drop
     limits[0] = low_x, low_y, low_z
     limits[1] = high_x, high_y, high_z

@@ -41,7 +41,7 @@ ARRAYS = {
     "height": "int32[n], above the WGS 84 ellipsoid, 1e-4 m",
     "surface_class": "uint8[n], ASPRS class of the highest point of the vertex",
     "count": "uint16[n], points that it is the mean of; 65535 stands for more, too",
-    "day": "uint16[n], of its highest point, since 1970-01-01, 0 for not known; [1] if all have one",
+    "day": "uint16[n], of its highest point, since 1970-01-01, 0 not known; [1] if all have one",
     "facet": "int32[m, 3], vertices of the facets",
     "variance": "float32[m], of a point's height there, (1e-4 m)²",
     "bulge": "float32[m], of the surface above the facet, 1e-4 m",
