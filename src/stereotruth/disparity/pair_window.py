@@ -80,10 +80,10 @@ class WindowLabels:
     labels: Labels
     height: Floats
     surface_class: Bytes
-    day: NDArray[np.uint16] | None
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
+    day: NDArray[np.uint16] | None = None
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -95,10 +95,10 @@ class WindowLabels:
             labels=labels,
             height=self.height[part],
             surface_class=self.surface_class[part],
-            day=None if self.day is None else self.day[part],
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],
+            day=None if self.day is None else self.day[part],
         )
 
     def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:

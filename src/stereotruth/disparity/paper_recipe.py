@@ -72,7 +72,6 @@ def paper_labels(
         labels=labels,
         height=pixels.highest,
         surface_class=pixels.surface_class,
-        day=None,
         point_count=pixels.count,
         correlation=pixels.correlation,
         change=np.zeros(status.shape, np.uint8),
