@@ -52,7 +52,8 @@ def surface_of_points() -> tuple[GroundSurface, Floats]:
     builder = VertexBuilder(scale, (0, 0), (400_000, 400_000))
     lon, lat = (np.rint(c / CELL_M * CELL[0]).astype(np.int64) for c in (x, y))
     ground, first = np.full(x.size, 2, np.uint8), np.ones(x.size, np.uint8)
-    builder.add(lon, lat, np.rint(h / LATTICE_M).astype(np.int64), ground, first)
+    days = np.zeros(x.size, np.uint16)
+    builder.add(lon, lat, np.rint(h / LATTICE_M).astype(np.int64), ground, first, days)
     return ground_surface(builder.built(), scale), np.stack([x, y, h])
 
 

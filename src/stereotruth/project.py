@@ -253,6 +253,13 @@ def names_in_pair(scene: sheets.Scene, images: Mapping[str, sheets.Image]) -> tu
     return by_file.get(key(scene.left_image), ""), by_file.get(key(scene.right_image), "")
 
 
+def days_of_pair(names: tuple[str, str], images: Mapping[str, sheets.Image]) -> tuple[str, str]:
+    """Days (ISO) on which a pair's left and right image were taken by the images sheet, empty where
+    it does not say it; ``names``: see :func:`names_in_pair`."""
+    left, right = (sheets.day_of(images[name].acquired) if name else None for name in names)
+    return left.isoformat() if left else "", right.isoformat() if right else ""
+
+
 def _remarks_on_lists(
     rows: Mapping[str, sheets.Scene], scenes: Mapping[str, sheets.Scene], settings: Configuration
 ) -> Iterator[str]:

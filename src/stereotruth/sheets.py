@@ -356,14 +356,14 @@ def with_images(
             )
         found[f"{view}_image"] = image.file
         found[f"{view}_mask"] = cells[f"{view}_mask"] or image.mask
-        dates.append(_day(image.acquired))
+        dates.append(day_of(image.acquired))
     if len(dates) == 2 and not cells["diachronic"] and None not in dates:
         apart = abs((dates[0] - dates[1]).days)
         found["diachronic"] = "true" if apart > DIACHRONIC_DAYS else ""
     return found
 
 
-def _day(acquired: str) -> date | None:
+def day_of(acquired: str) -> date | None:
     """Of a cell ``acquired``; None where it is empty."""
     time = acquisition_time(acquired) if acquired else None
     return time.date() if isinstance(time, datetime) else time

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from stereotruth.products.grids import Layer, atomic_store, create_grid, open_gr
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from .images import pattern
-from .las import write_las
+from .las import adjusted, write_las
 
 SIZE = (320, 280)  # cols, rows of both original images
 HALF = (16.0, 13.0)  # m east, north: half sides of the box
@@ -123,25 +124,37 @@ def points_on(box: bool, noise: float = 0.0, spacing: float = 0.4) -> np.ndarray
     return np.column_stack([LON + east / METRES[0], LAT + north / METRES[1], height])
 
 
-def write_points(folder: Path, points: np.ndarray, name: str = "points") -> Path:
+def write_points(
+    folder: Path,
+    points: np.ndarray,
+    name: str = "points",
+    day: int | np.ndarray | None = None,
+    acquired: Sequence[str] = (),
+) -> Path:
+    """Their store; ``day``: since 1970-01-01, in GPS times; ``acquired``: by a catalogue."""
     to_utm = pyproj.Transformer.from_crs("EPSG:4979", UTM, always_xy=True)
     folder.mkdir(exist_ok=True)
     xyz = np.column_stack(to_utm.transform(*points.T))
     first = np.ones(len(xyz), np.uint8)  # returns: no order of points tells another surface
-    write_las(folder / f"{name}.las", xyz=xyz, return_number=first)
-    ingest(folder / f"{name}.las", folder / f"{name}.points")
+    times = {}
+    if day is not None:
+        times = {"gps_time": adjusted(day + np.zeros(len(xyz))), "absolute": True}
+    write_las(folder / f"{name}.las", xyz=xyz, return_number=first, **times)
+    ingest(folder / f"{name}.las", folder / f"{name}.points", acquired=acquired)
     return folder / f"{name}.points"
 
 
+PAIR = ("view", "alignment", "surface")
 RUN = ("code", "workers", "scheduler", "scene", "max_points", "strip")
 
 
 def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):
-    """project_scene; ``options`` are its own, view and alignment, and those of its settings."""
+    """project_scene; ``options`` are its own, view, alignment and surface, and those of its
+    settings."""
     run = {name: options.pop(name) for name in RUN if name in options}
-    pair = {name: options.pop(name) for name in ("view", "alignment") if name in options}
+    pair = {name: options.pop(name) for name in PAIR if name in options}
     inputs = SceneInputs.of(left, right, stores, Settings(**options), **pair)
-    if inputs.point_stores:
+    if inputs.point_stores and inputs.surface is None:
         inputs = inputs.with_surface(out.parent / "surfaces")
     return project_scene(inputs, out, **{"code": "test", **run})
 

@@ -45,6 +45,7 @@ def thinned_surface(
     """
     xyz = rng.uniform(0, side, (points, 3))
     xyz[:, 2] = 900 + 40 * np.sin(xyz[:, 0] / 90) + 30 * np.cos(xyz[:, 1] / 70)
+    xyz[:, 2] *= min(1.0, side / 1000)  # inside of the cube
     xyz = np.round(xyz, 2)
     shares = 4.0 ** np.arange(levels)
     level = rng.choice(levels, points, p=shares / shares.sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from datetime import datetime
 from pathlib import Path
 
 import laspy
@@ -29,9 +30,13 @@ def write_las(
     scale: float = 0.001,
     seed: int = 0,
     xyz: np.ndarray | None = None,
+    absolute: bool = False,
     **fields: np.ndarray,
 ) -> np.ndarray:
-    """Random points on a square; returns their coordinates as stored, float64[n, 3]."""
+    """Random points on a square; returns their coordinates as stored, float64[n, 3].
+
+    ``absolute``: GPS times are.
+    """
     rng = np.random.default_rng(seed)
     if xyz is None:
         xyz = np.column_stack(
@@ -44,6 +49,8 @@ def write_las(
         header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", system.to_wkt().encode() + b"\0"))
         header.global_encoding.wkt = pdrf >= 6
     las = laspy.LasData(header)
+    if absolute:
+        las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     las.x, las.y, las.z = xyz.T
     values = {
         "classification": np.full(len(xyz), 2, np.uint8),
@@ -55,6 +62,12 @@ def write_las(
         setattr(las, name, value)
     las.write(path)
     return np.column_stack([las.x, las.y, las.z])
+
+
+def adjusted(day: np.ndarray) -> np.ndarray:
+    """Adjusted standard GPS time (s) of noon of days since 1970-01-01."""
+    before = (datetime(1980, 1, 6) - datetime(1970, 1, 1)).days
+    return (day - before + 0.5) * 86400.0 - 1e9
 
 
 def everything(store: PointStore) -> Points:

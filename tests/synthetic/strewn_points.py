@@ -61,5 +61,6 @@ def surface_of(
     scale = scale_of(spacing**-2)
     builder = VertexBuilder(scale, (0, 0), (1_000_000, 1_000_000))
     h = np.rint(height[kept] / LATTICE_M).astype(np.int64)
-    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
+    classes, returns = np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8)
+    builder.add(lon, lat, h, classes, returns, np.zeros(lon.size, np.uint16))
     return ground_surface(builder.built(), scale)

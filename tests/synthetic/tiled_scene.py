@@ -97,20 +97,24 @@ def make_scene(
     label_offset: float = 0.0,
     row_shift: float = 0.0,
     colour: bool = False,
+    lidar_days: tuple[int, int] = (0, 0),
+    acquired: tuple[str | None, str | None] = (None, None),
 ) -> SceneFiles:
     """Stores of one scene; labels end at epipolar row ``bare_from``.
 
     Planted errors: of the labels (px), and of the right image's rows (px, down). ``colour``: with
-    red, green and blue beside the grey images.
+    red, green and blue beside the grey images. ``lidar_days`` of labels left and right of the
+    middle; ``acquired``: of both images, by their deliveries.
     """
     model, views, disparity = geometry(turn, row_shift)
     attrs = {"epipolar": model.to_dict(), "provenance": {"made": "by hand"}}
     layer = Layer("uint16", 0, {"units": "1", "long_name": "grey value"})
     layers = dict.fromkeys(("image", *(COLOURS if colour else ())), layer)
-    for name, (inside, lon, lat, _) in zip(("left", "right"), views):
+    for name, taken, (inside, lon, lat, _) in zip(("left", "right"), acquired, views):
         grey = np.where(inside, np.rint(texture(lon, lat)), 0).astype(np.uint16)
+        told = attrs | {"acquired": taken}
         with atomic_store(folder / f"{name}.zarr") as path:
-            array = create_grid(path, model.shape, layers, chunk=64, shard=128, attrs=attrs)
+            array = create_grid(path, model.shape, layers, chunk=64, shard=128, attrs=told)
             array["image"][:] = grey
             for k, band in enumerate(COLOURS if colour else ()):
                 array[band][:] = grey + np.uint16(300 * k) * (grey > 0)
@@ -126,6 +130,7 @@ def make_scene(
             {
                 "disparity": Layer("float32", np.nan, meta),
                 "height": Layer("float32", np.nan, meta | {"units": "m"}),
+                "lidar_date": Layer("uint16", 0, meta | {"units": "days since 1970-01-01"}),
                 "status": Layer(
                     "uint8",
                     0,
@@ -138,6 +143,8 @@ def make_scene(
         )
         arrays["disparity"][:] = np.where(known, disparity + label_offset, np.nan)
         arrays["height"][:] = np.where(known, height, np.nan)
+        west = np.arange(model.shape[1]) < model.shape[1] // 2
+        arrays["lidar_date"][:] = np.where(known, np.where(west, *lidar_days), 0)
         arrays["status"][:] = np.where(known, 1, np.where(inside & (y < bare_from), 4, 0))
     stores = (folder / f"{name}.zarr" for name in ("scene", "left", "right"))
     return SceneFiles(folder.name, *stores)

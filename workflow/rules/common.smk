@@ -11,6 +11,7 @@ from stereotruth.project import (
     FILES,
     adjusted_scenes,
     check_fixed,
+    days_of_pair,
     file_of_image,
     is_synthetic,
     lidar_days,

@@ -43,6 +43,7 @@ rule export:
     params:
         script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
+        acquired=lambda w: [days_of_pair(IMAGE_NAMES[s.scene], IMAGES) for s in scenes_of(w.city)],
         city=lambda w: asdict(CITIES[w.city]),
         settings={
             **asdict(SETTINGS.tiles),

@@ -26,6 +26,7 @@ if __name__ == "__main__":
             given.right,
             given.alignment,
             of_right,
+            snakemake.params.acquired,
         )
         made = snakemake.output
         summary = export_city(

@@ -13,6 +13,7 @@ if __name__ == "__main__":
     parameters = {
         "lidar_crs": snakemake.params.lidar_crs,
         "drop_classes": snakemake.params.drop_classes,
+        "acquired": list(snakemake.params.acquired),
     }
 
     def ingest_file() -> None:

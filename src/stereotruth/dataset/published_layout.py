@@ -42,8 +42,8 @@ Conventions
   {rounding}
 - The right image of each pair is shifted by a whole number of px (right_offset_px in
   manifest.csv), which is already inside d: the disparity of the scene is d + right_offset_px.
-- height, class, agl, uncertainty, where there are such folders: layers on the grid of disp
-  (tiles.layers); nodata is tagged.
+- height, class, agl, uncertainty, lidar_date, where there are such folders: layers on the grid of
+  disp (tiles.layers); nodata is tagged.
 - Why a pixel has no label (status), and the way back to heights and to the original images
   (orientation), are in tiles/<City>/ under the same number; manifest.csv has their checksums there.
 - No ground lies in two splits: tiles of which two overlap are in one split, or in none and then

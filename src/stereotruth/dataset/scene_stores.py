@@ -23,7 +23,8 @@ from .sure_labels import Labels, tile_flags, tile_labels
 class SceneFiles(NamedTuple):
     """What export reads of one scene: its id and stores, and where it came from the alignment.
 
-    ``disparity_of_right``: the store of the right view's labels, if they are wanted.
+    ``disparity_of_right``: the store of the right view's labels, if they are wanted. ``acquired``:
+    days (ISO) of the left and right image by the images sheet, empty where their deliveries tell.
     """
 
     scene: str
@@ -32,6 +33,7 @@ class SceneFiles(NamedTuple):
     right: Path
     alignment: Path | None = None
     disparity_of_right: Path | None = None
+    acquired: tuple[str, str] = ("", "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class SceneStores:
 
     ``doubts``: warnings of the alignment, a refinement that was refused among them.
     ``disparity``, ``status``, and these of the right view (``of_right``), as the tiles have them.
+    ``acquired``: days (ISO) of the left and right image, empty where they are not known.
     """
 
     scene: str
@@ -52,6 +55,8 @@ class SceneStores:
     of_right: Mapping[str, Labels] | None
     surface_class: zarr.Array | None
     uncertainty: zarr.Array | None
+    lidar_date: zarr.Array | None
+    acquired: tuple[str, str]
     gcp_rms: float | None
     model: EpipolarModel
     sensors: Mapping[str, Mapping[str, Any]]
@@ -112,6 +117,11 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         of_right=of_right,
         surface_class=disparity.get("surface_class"),
         uncertainty=disparity.get("uncertainty"),
+        lidar_date=disparity.get("lidar_date"),
+        acquired=tuple(
+            day or view.attrs.get("acquired") or ""
+            for day, view in zip(item.acquired, (left, right))
+        ),
         gcp_rms=gcp_rms,
         model=model,
         sensors={"left": sensor_record(model.left), "right": sensor_record(model.right)},

@@ -42,12 +42,14 @@ class Tiles:
     `too_uncertain` (13). 0: none of them is in the tiles. All other labels are"""
 
     layers: Annotated[
-        tuple[Literal["height", "class", "agl", "uncertainty"], ...], AfterValidator(each_once)
+        tuple[Literal["height", "class", "agl", "uncertainty", "lidar_date"], ...],
+        AfterValidator(each_once),
     ] = ()
     """more files of each labelled tile, on the grid of `disp`: `height` (of what the label shows, m
     above the ellipsoid), `class` (LAS class), `agl` (m above the ground, by the LiDAR's class 2, or
-    a morphological filter where it has none), `uncertainty` (of the disparity, px); float32 with
-    nodata -9999, `class` uint8 with 0. They go into `dataset/` too, and `agl` and `class` into the
+    a morphological filter where it has none), `uncertainty` (of the disparity, px), `lidar_date`
+    (when the LiDAR measured it, days since 1970-01-01); float32 with nodata -9999, `class` uint8
+    and `lidar_date` uint16 with 0. They go into `dataset/` too, and `agl` and `class` into the
     truth of `dataset_us3d/`"""
 
 

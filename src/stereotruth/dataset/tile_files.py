@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.warping import agreement, warp_rows
 from ..errors import InputError
+from ..lidar.gps_times import number_of
 from ..products.files import link
 from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
@@ -295,6 +296,7 @@ def write_tile(
         "disparity_nodata": f"{cut.nodata:g}",
         "lon": f"{lon:.7f}",
         "lat": f"{lat:.7f}",
+        **_lidar_days(source, window, known),
         **check_cells(checks, cut.limits),
     }
     for value, meaning in cut.flags.items():
@@ -307,6 +309,25 @@ def write_tile(
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = sums.get(kind, "")
     return row, ring, checks
+
+
+def _lidar_days(
+    source: SceneStores, window: Window, known: NDArray[np.bool_]
+) -> dict[str, int | str]:
+    """Days from the LiDAR to both images: of a pair's labels (``known``), the median of those whose
+    day is known; empty where no such day, or none of the image, is."""
+    days = np.empty(0, np.uint16)
+    if source.lidar_date is not None:
+        rows, cols = known.shape
+        here = slice(window.row0, window.row0 + rows), slice(window.col0, window.col0 + cols)
+        days = np.asarray(source.lidar_date[here])[known]
+        days = np.sort(days[days > 0])
+    return {
+        f"lidar_days_{view}": number_of(taken) - int(days[days.size // 2])
+        if taken and days.size
+        else ""
+        for view, taken in zip(("left", "right"), source.acquired)
+    }
 
 
 def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:

@@ -28,6 +28,9 @@ def tile_layers(
     values: dict[str, NDArray[Any]] = {}
     if "class" in names:
         values["class"] = _classes(source, here)
+    if "lidar_date" in names:
+        dates = source.lidar_date
+        values["lidar_date"] = np.zeros(known.shape) if dates is None else dates[here]
     if "uncertainty" in names:
         sigma = source.uncertainty
         values["uncertainty"] = np.full(known.shape, np.nan) if sigma is None else sigma[here]

@@ -112,14 +112,16 @@ class Crowns:
     """What rough surfaces show at the centres of pixels; arrays [h, w].
 
     ``visible``: from both cameras. ``labels``: disparity px, slope, variance px² (of the points and
-    of what is between them); ``height`` m, ``surface_class`` (ASPRS, of the nearest point): NaN (0)
-    where there is none. ``tops`` px: disparity of the nearest triangle of tops, steep ones too.
+    of what is between them); ``height`` m, ``surface_class`` (ASPRS) and ``day`` of the nearest
+    point: NaN (0) where there is none. ``tops`` px: disparity of the nearest triangle of tops,
+    steep ones too.
     """
 
     visible: Bools
     labels: Labels
     height: Floats
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint16]
     tops: Floats
 
 
@@ -151,12 +153,14 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
 
     values = PixelValues.none(shape)
     none = np.zeros(len(corner))
-    facets = FacetValues(xy, corner, tops.h_q, tops.surface_class, tops.count, none, none)
+    of_vertices = tops.h_q, tops.surface_class, tops.day, tops.count
+    facets = FacetValues(xy, corner, *of_vertices, none, none)
     interpolate(facets, index, first, values)
     variance = _variance(rough, index, all_around, scale)
     labelled &= values.surface_class != WATER_CLASS
     labels = Labels(disparity, values.slope, variance)
-    return Crowns(labelled, labels, values.height * LATTICE_M, values.surface_class, tops_buffer)
+    of_pixels = values.height * LATTICE_M, values.surface_class, values.day
+    return Crowns(labelled, labels, *of_pixels, tops_buffer)
 
 
 def without_contours(
@@ -244,5 +248,6 @@ def with_crowns(
         labels=merged,
         height=height,
         surface_class=surface_class,
+        day=np.where(new, crowns.day, labels.day),
         correlation=correlation,
     )

@@ -50,6 +50,7 @@ def facet_labels(
         labels=labels,
         height=np.where(measured, pixels.highest, visible.height),
         surface_class=np.where(measured, pixels.surface_class, visible.surface_class),
+        day=visible.day,
         point_count=np.where(measured, pixels.count, 0),
         correlation=np.full(status.shape, np.nan),
         change=np.zeros(status.shape, np.uint8),

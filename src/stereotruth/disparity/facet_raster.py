@@ -59,14 +59,15 @@ class FacetValues(NamedTuple):
     """Triangles ``corner`` [m, 3] of vertices [n] at ``xy`` [4, n], and what is interpolated in
     them.
 
-    ``h`` (lattice steps), ``surface_class``, ``count`` of each vertex; ``variance`` (lattice
-    steps²) and ``bulge`` (lattice steps) of each triangle.
+    ``h`` (lattice steps), ``surface_class``, ``day``, ``count`` of each vertex; ``variance``
+    (lattice steps²) and ``bulge`` (lattice steps) of each triangle.
     """
 
     xy: Floats
     corner: Steps
     h: Ints
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint16]
     count: Steps
     variance: Floats
     bulge: Floats
@@ -75,19 +76,21 @@ class FacetValues(NamedTuple):
 class PixelValues(NamedTuple):
     """What triangles have at the centres of pixels [h, w]: ``slope`` [2, h, w] of the disparity;
     ``variance`` (lattice steps²), ``height`` and ``rise`` of the surface above its triangle
-    (lattice steps); ``surface_class`` of the nearest vertex."""
+    (lattice steps); ``surface_class`` and ``day`` of the nearest vertex."""
 
     slope: Floats
     variance: Floats
     height: Floats
     rise: Floats
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint16]
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> PixelValues:
         """Of pixels without a triangle."""
         height, classes = np.full(shape, np.nan), np.zeros(shape, np.uint8)
-        return cls(np.zeros((2, *shape)), np.zeros(shape), height, np.zeros(shape), classes)
+        values = np.zeros((2, *shape)), np.zeros(shape), height, np.zeros(shape)
+        return cls(*values, classes, np.zeros(shape, np.uint16))
 
 
 @inner
@@ -310,7 +313,7 @@ def interpolate(
     xy, corner, h, count = facets.xy, facets.corner, facets.h, facets.count
     classes, noise, bulge = facets.surface_class, facets.variance, facets.bulge
     slope, variance, height, rise = out.slope, out.variance, out.height, out.rise
-    surface_class = out.surface_class
+    surface_class, day = out.surface_class, out.day
     rows, cols = index.shape
     for j in range(rows):
         for i in range(cols):
@@ -333,7 +336,8 @@ def interpolate(
             )
             rise[j, i] = bulge[t] * (a * b + b * c + c * a)
             height[j, i] = h[v[0]] + b * float(h[v[1]] - h[v[0]]) + c * float(h[v[2]] - h[v[0]])
-            surface_class[j, i] = classes[v[0] if a >= b and a >= c else v[1] if b >= c else v[2]]
+            nearest = v[0] if a >= b and a >= c else v[1] if b >= c else v[2]
+            surface_class[j, i], day[j, i] = classes[nearest], facets.day[nearest]
 
 
 def right_pixels(

@@ -185,8 +185,8 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     raster_prisms(prisms, first, undecided)
     values = PixelValues.none(shape)
     facets = FacetValues(
-        xy, surface.facet, every.h_q, every.surface_class, every.count, surface.variance,
-        surface.bulge,
+        xy, surface.facet, every.h_q, every.surface_class, every.day, every.count,
+        surface.variance, surface.bulge,
     )  # fmt: skip
     interpolate(facets, index, first, values)
     is_higher = undecided > above + OCCLUSION_TOLERANCE_PX * inputs.pixel_m

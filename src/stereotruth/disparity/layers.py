@@ -12,6 +12,7 @@ from .right_view import Pair
 from .settings import Settings
 from .status import Status, is_labelled
 
+LIDAR_DATE = "lidar_date"
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
 
@@ -37,6 +38,8 @@ def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str,
     count = np.where(kept, np.minimum(labels.point_count, GREATEST_COUNT), 0)
     layers["point_count"] = count.astype(np.uint16)
     layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
+    if labels.day is not None:
+        layers[LIDAR_DATE] = np.where(known, labels.day, 0).astype(np.uint16)
     layers["status"] = labels.status
     layers["change"] = labels.change
     return layers
@@ -66,6 +69,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "long_name": "LAS class (ASPRS) of the highest point used",
         "comment": "0: never classified, or no label",
     }
+    date = {LIDAR_DATE: Layer("uint16", 0, _lidar_date())} if on_surface else {}
     return {
         "disparity": Layer("float32", np.nan, _disparity(on_surface, view)),
         "status": Layer("uint8", 0, _status(settings, view, masked)),
@@ -74,6 +78,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "correlation": Layer("float32", np.nan, _correlation(settings, view)),
         "uncertainty": Layer("float32", np.nan, _uncertainty(on_surface)),
         "surface_class": Layer("uint8", 0, surface_class),
+        **date,
         "change": Layer("uint8", 0, _change()),
     }
 
@@ -147,6 +152,19 @@ def _change() -> dict[str, object]:
         "moved": "vehicles, and what else is as small and low",
         "ground": "the ground itself, as crops, earthworks",
         "unknown": "the images contradict the LiDAR, and nothing tells what has changed",
+    }
+
+
+def _lidar_date() -> dict[str, object]:
+    """Attributes of the layer lidar_date, which xarray reads as dates."""
+    return {
+        "units": "days since 1970-01-01",
+        "calendar": "proleptic_gregorian",
+        "long_name": "day on which the LiDAR measured what the label shows: that of the nearest "
+        "vertex of the surface, by the GPS time of its highest point, else the middle of the days "
+        "of its file by the list of tiles",
+        "nodata": 0,
+        "_FillValue": 0,  # not known, or no label
     }
 
 

@@ -82,8 +82,10 @@ class WindowLabels:
     """Labels of a window and why its other pixels have none; arrays [h, w], margin included.
 
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
-    ``surface_class`` (ASPRS) of what a pixel shows; ``point_count``: points used; ``correlation``:
-    coefficient of both images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
+    ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
+    1970-01-01, 0 for not known (None with the recipe paper); ``point_count``: points used;
+    ``correlation``: coefficient of both images; ``change``: why a pixel has changed
+    (:class:`.reason.Reason`).
     """
 
     status: Bytes
@@ -93,6 +95,7 @@ class WindowLabels:
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
+    day: NDArray[np.uint16] | None = None
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -107,6 +110,7 @@ class WindowLabels:
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],
+            day=None if self.day is None else self.day[part],
         )
 
     def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:

@@ -102,9 +102,9 @@ class VisibleSurface:
     ``visibility``: NO_FACET, VISIBLE (from both cameras), PRISM_IN_LEFT (an undecided triangle may
     be nearer to the left camera), PRISM_IN_RIGHT (to the right one), FACET_IN_RIGHT (a facet hides
     it from there). ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px² (of the points
-    alone), ``height`` m and ``surface_class`` (ASPRS, of the nearest vertex) of the nearest facet,
-    NaN (0) where there is none. ``bulging``: whether the surface bulges out of its facet.
-    ``projected``: all of it in both images.
+    alone), ``height`` m, ``surface_class`` (ASPRS) and ``day`` (both of the nearest vertex) of the
+    nearest facet, NaN (0) where there is none. ``bulging``: whether the surface bulges out of its
+    facet. ``projected``: all of it in both images.
     """
 
     visibility: NDArray[np.uint8]
@@ -113,6 +113,7 @@ class VisibleSurface:
     variance: Floats
     height: Floats
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint16]
     bulging: Bools
     projected: ProjectedSurface
 
@@ -141,10 +142,8 @@ def visible_surface(
 
     values = PixelValues.none(shape)
     vertices = surface.vertices
-    classes, count = vertices.surface_class, vertices.count
-    facets = FacetValues(
-        projected.xy, surface.facet, vertices.h_q, classes, count, surface.variance, surface.bulge
-    )
+    of_vertices = vertices.h_q, vertices.surface_class, vertices.day, vertices.count
+    facets = FacetValues(projected.xy, surface.facet, *of_vertices, surface.variance, surface.bulge)
     interpolate(facets, index, first, values)
     turned = (visibility == VISIBLE) & (1.0 - values.slope[0] < LEAST_FACET_WIDTH)
     visibility[turned] = FACET_IN_RIGHT
@@ -156,6 +155,7 @@ def visible_surface(
         variance=values.variance * step_px**2,
         height=(values.height + values.rise) * LATTICE_M,
         surface_class=values.surface_class,
+        day=values.day,
         bulging=values.rise > 0.0,
         projected=projected,
     )

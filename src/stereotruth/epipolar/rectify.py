@@ -23,11 +23,13 @@ from ..numerics.cubic_convolution import SIX_POINT_RADIUS
 from ..products.grids import Layer, Strip, blocks
 from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, resumable_grid
+from .acquisition import read_acquisition
 from .colours import COLOURS
 from .image_noise import noise_of, resampled_noise
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
+from .rpc import SensorModel
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -190,6 +192,13 @@ def rectify_image(
     }
 
 
+def _acquired(source: Source, sensor: SensorModel) -> str | None:
+    """The day (ISO, UTC) on which an image was taken, by its delivery; None: not told."""
+    place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
+    time = read_acquisition(source.path, place).time
+    return None if time is None else time.date().isoformat()
+
+
 def rectify(
     left: Source,
     right: Source,
@@ -242,6 +251,7 @@ def rectify(
             attrs = {
                 "view": view,
                 "epipolar": model.to_dict(),
+                "acquired": _acquired(source, getattr(model, view)),
                 "provenance": dict(provenance or {}),
             }
             source.check_blocks(workers)

@@ -33,6 +33,7 @@ from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
 from .cell_sort import SCRATCH_POINTS, SortedRuns
 from .footprint import Footprint
+from .gps_times import BY_CATALOGUE, CODES, not_told_apart
 from .las_files import PointTally
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 from .octree_nodes import Touches
@@ -165,7 +166,8 @@ def ingest(
     ``classes`` (points read by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
     degrees, h_min, h_max in m; of no point: where all points of the file are about), ``crs``,
     ``footprint`` (runs of cells, or None), ``acquired`` (first and last day of all points read, and
-    what tells them; None where nothing does) and ``notes`` (remarks for the user, which are logged
+    what tells them; None where nothing does), ``days`` that points tell themselves (of more than
+    :data:`.gps_times.CODES` none) and ``notes`` (remarks for the user, which are logged
     too).
 
     Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
@@ -208,7 +210,7 @@ def ingest(
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits) if runs.written else _about(transform, points, own)
         notes = _notes(points, part, transform, tally, bounds)
-        cells_crc32 = runs.write(unfinished)
+        cells_crc32, days = runs.write(unfinished), tally.days.days
         summary = {
             "points": _counts(tally, runs, header, dropped),
             "nodes": part.nodes,
@@ -218,6 +220,7 @@ def ingest(
             "crs": transform.describe(),
             "footprint": None if footprint is None else footprint.runs,
             "acquired": _days(tally, acquired),
+            "days": days if len(days) <= CODES else [],
             "notes": notes,
         }
         about = {"source": file.name, "cells_crc32": cells_crc32}
@@ -241,10 +244,10 @@ def _counts(
 
 def _days(tally: PointTally, stated: Sequence[str]) -> dict[str, str] | None:
     """First and last day of a file's points, by their times, or else as a catalogue states them."""
-    if days := tally.times.days:
-        return {"start": days[0], "end": days[1], "by": "GPS time of the points"}
+    if days := tally.days.days:
+        return {"start": days[0], "end": days[-1], "by": "GPS time of the points"}
     if stated:
-        return {"start": stated[0], "end": stated[-1], "by": "catalogue"}
+        return {"start": stated[0], "end": stated[-1], "by": BY_CATALOGUE}
     return None
 
 
@@ -326,6 +329,8 @@ def _notes(
         check_area(transform.system, lon, lat, file),
     )
     notes = [*transform.notes, *filter(None, remarks)]
+    if same := not_told_apart(tally.days.days):
+        notes.append(f"{len(same)} days of its points cannot be told apart: labels have none there")
     if bounds[4] < -600 or bounds[5] > 9500:
         notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
     return notes

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..kernels import inner, kernel
 from ..products.remote_files import size_of
-from .gps_times import GpsTimes, has_days
+from .gps_times import GpsDays, has_days
 from .las_layout import check_layout, wrong_count
 from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 
@@ -157,7 +157,7 @@ class PointTally:
     lattice_limits: Integers = field(default_factory=_no_limits)  # [2, 3], kept points
     sample: list[np.ndarray] = field(default_factory=list)
     sampled: int = 0
-    times: GpsTimes = field(default_factory=GpsTimes)  # of all points, where they tell the day
+    days: GpsDays = field(default_factory=GpsDays)  # of all points, where they tell them
 
     def take(
         self,
@@ -166,11 +166,11 @@ class PointTally:
         drop_classes: Sequence[int],
     ) -> tuple[Floats, NDArray[np.uint32]]:
         """Coordinates [3, n] and attributes [n], see _unpack, of the points to keep."""
-        if has_days(header):
-            self.times.add(points)
         unwanted = np.isin(np.arange(256), drop_classes)
         raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
-        xyz, attributes = np.empty((3, len(points))), np.empty(len(points), np.uint32)
+        xyz, attributes = np.empty((3, len(points))), np.zeros(len(points), np.uint32)
+        if has_days(header):
+            self.days.take(points, attributes)
         kept = _unpack(
             raw,
             header.point_format.id >= 6,
@@ -300,9 +300,10 @@ def _unpack(
 
     ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
     in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
-    class. Attributes are class + 256 return number + 65536 number of returns. ``counts`` [2, 257]:
-    of kept and of dropped points by class, the last of withheld ones; ``by_return`` [16]: of all
-    points by return number. ``limits`` [2, 3]: lowest and highest stored coordinates of all.
+    class. Attributes are class + 256 return number + 2**16 number of returns + 2**20 code of the
+    day; of all points, ``attributes`` have this code. ``counts`` [2, 257]: of kept and of dropped
+    points by class, the last of withheld ones; ``by_return`` [16]: of all points by return number.
+    ``limits`` [2, 3]: lowest and highest stored coordinates of all.
     """
     kept = 0
     low_x, low_y, low_z = limits[0]
@@ -324,7 +325,7 @@ def _unpack(
         xyz[0, kept] = x * scale[0] + offset[0]
         xyz[1, kept] = y * scale[1] + offset[1]
         xyz[2, kept] = z * scale[2] + offset[2]
-        attributes[kept] = kind | returns
+        attributes[kept] = kind | returns | np.int64(attributes[i]) << 20
         kept += 1 - drop
     limits[0] = low_x, low_y, low_z
     limits[1] = high_x, high_y, high_z

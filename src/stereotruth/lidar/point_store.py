@@ -9,7 +9,7 @@ A folder with plain arrays, which NumPy opens (little-endian; n points, m cells 
                               (20 to 27), return number (28 to 31);
 
                               latitude from the cell's south edge, steps (0 to 19), number of
-                              returns (20 to 23);
+                              returns (20 to 23), code of the day (24 to 31, :mod:`.gps_times`);
 
                               height above the WGS 84 ellipsoid, steps (32 bits, signed)
 ``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
@@ -42,6 +42,7 @@ from ..kernels import kernel
 from ..products.files import read_json
 from ..products.provenance import own_digest
 from .footprint import Footprint
+from .gps_times import Days, days_by_code
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
 
 Bytes = NDArray[np.uint8]
@@ -49,7 +50,7 @@ Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-FORMAT = 3  # of the files
+FORMAT = 4  # of the files
 POINTS, CELLS, ATTRIBUTES = "points.npy", "cells.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
@@ -72,7 +73,7 @@ ARRAYS = {  # what the files' attributes would say if they had any
         "the WGS 84 ellipsoid (signed); LAS attributes above bit 19",
         "components": [
             "lon + (class << 20) + (return number << 28)",
-            "lat + (number of returns << 20)",
+            "lat + (number of returns << 20) + (code of the day << 24)",
             "height",
         ],
     },
@@ -88,7 +89,8 @@ _PIECE = 1 << 16  # points that are read at once, so that they stay in the cache
 
 @dataclass(frozen=True)
 class Points:
-    """Points of a query, [n] each: lattice coordinates (int64) and LAS attributes (uint8)."""
+    """Points of a query, [n] each: lattice coordinates (int64), LAS attributes (uint8), and the
+    ``day`` that each was measured on (uint16, since 1970-01-01; 0: not known)."""
 
     lon_q: np.ndarray
     lat_q: np.ndarray
@@ -96,6 +98,7 @@ class Points:
     classification: np.ndarray
     return_number: np.ndarray
     number_of_returns: np.ndarray
+    day: np.ndarray
 
     def __len__(self) -> int:
         return self.lon_q.size
@@ -120,7 +123,7 @@ class Points:
         """Points of all parts, in their order."""
         if not parts:
             q, u = np.empty(0, np.int64), np.empty(0, np.uint8)
-            return cls(q, q, q, u, u, u)
+            return cls(q, q, q, u, u, u, np.empty(0, np.uint16))
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
@@ -130,15 +133,18 @@ def _select(
     start: Integers,
     corner: Integers,
     box: Integers,
+    days: Days,
     lon: Integers,
     lat: Integers,
     height: Integers,
     out: Bytes,
+    day: Days,
 ) -> int:
-    """Fill lon, lat, height [n] and out [3, n] with the stored points in a box; how many there are.
+    """Fill lon, lat, height, day [n] and out [3, n] with the stored points in a box; how many there
+    are.
 
     ``start`` [m + 1] of the cells' points among the ``stored``, ``corner`` [2, m] their south-west
-    corners (lon, lat).
+    corners (lon, lat); ``days`` [256] by code.
     """
     kept = 0
     west, south, east, north = box[0], box[1], box[2], box[3]
@@ -152,6 +158,7 @@ def _select(
             out[0, kept] = first >> CELL_BITS & 255
             out[1, kept] = first >> 28
             out[2, kept] = second >> CELL_BITS & 15
+            day[kept] = days[second >> 24]
             kept += (x >= west) & (y >= south) & (x <= east) & (y <= north)
     return kept
 
@@ -242,6 +249,11 @@ class PointStore:
         runs = self.attrs.get("footprint")
         return None if runs is None else Footprint.of_runs(runs)
 
+    @cached_property
+    def days(self) -> Days:
+        """The day that each code of a point stands for [256]; 0: not known."""
+        return days_by_code(self.attrs["days"], self.attrs["acquired"])
+
     @property
     def cell_counts(self) -> Integers:
         """Points in each cell."""
@@ -287,12 +299,13 @@ class PointStore:
         ranges = self._cells(box)
         total = int(sum(self._start[end] - self._start[first] for first, end in ranges))
         lattice, attributes = np.empty((3, total), np.int64), np.empty((3, total), np.uint8)
+        day = np.empty(total, np.uint16)
         limits, kept = np.array(box), 0
         for stored, start, cells in self._stored(ranges):
             corner = np.stack([self.cell_col[cells], self.cell_row[cells]]) << CELL_BITS
-            out = (*lattice[:, kept:], attributes[:, kept:])
-            kept += _select(stored, start, corner, limits, *out)
-        return Points(*lattice[:, :kept], *attributes[:, :kept])
+            out = (*lattice[:, kept:], attributes[:, kept:], day[kept:])
+            kept += _select(stored, start, corner, limits, self.days, *out)
+        return Points(*lattice[:, :kept], *attributes[:, :kept], day[:kept])
 
     def _stored(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[Words, Integers, slice]]:
         """Points of ranges of cells as they are stored, [n, 3], a piece at a time.

@@ -59,7 +59,7 @@ def headlines(
     if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
         text = f"{spread(dense, '.2g')} points/m²"
         found.append(Headline("LiDAR density", text, "over the ground that it covers"))
-    found += _lidar([of for scene in scenes if (of := scene.get("lidar"))])
+    found += _lidar([of for scene in scenes if (of := scene.get("lidar"))], labelled)
     low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
     high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
     if low and high:
@@ -74,7 +74,7 @@ def headlines(
     return found
 
 
-def _lidar(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
+def _lidar(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
     """What was read of the LiDAR, by the scene of which most was, and what is missing."""
     if not scenes:
         return []
@@ -91,11 +91,12 @@ def _lidar(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
         if of["not_read_m2"]:
             note += f"; {of['not_read_m2'] / 1e6:.3f} km² around the images were not read"
     text = f"{read / 1e6:.1f} of {every / 1e6:.1f} MB"
-    return [Headline("LiDAR read", text, note, bool(holes)), *_dates(scenes)]
+    return [Headline("LiDAR read", text, note, bool(holes)), *_dates(scenes, labelled)]
 
 
-def _dates(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
-    """When the LiDAR was measured, and what its heights count from if that differs."""
+def _dates(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
+    """When the LiDAR was measured, the days from there to the images of tiles, and what its heights
+    count from if that differs."""
     days = [of["acquired"] for of in scenes if of["acquired"]]
     surfaces = sorted({text for of in scenes for text in of["surfaces"]})
     mixed = any(len(of["surfaces"]) > 1 for of in scenes)
@@ -104,7 +105,20 @@ def _dates(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
     text = f"{min(d[0] for d in days)} to {max(d[1] for d in days)}" if days else "not known"
     some = f"of {len(days)} of {len(scenes)} scenes" if 0 < len(days) < len(scenes) else ""
     note = f"heights of different surfaces: {'; '.join(surfaces)}" if mixed else ""
-    return [Headline("LiDAR measured", text, _and(*filter(None, (some, note))), mixed)]
+    parts = some, _days_to_images(labelled), note
+    return [Headline("LiDAR measured", text, _and(*filter(None, parts)), mixed)]
+
+
+def _days_to_images(labelled: Rows) -> str:
+    cells = [row.get(f"lidar_days_{view}", "") for row in labelled for view in ("left", "right")]
+    days = [int(cell) for cell in cells if cell]
+    if not days:
+        return ""
+    low, high = min(days), max(days)
+    if low < 0 < high:
+        return f"images from {-low} days earlier to {high} days later"
+    text = spread([abs(day) for day in days], ".0f")
+    return f"images {text} days {'later' if high > 0 else 'earlier'}"
 
 
 def _and(*parts: str) -> str:

@@ -154,6 +154,8 @@ def with_pieces(
     anchor = lines.anchor[pieces.facet_of, pieces.facet_side]
     classes[:facets] = np.repeat(vertices.surface_class[anchor], 3)
     classes[facets:] = np.repeat(vertices.surface_class[corner[pieces.strip_of, 0]], 3)
+    out.day[size : size + facets] = np.repeat(vertices.day[anchor], 3)
+    out.day[size + facets :] = np.repeat(vertices.day[corner[pieces.strip_of, 0]], 3)
     out.count[size:] = 1
     index = np.arange(size, size + facets + strips, dtype=np.int32).reshape(-1, 3)
     return out, index[: facets // 3], index[facets // 3 :]

@@ -12,6 +12,7 @@ outlive a killed job, and one more LiDAR file leaves those that it does not touc
 from __future__ import annotations
 
 import logging
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -99,7 +100,9 @@ class _Maker:
                 "scale": asdict(self.scale),
                 "side": self.side,
                 "blocks": list(parts.items()),
-                "points": sorted(store.attrs["cells_crc32"] for store in touched),
+                "points": sorted(
+                    (store.attrs["cells_crc32"], zlib.crc32(store.days)) for store in touched
+                ),
                 "code": self.code,
             }
         )
@@ -116,9 +119,8 @@ class _Maker:
         some = False
         for points in self._points(low, high):
             some |= points.lon_q.size > 0
-            builder.add(
-                points.lon_q, points.lat_q, points.h_q, points.classification, points.return_number
-            )
+            lattice = points.lon_q, points.lat_q, points.h_q
+            builder.add(*lattice, points.classification, points.return_number, points.day)
         if not some:
             return
         first = [q // size for q, size in zip(low, self.scale.cell)]

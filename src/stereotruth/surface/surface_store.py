@@ -34,7 +34,7 @@ from .scale import PART, SurfaceScale
 from .surface import GroundSurface
 from .vertices import Vertices
 
-FORMAT = 1
+FORMAT = 2
 ATTRIBUTES, BLOCKS = "surface.json", "blocks"
 ARRAYS = {
     "lon": "int32[n], longitude of the vertices from the block's south-west corner, 1e-9 degree",
@@ -42,6 +42,7 @@ ARRAYS = {
     "height": "int32[n], above the WGS 84 ellipsoid, 1e-4 m",
     "surface_class": "uint8[n], ASPRS class of the highest point of the vertex",
     "count": "uint16[n], points that it is the mean of; 65535 stands for more, too",
+    "day": "uint16[n], of its highest point, since 1970-01-01, 0 not known; [1] if all have one",
     "facet": "int32[m, 3], vertices of the facets",
     "variance": "float32[m], of a point's height there, (1e-4 m)²",
     "bulge": "float32[m], of the surface above the facet, 1e-4 m",
@@ -90,6 +91,7 @@ def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> 
         height=vertices.h_q.astype(np.int32),
         surface_class=vertices.surface_class,
         count=np.minimum(vertices.count, 65535).astype(np.uint16),
+        day=vertices.day[:1] if np.ptp(vertices.day) == 0 else vertices.day,
         facet=facet,
         variance=surface.variance.astype(np.float32),
         bulge=surface.bulge.astype(np.float32),
@@ -119,7 +121,7 @@ class WindowSurface:
         """The triangles that touch a ``region``, and their vertices."""
         parts, used, start = [], np.zeros(self.vertices.x.size, np.bool_), 0
         for block in self.blocks:
-            arrays = self.store.arrays(block, list(ARRAYS)[5:])
+            arrays = self.store.arrays(block, list(ARRAYS)[6:])
             size = self.store.sizes[block.name]
             part = self._touching(arrays, start, region)
             for name in ("facet", "whole", "strip", "top"):
@@ -244,14 +246,15 @@ class SurfaceStore:
         first = tuple(int(q) // side for q, side in zip(corners, cell))
         parts = []
         for block in blocks:
-            a = self.arrays(block, list(ARRAYS)[:5])
+            a = self.arrays(block, list(ARRAYS)[:6])
             lon = a["lon"] + np.int64(block.col * self.side * cell[0])
             lat = a["lat"] + np.int64(block.row * self.side * cell[1])
             x = (lon - first[0] * cell[0]) * PART // cell[0]
             y = (lat - first[1] * cell[1]) * PART // cell[1]
             h = a["height"].astype(np.int64)
             count = a["count"].astype(np.int32)
-            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count))
+            day = np.broadcast_to(a["day"], lon.shape)
+            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count, day))
             self.sizes[block.name] = lon.size
         vertices = Vertices(*(np.concatenate(values) for values in zip(*parts)))
         return WindowSurface(self, tuple(blocks), vertices, first)

@@ -21,6 +21,7 @@ from .scale import PART_BITS, SQUARE_CELLS, SurfaceScale, height_steps
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
+Days = NDArray[np.uint16]
 
 _LOWEST = np.iinfo(np.int32).min
 
@@ -30,7 +31,8 @@ class Vertices(NamedTuple):
 
     ``lon_q``, ``lat_q``, ``h_q`` int64: global lattice steps; ``x``, ``y`` int64: plan position in
     parts of a cell from the window's first cell; ``surface_class`` uint8: ASPRS class of the
-    highest point of the cell; ``count`` int32: number of points that the vertex is the mean of.
+    highest point of the cell; ``count`` int32: number of points that the vertex is the mean of;
+    ``day`` uint16: when that highest point was measured, since 1970-01-01; 0: not known.
     """
 
     lon_q: Ints
@@ -40,6 +42,7 @@ class Vertices(NamedTuple):
     y: Ints
     surface_class: Bytes
     count: Steps
+    day: Days
 
     def taken(self, chosen: NDArray) -> Vertices:
         """The vertices of an index or a mask."""
@@ -47,21 +50,23 @@ class Vertices(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points [n]: lattice coordinates, ASPRS class, number of the return in its pulse."""
+    """Points [n]: lattice coordinates, ASPRS class, number of the return in its pulse, day."""
 
     lon_q: Ints
     lat_q: Ints
     h_q: Ints
     surface_class: Bytes
     return_number: Bytes
+    day: Days
 
 
 class _CellTops(NamedTuple):
-    """Greatest height of each cell [rows, cols] and its class; ``first`` cell of the window and
-    size of a ``cell`` (lon, lat, lattice steps)."""
+    """Greatest height of each cell [rows, cols], its class and day; ``first`` cell of the window
+    and size of a ``cell`` (lon, lat, lattice steps)."""
 
     height: Steps
     surface_class: Bytes
+    day: Days
     first: tuple[int, int]
     cell: tuple[int, int]
 
@@ -77,14 +82,16 @@ def _whole(number: int, inverse: float) -> int:
 
 @kernel
 def _raise_tops(points: _Points, tops: _CellTops, index: Steps, position: Steps) -> int:
-    """Raise the greatest height of each cell by first returns; of equals the greater class stays.
+    """Raise the greatest height of each cell by first returns; of equals the greater class stays,
+    and the later day.
 
     Fills ``index`` (cell) and ``position`` [n, 3] (steps from the cell's corner, height); returns
     how many points are first returns.
     """
     lon_q, lat_q, h_q = points.lon_q, points.lat_q, points.h_q
-    classes, returns = points.surface_class, points.return_number
-    top, top_class, first, cell = tops.height, tops.surface_class, tops.first, tops.cell
+    classes, returns, days = points.surface_class, points.return_number, points.day
+    top, top_class, top_day = tops.height, tops.surface_class, tops.day
+    first, cell = tops.first, tops.cell
     n = 0
     cols = top.shape[1]
     west, south = first[0] * cell[0], first[1] * cell[1]
@@ -101,9 +108,12 @@ def _raise_tops(points: _Points, tops: _CellTops, index: Steps, position: Steps)
         n += 1
         if h > top[j, i]:
             top[j, i] = h
-            top_class[j, i] = classes[k]
+            top_class[j, i], top_day[j, i] = classes[k], days[k]
         elif h == top[j, i]:
-            top_class[j, i] = max(top_class[j, i], classes[k])
+            if classes[k] > top_class[j, i]:
+                top_class[j, i], top_day[j, i] = classes[k], days[k]
+            elif classes[k] == top_class[j, i]:
+                top_day[j, i] = max(top_day[j, i], days[k])
     return n
 
 
@@ -177,7 +187,7 @@ def _thinned(
     ``sums``: counts and mean positions; ``points``: number of points of each square. Returns the
     number of vertices.
     """
-    first, cell, before = tops.first, tops.cell, grid.before
+    first, cell, before, days = tops.first, tops.cell, grid.before, tops.day
     x, y, h, classes = cells.x, cells.y, cells.h, cells.surface_class
     is_even, height, one = even.is_even, even.height, even.one
     rows, cols = number.shape
@@ -196,7 +206,9 @@ def _thinned(
                 out.lon_q[m], out.lat_q[m] = (i + first[0]) * cell[0], (j + first[1]) * cell[1]
                 out.h_q[m] = height[s]
                 out.x[m], out.y[m] = i << PART_BITS, j << PART_BITS
-                out.surface_class[m], out.count[m] = classes[one[s]], points[s]
+                k = one[s]
+                out.surface_class[m], out.count[m] = classes[k], points[s]
+                out.day[m] = days[y[k] >> PART_BITS, x[k] >> PART_BITS]
                 m += 1
                 continue
             for i in range(max(west, 0), min(west + SQUARE_CELLS, cols)):
@@ -207,6 +219,7 @@ def _thinned(
                 out.lat_q[m] = (j + first[1]) * cell[1] + sums[k, 2]
                 out.h_q[m], out.x[m], out.y[m] = h[k], x[k], y[k]
                 out.surface_class[m], out.count[m] = classes[k], sums[k, 0]
+                out.day[m] = days[j, i]
                 m += 1
     return m
 
@@ -229,15 +242,22 @@ class VertexBuilder:
         last = [q // side for q, side in zip(self.high, cell)]
         shape = last[1] - first[1] + 1, last[0] - first[0] + 1
         height = np.full(shape, _LOWEST, dtype=np.int32)
-        self.tops = _CellTops(height, np.zeros(shape, dtype=np.uint8), first, tuple(cell))
+        classes, days = (np.zeros(shape, dtype) for dtype in (np.uint8, np.uint16))
+        self.tops = _CellTops(height, classes, days, first, tuple(cell))
 
     def add(
-        self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: Bytes, return_number: Bytes
+        self,
+        lon_q: Ints,
+        lat_q: Ints,
+        h_q: Ints,
+        surface_class: Bytes,
+        return_number: Bytes,
+        day: Days,
     ) -> None:
-        """Points by lattice coordinates and class; later returns of a pulse lie below what the
+        """Points by lattice coordinates, class and day; later returns of a pulse lie below what the
         cameras see."""
         index, position = np.empty(lon_q.size, np.int32), np.empty((lon_q.size, 3), np.int32)
-        points = _Points(lon_q, lat_q, h_q, surface_class, return_number)
+        points = _Points(lon_q, lat_q, h_q, surface_class, return_number, day)
         kept = _raise_tops(points, self.tops, index, position)
         self.blocks.append((index[:kept], position[:kept]))
 
@@ -264,6 +284,7 @@ class VertexBuilder:
             *(np.empty(size, np.int64) for _ in range(5)),
             np.empty(size, np.uint8),
             np.empty(size, np.int32),
+            np.empty(size, np.uint16),
         )
         _thinned(number, sums, cells, self.tops, grid, even, points, out)
         return out

@@ -9,17 +9,17 @@ import rasterio
 from stereotruth.dataset.layer_kinds import KINDS, NODATA
 from stereotruth.dataset.other_layouts import write_layout
 from stereotruth.dataset.published_layout import assemble_dataset
-from stereotruth.dataset.scene_stores import open_stores
+from stereotruth.dataset.scene_stores import SceneFiles, open_stores
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.dataset.tile_layers import tile_layers
 from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
 from stereotruth.products.provenance import file_sha256
 
-from ...synthetic.tiled_scene import read, rows_of, run, terrain
+from ...synthetic.tiled_scene import labels, make_scene, read, rows_of, run, terrain
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-ALL = ("height", "class", "agl", "uncertainty")
+ALL = ("height", "class", "agl", "uncertainty", "lidar_date")
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,7 @@ def test_heights_are_those_that_the_labels_were_made_of(scene):
     assert np.abs(found["height"][known] - true[known]).max() < 0.01
     assert (found["height"][~known] == NODATA).all()
     assert (found["agl"][known] > -12).all() and (found["agl"][~known] == NODATA).all()
+    assert (found["lidar_date"] == 0).all()
     assert (found["uncertainty"] == NODATA).all() and (found["class"] == 0).all()
     assert true[known].min() > terrain(0.0, 0.0) - 20  # the store has heights at all
 
@@ -88,3 +89,39 @@ def test_a_layer_that_the_dataset_has_not_is_refused(exported, tmp_path):
     dataset = StereoDataset("mine", tmp_path / "dataset", "stereotruth", (-64, 64))
     with pytest.raises(InputError, match=r"no layer agl.*tiles\.layers: \[agl\]"):
         dataset.layer(dataset.pairs(labelled=True)[0], "agl")
+
+
+@pytest.fixture(scope="module")
+def dated(tmp_path_factory) -> SceneFiles:
+    """LiDAR of 2020-01-01 and, in the right half, of 2021-01-01."""
+    folder = tmp_path_factory.mktemp("dated") / "Town-1"
+    return make_scene(folder, lidar_days=(18_262, 18_628), acquired=("2020-01-11", None))
+
+
+@pytest.mark.parametrize(
+    ("by_sheet", "days"),
+    [
+        (("", ""), {"left": (10, -356), "right": ("", "")}),
+        (("2019-12-31", "2021-01-02"), {"left": (-1, -367), "right": (367, 1)}),
+    ],
+)
+def test_the_manifest_has_the_days_from_lidar_to_images(dated, tmp_path, by_sheet, days):
+    """The sheet goes before the delivery; a tile has the median of its labels."""
+    run([dated._replace(acquired=by_sheet)], tmp_path / "Town", layers=("lidar_date",))
+    sides = set()
+    for row in rows_of(tmp_path / "Town"):
+        if row["complete"] == "no":
+            continue
+        layer = read(tmp_path / "Town" / row["layer_lidar_date"])
+        known = np.isfinite(labels(tmp_path / "Town" / row["disp"]))
+        assert set(layer[known].tolist()) <= {18_262, 18_628} and not layer[~known].any()
+        side = int((layer[known] == 18_628).mean() >= 0.5)
+        sides.add(side)
+        for view, expected in days.items():
+            assert row[f"lidar_days_{view}"] == str(expected[side])
+    assert sides == {0, 1}
+
+
+def test_days_that_nobody_knows_are_empty(tiles):
+    for row in rows_of(tiles):
+        assert row["lidar_days_left"] == row["lidar_days_right"] == ""

@@ -25,6 +25,7 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
         variance=zeros,
         height=zeros,
         surface_class=zeros.astype(np.uint8),
+        day=zeros.astype(np.uint16),
         bulging=np.arange(8) + zeros == 5,
         projected=None,
     )

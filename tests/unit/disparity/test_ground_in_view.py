@@ -31,7 +31,7 @@ def vertices(height_at) -> Vertices:
     y, x = (v.reshape(-1).astype(np.int64) for v in np.mgrid[0:400, 0:400])
     h = height_at(x / 2.0, y / 2.0).astype(np.int64)
     ones = np.ones(x.size, np.int32)
-    return Vertices(x * 100, y * 100, h, x * PART, y * PART, ones.astype(np.uint8), ones)
+    return Vertices(x * 100, y * 100, h, x * PART, y * PART, ones.astype(np.uint8), ones, ones)
 
 
 def in_view(height_at) -> np.ndarray:

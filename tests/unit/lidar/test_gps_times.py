@@ -4,35 +4,35 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-import laspy
 import numpy as np
 import pytest
 
+from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.gps_times import number_of
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore, query_points
 
-from ...synthetic.las import write_las
+from ...synthetic.las import adjusted, everything, write_las
+from ...synthetic.stores import content_of, part_of
 
 GPS_LESS_UTC_S = 18
 
 
-def adjusted(day: str) -> float:
+def seconds(day: str) -> float:
     """Adjusted standard GPS time of noon of a day, by the difference of two calendars."""
     noon = datetime.fromisoformat(f"{day}T12:00:00+00:00")
     return (noon - datetime(1980, 1, 6, tzinfo=UTC)).total_seconds() + GPS_LESS_UTC_S - 1e9
 
 
 def with_times(file, times, *, absolute: bool, pdrf: int = 6):
-    write_las(file, len(times), pdrf=pdrf, gps_time=times)
-    las = laspy.read(file)
-    las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(absolute))
-    las.write(file)
+    write_las(file, len(times), pdrf=pdrf, gps_time=times, absolute=absolute)
     return file
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 @pytest.mark.parametrize("pdrf", [1, 3, 6, 7])
 def test_days_follow_from_absolute_times(tmp_path, name, pdrf):
-    times = np.linspace(adjusted("2019-05-04"), adjusted("2019-05-09"), 3000)
+    times = np.linspace(seconds("2019-05-04"), seconds("2019-05-09"), 3000)
     times[::7] = 0.0  # never filled in
     file = with_times(tmp_path / name, times, absolute=True, pdrf=pdrf)
     found = ingest(file, tmp_path / "s.points", acquired=("2001-01-01", "2001-01-02"))["acquired"]
@@ -40,7 +40,7 @@ def test_days_follow_from_absolute_times(tmp_path, name, pdrf):
 
 
 def test_times_before_the_epoch_of_adjusted_time(tmp_path):
-    file = with_times(tmp_path / "a.laz", np.full(3000, adjusted("2007-03-01")), absolute=True)
+    file = with_times(tmp_path / "a.laz", np.full(3000, seconds("2007-03-01")), absolute=True)
     assert ingest(file, tmp_path / "s.points")["acquired"]["start"] == "2007-03-01"
 
 
@@ -52,3 +52,58 @@ def test_a_catalogue_tells_where_points_do_not(tmp_path, times, absolute):
     found = ingest(file, tmp_path / "s.points", acquired=("2020-01-01", "2020-02-01"))["acquired"]
     assert found == {"start": "2020-01-01", "end": "2020-02-01", "by": "catalogue"}
     assert ingest(file, tmp_path / "t.points")["acquired"] is None
+
+
+def dated(folder, days, name="a", footprint=None) -> PointStore:
+    """A store of points of classes 1 to 4 in turn, that were measured on ``days`` by class."""
+    classes = (np.arange(4000) % 4 + 1).astype(np.uint8)
+    times = np.array([0.0 if day is None else adjusted(day) for day in days])[classes - 1]
+    file = folder / f"{name}.laz"
+    write_las(file, 4000, gps_time=times, classification=classes, absolute=True)
+    catalogue = ("2001-01-01", "2001-01-31")
+    ingest(file, folder / f"{name}.points", acquired=catalogue, footprint=footprint)
+    return PointStore(folder / f"{name}.points")
+
+
+@pytest.mark.parametrize(
+    ("days", "told"),
+    [
+        ((17_000, 17_001, 18_000, 49_000), (17_000, 17_001, 18_000, 49_000)),
+        ((3_000, None, 3_000, 17_000), (0, 0, 0, 17_000)),  # 1978 is no time
+        ((17_000, 17_255, 17_001, 17_256), (0, 0, 0, 0)),  # of one code each
+        ((17_000, 17_255, 17_001, 17_001), (0, 0, 17_001, 17_001)),
+        ((None, None, None, None), (11_338,) * 4),  # the middle of the catalogue's days
+    ],
+)
+def test_each_point_has_its_day(tmp_path, days, told):
+    store = dated(tmp_path, days)
+    points = everything(store)
+    assert len(points) == 4000
+    assert (points.day == np.array(told)[points.classification - 1]).all()
+    shared = any("cannot be told apart" in note for note in store.attrs["notes"])
+    assert shared == (17_255 in days)
+    assert (query_points([store, store], *store.bounds[:4]).day[4000:] == points.day).all()
+
+
+def test_days_of_a_part_are_those_of_the_whole(tmp_path):
+    """A cell has the same bytes whatever other days the file has elsewhere."""
+    whole = dated(tmp_path, (17_000, 17_001, 18_000, 49_000))
+    row, col = whole.cell_row[0], whole.cell_col[0]
+    footprint = Footprint(int(row), int(col), np.ones((2, 2), np.bool_))
+    part = dated(tmp_path, (17_000, 17_001, 18_000, 49_000), "part", footprint)
+    assert 0 < part.count < whole.count
+    assert content_of(part) == part_of(whole, footprint)
+    assert (part.days == whole.days).all()
+
+
+def test_days_without_end_are_none(tmp_path):
+    """Times that are noise: first and last day are told, as of any file, and no day of a point."""
+    times = np.random.default_rng(0).uniform(-9e8, 9e8, 3000)
+    store = with_times(tmp_path / "a.laz", times, absolute=True)
+    found = ingest(store, tmp_path / "s.points")
+    assert found["acquired"]["start"] < "1985" and found["days"] == []
+    assert (everything(PointStore(tmp_path / "s.points")).day == 0).all()
+
+
+def test_days_are_counted_from_1970():
+    assert number_of("1970-01-01") == 0 and number_of("2019-03-01") == 17_956

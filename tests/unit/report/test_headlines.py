@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.report.headlines import headlines
 
@@ -87,6 +89,33 @@ def test_density_is_that_of_the_scenes():
     dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
     assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
     assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"
+
+
+LIDAR = {
+    "bytes": [1, 1],
+    "files": [1, 1],
+    "nodes": None,
+    "holes_m2": 0.0,
+    "not_read_m2": 0.0,
+    "acquired": ["2019-05-04", "2019-05-09"],
+    "surfaces": {"ellipsoid": 1},
+}
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ("", "", ""),
+        ("12", "", "images 12 days later"),
+        ("365", "12", "images 12–365 days later"),
+        ("-7", "-7", "images 7 days earlier"),
+        ("-7", "30", "images from 7 days earlier to 30 days later"),
+    ],
+)
+def test_days_from_the_lidar_to_the_images_stand_beside_its_own(left, right, said):
+    row = ROW | {"lidar_days_left": left, "lidar_days_right": right}
+    card = cards({"A-1": SCENE | {"lidar": LIDAR}}, rows=[row, ROW])["LiDAR measured"]
+    assert (card.value, card.note) == ("2019-05-04 to 2019-05-09", said)
 
 
 def test_a_doubt_stands_with_the_gates():

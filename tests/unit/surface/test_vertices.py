@@ -27,7 +27,8 @@ def built(height_at, low=(0, 0), kept=None, noise_m=0.0, kinds=2, order=None) ->
     builder = VertexBuilder(SCALE, low, (SIZE * CELL, SIZE * CELL))
     lon, lat = ((c[use] * CELL).astype(np.int64) for c in (x, y))
     q = np.rint(h[use] / LATTICE_M).astype(np.int64)
-    builder.add(lon, lat, q, classes[use].astype(np.uint8), np.ones(lon.size, np.uint8))
+    returns, days = np.ones(lon.size, np.uint8), np.zeros(lon.size, np.uint16)
+    builder.add(lon, lat, q, classes[use].astype(np.uint8), returns, days)
     return builder.built()
 
 
@@ -43,7 +44,8 @@ def test_places_are_those_of_whole_numbers(cell) -> None:
     scale = scale_of(1.0, cell)
     builder = VertexBuilder(scale, tuple(low.tolist()), tuple((low + size).tolist()))
     h = rng.integers(-(10**6), 10**6, lon.size)
-    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), np.ones(lon.size, np.uint8))
+    returns, days = np.ones(lon.size, np.uint8), np.zeros(lon.size, np.uint16)
+    builder.add(lon, lat, h, np.full(lon.size, 2, np.uint8), returns, days)
     found = builder.built()
     tolerance = int(scale.top_m / LATTICE_M)
     expected = {}
@@ -131,23 +133,26 @@ def test_a_window_has_the_vertices_of_the_whole_in_any_order() -> None:
 
 def test_vertices_are_means_of_the_tops_of_cells() -> None:
     scale = scale_of(1.0, (3000, 2500))
-    lon = np.array([6010, 6030, 6020, 9001, 9005])
-    lat = np.array([2600, 2700, 2650, 2510, 2515])
-    height = np.array([100_000, 100_200, 60_000, 50_000, 50_010])  # the third lies 4 m below
-    classes = np.array([6, 5, 2, 2, 5], np.uint8)
-    returns = np.array([1, 0, 1, 1, 2], np.uint8)  # what is not told counts, the last does not
+    lon = np.array([6010, 6030, 6020, 9001, 9005, 9001, 9001])
+    lat = np.array([2600, 2700, 2650, 2510, 2515, 2510, 2510])
+    # the third lies 4 m below; three are one point of two days, and of another class
+    height = np.array([100_000, 100_200, 60_000, 50_000, 50_010, 50_000, 50_000])
+    classes = np.array([6, 5, 2, 2, 5, 2, 1], np.uint8)
+    returns = np.array([1, 0, 1, 1, 2, 1, 1], np.uint8)  # what is not told counts, 2 does not
+    days = np.array([18_000, 17_000, 18_000, 17_000, 19_000, 18_500, 19_000], np.uint16)
     whole = VertexBuilder(scale, (0, 0), (20_000, 20_000))
-    whole.add(lon, lat, height, classes, returns)
+    whole.add(lon, lat, height, classes, returns, days)
     found = whole.built()
     assert found.lon_q.tolist() == [6020, 9001]
     assert found.lat_q.tolist() == [2650, 2510]
     assert found.h_q.tolist() == [100_100, 50_000]
-    assert found.count.tolist() == [2, 1]
+    assert found.count.tolist() == [2, 3]
     assert found.surface_class.tolist() == [5, 2]  # that of the highest
+    assert found.day.tolist() == [17_000, 18_500]  # likewise; the later one of those of its class
     other = VertexBuilder(scale, (3000, 2500), (20_000, 20_000))
-    for k in (3, 1, 4, 2, 0):
-        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes, returns)))
+    for k in (5, 6, 3, 1, 4, 2, 0):
+        other.add(*(v[k : k + 1] for v in (lon, lat, height, classes, returns, days)))
     again = other.built()
-    for name in ("lon_q", "lat_q", "h_q", "surface_class", "count"):
+    for name in ("lon_q", "lat_q", "h_q", "surface_class", "count", "day"):
         assert getattr(again, name).tolist() == getattr(found, name).tolist()
     assert (found.x - again.x).tolist() == [PART, PART]
