@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from numba import njit
+from numba import config, njit
 from numba.extending import register_jitable
 
 from .kernel_cache import KernelCache
 
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
+if config.BOUNDSCHECK:  # NUMBA_BOUNDSCHECK=1: kernels refuse indices out of bounds
+    _OPTIONS["boundscheck"] = True
 
 
 def kernel(function: Callable) -> Callable:

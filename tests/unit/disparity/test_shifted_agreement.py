@@ -118,3 +118,17 @@ def test_a_small_crown_that_was_felled(diachronic: bool) -> None:
     assert changed[57:66, 72:81].all()
     changed[crown] = False
     assert not changed.any()
+
+
+@pytest.mark.parametrize("share", [0.002, 0.3])
+def test_wanted_pixels_have_the_values_that_all_together_have(share):
+    """At the borders, too, and where a run of them is shorter than the correlation's window."""
+    wanted = np.random.default_rng(2).uniform(size=SHAPE) < share
+    wanted[[0, 0, -1, -1, 50, 51], [0, -1, 0, -1, 1, -2]] = True
+    window = grown(3)
+    every = shifted_agreement(LEVEL, window, (0.0, 0.0), 9, 4, ALL)
+    few = shifted_agreement(LEVEL, window, (0.0, 0.0), 9, 4, wanted)
+    for name in ("here", "elsewhere", "shift", "signal"):
+        one, other = getattr(every, name), getattr(few, name)
+        assert np.array_equal(one[wanted], other[wanted], equal_nan=True), name
+        assert np.isnan(other[~wanted]).all(), name
