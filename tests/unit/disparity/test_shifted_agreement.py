@@ -10,6 +10,8 @@ from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
 from stereotruth.disparity.shifted_agreement import ShiftedAgreement, shifted_agreement
+from stereotruth.disparity.surface_means import surface_mean
+from stereotruth.epipolar.surface_correlation import BLOCK, surface_correlation
 
 ROWS, COLS = slice(20, 140), slice(60, 200)
 SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
@@ -132,3 +134,17 @@ def test_wanted_pixels_have_the_values_that_all_together_have(share):
         one, other = getattr(every, name), getattr(few, name)
         assert np.array_equal(one[wanted], other[wanted], equal_nan=True), name
         assert np.isnan(other[~wanted]).all(), name
+
+
+def test_single_pixels_at_the_borders_of_a_wide_window():
+    """Their neighbours begin or end beyond the window, which is wider than a block."""
+    rng, shape = np.random.default_rng(3), (12, 3 * BLOCK)
+    values, warped = rng.normal(size=(2, *shape))
+    flat = np.zeros(shape), np.zeros((2, *shape))
+    wanted = np.zeros(shape, np.bool_)
+    wanted[:, [0, 1, 40, BLOCK - 1, BLOCK, -2, -1]] = True
+    for of in (
+        lambda chosen: surface_mean(values, *flat, 9, 1, chosen),
+        lambda chosen: surface_correlation(values, warped, *flat, 9, None, chosen),
+    ):
+        assert np.array_equal(of(wanted)[wanted], of(None)[wanted], equal_nan=True)
