@@ -15,12 +15,13 @@ from stereotruth.project import (
     adjusted_scenes,
     check_fixed,
     configured,
+    days_of_pair,
     read_mapping,
     read_scenes,
     stores_of,
 )
 from stereotruth.settings import merged
-from stereotruth.sheets import Scene
+from stereotruth.sheets import Image, Scene
 
 
 def test_a_mapping_is_laid_over_another():
@@ -189,3 +190,21 @@ def test_what_is_fixed_is_a_scene_or_an_image_with_a_file(tmp_path):
         check("Z", str(file))
     with pytest.raises(InputError, match="no such file"):
         check("A", "nowhere.json")
+
+
+@pytest.mark.parametrize(
+    ("names", "days"),
+    [
+        (("l", "r"), ("2020-10-25", "2020-10-26")),
+        (("r", ""), ("2020-10-26", "")),  # a file that the sheet does not have
+        (("n", "l"), ("", "2020-10-25")),
+    ],
+)
+def test_days_of_a_pair_are_those_of_the_images_sheet(names, days):
+    """UTC, whatever the zone."""
+    acquired = {"l": "2020-10-26T03:12:45+08:00", "r": "2020-10-26", "n": ""}
+    images = {
+        name: Image(image=name, city="A", file=f"{name}.tif", acquired=cell)
+        for name, cell in acquired.items()
+    }
+    assert days_of_pair(names, images) == days

@@ -155,14 +155,19 @@ def both_views(made, tmp_path_factory) -> Project:
 
 
 def test_the_store_of_a_scene_opens_by_xarray_alone(made):
-    """All layers as Zarr has them, status in whole numbers, and in them the values of the tiles."""
+    """All layers as Zarr has them, status in whole numbers, days as dates; in them the values of
+    the tiles."""
     store = made.folder / "results/project/Tiny/Tiny-1.zarr"
     raw = zarr.open_group(store, mode="r")
     with xr.open_zarr(store) as grid:
         assert {"disparity", "status", "height", "uncertainty"} <= set(grid.data_vars)
         for name, layer in grid.data_vars.items():
-            assert layer.dims == ("y", "x") and layer.dtype == raw[name].dtype
-            assert np.array_equal(layer.values, raw[name][:], equal_nan=layer.dtype.kind == "f")
+            values = raw[name][:]
+            if name == "lidar_date":
+                days = values.astype("datetime64[D]").astype("datetime64[ns]")
+                values = np.where(values == 0, np.datetime64("NaT"), days)
+            assert layer.dims == ("y", "x") and layer.dtype == values.dtype
+            assert np.array_equal(layer.values, values, equal_nan=layer.dtype.kind in "fM")
         tiles = [row for row in manifest(made) if row["complete"] == "yes"]
         for row in tiles:
             y, x, size = (int(row[key]) for key in ("row0", "col0", "size"))

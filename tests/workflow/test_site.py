@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ import rasterio
 
 from stereotruth.command.example_city import SITE
 from stereotruth.dataset.verify import defects
+from stereotruth.lidar.catalogue_list import ListedTile, TileList, write_list
+from stereotruth.lidar.footprint import Footprint
 from stereotruth.products.grids import open_grid
 from stereotruth.simulate.site_images import image_truth
 
@@ -35,13 +38,39 @@ def call(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+DAYS = "2019-03-01", "2019-03-05"  # of the LiDAR, by a catalogue
+
+
+def list_of_tiles(folder: Path) -> None:
+    """As `stereotruth lidar` writes it from a catalogue that knows days."""
+    place = np.array([[SITE.city.lon], [SITE.city.lat]])
+    ground = place + 0.03 * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
+    tiles = tuple(
+        ListedTile(str(file.relative_to(folder)), file.stat().st_size, "", -1, *DAYS)
+        for file in sorted((folder / "data/lidar").iterdir())
+    )
+    listed = TileList(
+        catalogue="https://example.org/tiles.vpc",
+        sha256="0" * 64,
+        bytes=1,
+        hosts=(),
+        ground=tuple(map(tuple, Footprint.around([ground], 0.0).runs)),
+        footprint_m2=1e6,
+        hole_m2=0.0,
+        crs="",
+        tiles=tiles,
+    )
+    write_list(listed, folder / "lidar.tsv")
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
     """The example, two pairs of it, made."""
     empty = tmp_path_factory.mktemp("empty")
     call(empty, "init", "--example", "site")
     folder = empty / "site"
-    given = "--lidar", "data/lidar", "--gcps", "gcps/Stack.csv"
+    list_of_tiles(folder)
+    given = "--lidar", "lidar.tsv", "--gcps", "gcps/Stack.csv"
     call(folder, "pairs", "Stack", "--most", "2", *given)
     assert "0 errors, 0 doubts" in call(folder, "check")
     with (folder / "config.yaml").open("a", encoding="utf-8") as config:
@@ -53,6 +82,11 @@ def site(tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_the_tiles_of_both_pairs_are_made_and_each_lidar_file_is_read_once(site):
     check_tiles(site)
+
+
+@pytest.mark.slow
+def test_tiles_say_how_old_the_lidar_was(site):
+    check_days(site)
 
 
 @pytest.mark.slow
@@ -118,6 +152,22 @@ def check_heights(site: Path) -> None:
         assert 0.9 < (error < 2 * sigma).mean() < 0.98
 
 
+def check_days(site: Path) -> None:
+    """From the middle of the catalogue's days to those of the images sheet."""
+    with (site / "tiles/Stack/manifest.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    found = {(row["scene"], row["lidar_days_left"], row["lidar_days_right"]) for row in rows}
+    expected = set()
+    for file in (site / "results/adjust/Stack").glob("*/alignment.json"):
+        record = json.loads(file.read_text())
+        images = [SITE.image(Path(record[view]["image"]).stem) for view in ("left", "right")]
+        days = [str((image.acquired.date() - date(2019, 3, 3)).days) for image in images]
+        expected.add((file.parent.name, *days))
+    assert len(expected) == 2 and found == expected
+    page = (site / "results/report/Stack/index.html").read_text(encoding="utf-8")
+    assert "2019-03-01 to 2019-03-05" in page and re.search(r"images [\d–]+ days later", page)
+
+
 def check_crops(site: Path) -> None:
     folder = site / "originals/Stack"
     assert defects(folder) == []
@@ -158,6 +208,7 @@ def check_order(site: Path, other: Path) -> None:
     """Labels, arrays and all, are the same bytes if images, scenes and points are turned round."""
     other.mkdir()
     shutil.copytree(site / "data", other / "data")
+    shutil.copy(site / "lidar.tsv", other)
     for name in ("config.yaml", "cities.tsv", "images.tsv", "scenes.tsv", "gcps/Stack.csv"):
         head, *rows = (site / name).read_text(encoding="utf-8").splitlines()
         if name != "config.yaml":

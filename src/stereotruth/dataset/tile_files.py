@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..epipolar.warping import agreement, warp_rows
 from ..errors import InputError
-from ..lidar.gps_times import number_of
 from ..products.files import link
 from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
@@ -322,12 +321,14 @@ def _lidar_days(
         here = slice(window.row0, window.row0 + rows), slice(window.col0, window.col0 + cols)
         days = np.asarray(source.lidar_date[here])[known]
         days = np.sort(days[days > 0])
-    return {
-        f"lidar_days_{view}": number_of(taken) - int(days[days.size // 2])
-        if taken and days.size
-        else ""
-        for view, taken in zip(("left", "right"), source.acquired)
-    }
+    found: dict[str, int | str] = {}
+    for view, taken in zip(("left", "right"), source.acquired):
+        cell = f"lidar_days_{view}"
+        found[cell] = ""
+        if taken and days.size:
+            since_1970 = int(np.datetime64(taken, "D").astype(np.int64))
+            found[cell] = since_1970 - int(days[days.size // 2])
+    return found
 
 
 def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:

@@ -233,9 +233,10 @@ def _day(text: Any) -> str:
         return ""
     try:
         time = datetime.fromisoformat(text.strip())
-    except ValueError:
+        time = time if time.tzinfo is None else time.astimezone(UTC)
+    except (ValueError, OverflowError):  # none, or of the year 0
         return ""
-    return (time if time.tzinfo is None else time.astimezone(UTC)).date().isoformat()
+    return time.date().isoformat()
 
 
 def _rows(

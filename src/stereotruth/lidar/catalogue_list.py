@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from datetime import date
 from pathlib import Path
 
 from ..errors import InputError
@@ -141,6 +142,8 @@ def read_list(file: str | Path) -> TileList:
             raise ValueError(f"{len(tiles)} of its {head['count']} tiles stand in it")
         if not tiles or not all(tile.file and tile.bytes >= 0 for tile in tiles):
             raise ValueError("it names no tile, or one without a file")
+        for day in (day for tile in tiles for day in (tile.start, tile.end) if day):
+            date.fromisoformat(day)
         return TileList(
             catalogue=head["catalogue"],
             sha256=head["sha256"],

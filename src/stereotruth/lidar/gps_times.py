@@ -31,6 +31,7 @@ ADJUSTED_S = 1e9
 LATEST_S = 4e9  # of adjusted time: the year 2138
 DAY_S = 86400.0
 FIRST_DAY = date(1970, 1, 1)
+LAST_DAY = np.iinfo(np.uint16).max
 EPOCH_DAY = (date(1980, 1, 6) - FIRST_DAY).days
 CODES = 255  # of days; 0: not known
 BY_CATALOGUE = "catalogue"
@@ -98,5 +99,6 @@ def days_by_code(days: Sequence[str], acquired: Mapping[str, Any] | None) -> Day
     for number in map(number_of, set(days).difference(not_told_apart(days))):
         out[1 + number % CODES] = number
     if acquired is not None and acquired["by"] == BY_CATALOGUE:
-        out[0] = (number_of(acquired["start"]) + number_of(acquired["end"])) // 2
+        middle = (number_of(acquired["start"]) + number_of(acquired["end"])) // 2
+        out[0] = middle if 0 < middle <= LAST_DAY else 0  # 1900-01-01 stands for none, too
     return out

@@ -15,7 +15,7 @@ from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.epipolar.settings import Settings
 from stereotruth.errors import InputError
-from stereotruth.products.grids import open_grid
+from stereotruth.products.grids import open_grid, require_complete
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from ...synthetic.images import pattern, write_image
@@ -114,6 +114,14 @@ def test_nodata_spreads_to_whatever_it_touches(tmp_path: Path) -> None:
     around = (np.abs(col - 230) < 40) & (np.abs(row - 205) < 40)
     near = (col > 216.5) & (col < 242.5) & (row > 196.5) & (row < 212.5)
     assert (left[around & ~near] == 500).all()
+
+
+def test_the_day_of_an_image_is_that_of_its_delivery(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    (tmp_path / "source/left.IMD").write_text("firstLineTime = 2020-10-25T23:12:45.000000Z;\n")
+    run(tmp_path, constant(), constant())
+    days = [require_complete(tmp_path / f"{v}.zarr").attrs["acquired"] for v in ("left", "right")]
+    assert days == ["2020-10-25", None]
 
 
 def test_nodata_tag_and_the_lowest_value(tmp_path: Path) -> None:

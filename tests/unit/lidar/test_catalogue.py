@@ -500,3 +500,11 @@ def test_cells_that_name_lists_and_catalogues():
         assert is_catalogue(name)
     for name in ("https://host/x/ept.json", "ept.json", "lidar/*.laz", "a.tsv"):
         assert not is_catalogue(name)
+
+
+def test_a_list_with_a_day_that_is_none_is_refused(tmp_path):
+    file = tmp_path / "a.tsv"
+    write_list(made_list(), file)
+    file.write_text(file.read_text().replace("2020-01-02", "spring 2020"))
+    with pytest.raises(InputError, match=r"no list of tiles that can be read .*spring 2020"):
+        read_list(file)

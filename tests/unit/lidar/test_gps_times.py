@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereotruth.lidar.footprint import Footprint
-from stereotruth.lidar.gps_times import number_of
+from stereotruth.lidar.gps_times import days_by_code, number_of
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore, query_points
 
@@ -107,3 +107,10 @@ def test_days_without_end_are_none(tmp_path):
 
 def test_days_are_counted_from_1970():
     assert number_of("1970-01-01") == 0 and number_of("2019-03-01") == 17_956
+
+
+@pytest.mark.parametrize("day", ["0001-01-01", "1900-01-01", "1970-01-01", "9999-12-31"])
+def test_a_day_that_stands_for_none_is_none(day):
+    """Catalogues write such ones where they know nothing."""
+    acquired = {"start": day, "end": day, "by": "catalogue"}
+    assert not days_by_code([], acquired).any()
