@@ -53,7 +53,7 @@ SEED = 2030
 SPACING_M = 0.5  # of the LiDAR's points
 
 
-def make_site(site: SiteSpec, folder: Path) -> None:
+def make_site(site: SiteSpec, folder: Path, spacing_m: float = SPACING_M) -> None:
     """Images, point stores and control points of a site, below its folder."""
     for image in site.images:
         made = folder / f"{image.name}.tif"
@@ -63,7 +63,7 @@ def make_site(site: SiteSpec, folder: Path) -> None:
         with atomic_folder(folder / "points") as scratch:
             for file in lidar_files(site.city, site.area):
                 simulate_lidar_tile(
-                    site.city, site.area, file, scratch / file, spacing_m=SPACING_M, seed=SEED
+                    site.city, site.area, file, scratch / file, spacing_m=spacing_m, seed=SEED
                 )
                 ingest(scratch / file, scratch / f"{Path(file).stem}.points")
                 (scratch / file).unlink()
