@@ -197,7 +197,7 @@ class _Triplet:
         return _Closures(in_a[0] - found - d_ac, roughness, of_models)
 
     def blocks(self) -> Iterator[tuple[_Closures, _Closures]]:
-        """Closures of pixels all over the grid of A-B, and of those LAG px beside each."""
+        """Closures of pixels all over the grid of A-B, and LAG px beside each, where there are."""
         rows, cols = self.ab.shape
         step = max(1, round((rows * cols / MOST) ** 0.5))
         for window in blocks((rows, cols), BLOCK):
@@ -207,9 +207,10 @@ class _Triplet:
                     window[0].start : window[0].stop : step, window[1].start : window[1].stop : step
                 ]
             )
-            both = self.closures(x, y), self.closures(x + LAG, y)
-            good = np.all([np.isfinite(v) for c in both for v in vars(c).values()], axis=0)
-            yield tuple(_Closures(*(v[good] for v in vars(c).values())) for c in both)
+            here = self.closures(x, y)
+            good = np.isfinite(list(vars(here).values())).all(axis=0)
+            here = _Closures(*(values[good] for values in vars(here).values()))
+            yield here, self.closures(x[good] + LAG, y[good])
 
 
 def _reading(here: _Closures, beside: _Closures) -> Floats:
@@ -221,12 +222,13 @@ def _reading(here: _Closures, beside: _Closures) -> Floats:
     floor = np.finfo(np.float32).eps * FLOAT_PX
     rough, other = (np.maximum(one.roughness, floor) for one in (here, beside))
     difference = np.abs(here.closure / rough - beside.closure / other) / 2**0.5
+    known = np.isfinite(difference)
     order = np.argsort(rough, kind="stable")
-    sigma = np.empty(rough.shape)
-    for part in np.array_split(order, max(1, min(CLASSES, len(order) // LEAST_OF_CLASS))):
-        if len(part):
-            usual = np.quantile(difference[part], 0.683)
-            size = np.minimum(difference[part], HEAVY * usual)
+    sigma = np.full(rough.shape, np.nan)
+    for part in np.array_split(order, max(1, min(CLASSES, int(known.sum()) // LEAST_OF_CLASS))):
+        size = difference[part][known[part]]
+        if len(size):
+            size = np.minimum(size, HEAVY * np.quantile(size, 0.683))
             sigma[part] = rough[part] * np.sqrt(np.mean(size**2))
     return sigma
 
@@ -255,7 +257,8 @@ def closure_of_labels(triplet: Triplet) -> tuple[Floats, Floats]:
         for k in (0, 1)
     )
     variance = _reading(here, beside) ** 2 + here.of_models + _of_alignment(triplet)
-    return here.closure, np.sqrt(variance)
+    known = np.isfinite(variance)
+    return here.closure[known], np.sqrt(variance[known])
 
 
 def _of_alignment(triplet: Triplet) -> float:
@@ -284,7 +287,7 @@ def _of_alignment(triplet: Triplet) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _AlignedPair:
-    """An alignment, its parameters counted from the middle of each image, and its tie points."""
+    """An alignment and its tie points, in whose parameters its fits are."""
 
     alignment: Alignment
     ties: PairEquations | None
@@ -307,10 +310,11 @@ def _pairs(triplet: Triplet) -> tuple[_AlignedPair, ...]:
     """The alignments of a triplet, A-B, B-C, A-C."""
     found = []
     for pair in (triplet.ab, triplet.bc, triplet.ac):
-        alignment = Alignment.load(pair.alignment)
-        left, right = (over_the_image(fit) for fit in alignment.fits)
-        moved = replace(alignment, left_fit=left, right_fit=right)
-        found.append(_AlignedPair(moved, read_equations(pair.equations)[0]))
+        alignment, ties = Alignment.load(pair.alignment), read_equations(pair.equations)[0]
+        if ties is not None:  # whose parameters are those of the images alone
+            left, right = (over_the_image(fit) for fit in alignment.fits)
+            alignment = replace(alignment, left_fit=left, right_fit=right)
+        found.append(_AlignedPair(alignment, ties))
     return tuple(found)
 
 
@@ -345,15 +349,16 @@ class _Ground:
         in_b, in_c = to(a, b, at), to(a, c, at)
         seen = _inside(in_b, ab.right_fit.size) & _inside(in_c, ac.right_fit.size)
         at, in_b, in_c = at[seen], in_b[seen], in_c[seen]
-        of_a, of_b, of_c = (
-            fit.design(*where.T)
-            for fit, where in ((ab.left_fit, at), (ab.right_fit, in_b), (ac.right_fit, in_c))
-        )
-        a_to_c, b_to_c = slopes(a, c, at), slopes(b, c, in_b)
+        designs = [
+            [fit.design(*where.T) for fit, where in zip(pair.alignment.fits, ends)]
+            for pair, ends in zip(pairs, ((at, in_b), (in_b, in_c), (at, in_c)))
+        ]
+        a_to_b, a_to_c, b_to_c = slopes(a, b, at), slopes(a, c, at), slopes(b, c, in_b)
+        (a_of_ab, b_of_ab), (b_of_bc, c_of_bc), (a_of_ac, c_of_ac) = designs
         effects = (
-            b_to_c @ np.concatenate([-slopes(a, b, at) @ of_a, of_b], axis=-1),
-            np.concatenate([-b_to_c @ of_b, of_c], axis=-1),
-            -np.concatenate([-a_to_c @ of_a, of_c], axis=-1),
+            b_to_c @ np.concatenate([-a_to_b @ a_of_ab, b_of_ab], axis=-1),
+            np.concatenate([-b_to_c @ b_of_bc, c_of_bc], axis=-1),
+            -np.concatenate([-a_to_c @ a_of_ac, c_of_ac], axis=-1),
         )
         return cls(in_c, effects)
 
