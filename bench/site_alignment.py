@@ -312,7 +312,7 @@ def main() -> None:
             rows.append(row)
     joint = [row for row in rows if "joint" in row]
     columns = ["site", "case", "best pair", "usual pair", "joint", "joint / best", "stated σ",
-               "joint, exact points", "labels: pairs", "labels: joint", "images doubted"]  # fmt: skip
+               "exact points", "labels: pairs", "labels: joint", "images doubted"]  # fmt: skip
     title = "Error at exact places per image, px of a coordinate; of labels, mean absolute px"
     print_table(title, columns, [
         [str(r["site"]), r["case"], f"{r['best']:.3f}", f"{r['median']:.3f}", f"{r['joint']:.3f}",
