@@ -16,9 +16,11 @@ Floats = NDArray[np.float64]
 Figures = Mapping[str, Mapping[str, Any]]
 
 HEAVY = 0.1  # weight of a pair that is left out, or nearly so
-LEAST_SPREAD_PX = 0.5  # of corrections over images: less does not make one of them stand out
-CHANCE = 0.01  # that a site without a fault has a correction that stands out
-MOST_OUT = 0.25  # share of the images whose corrections may stand out
+CHANCE = 0.05  # that a site without a fault has an image that stands out
+MOST_OUT = 0.25  # share of the images that may stand out
+NORMAL = 2.0 / 3.0  # power of a length that is normal if both coordinates are (Wilson, Hilferty)
+LEAST_SPREAD_PX = 0.3  # px to that power, of corrections: less makes none of them stand out
+LEAST_SPREAD_SHARE = 0.1  # of the shares that match, likewise
 
 
 def stand_out(values: Floats, least_spread: float) -> Bools:
@@ -45,6 +47,12 @@ def stand_out(values: Floats, least_spread: float) -> Bools:
     return out
 
 
+def _named(values: Mapping[str, float], sign: float, least_spread: float) -> set[str]:
+    """The names whose values, times ``sign``, are too large for the others."""
+    out = stand_out(sign * np.array(list(values.values())), least_spread)
+    return {name for name, is_out in zip(values, out) if is_out}
+
+
 def image_doubts(images: Figures, pairs: Figures) -> dict[str, list[str]]:
     """The doubts of each image by name; ``images``, ``pairs``: figures of the adjustment."""
     own = {
@@ -56,11 +64,18 @@ def image_doubts(images: Figures, pairs: Figures) -> dict[str, list[str]]:
         name: float(np.hypot(images[name]["correction"]["col"], images[name]["correction"]["row"]))
         for name in placed
     }
-    far = dict(zip(placed, stand_out(np.array(list(lengths.values())), LEAST_SPREAD_PX)))
-    usual = float(np.median(list(lengths.values()))) if placed else 0.0
+    far = _named({name: v**NORMAL for name, v in lengths.items()}, 1.0, LEAST_SPREAD_PX)
     # A pair matches no better than the poorer of its images: the best pair tells of both.
-    shares = {name: max(pair["matched"] for pair in own[name]) for name in images}
-    usual_share = float(np.median(list(shares.values())))
+    shares = {
+        name: max(pair["matched"] for pair in own[name])
+        for name in placed
+        if any(pair["tie_points"] for pair in own[name])
+    }
+    usual, usual_share = (
+        float(np.median(list(values.values()))) if values else 0.0 for values in (lengths, shares)
+    )
+    poor = _named(shares, -1.0, LEAST_SPREAD_SHARE)
+    poor |= {name for name, share in shares.items() if share < MIN_USED * usual_share}
     doubts: dict[str, list[str]] = {}
     for name, image in images.items():
         texts = doubts.setdefault(name, [])
@@ -68,16 +83,15 @@ def image_doubts(images: Figures, pairs: Figures) -> dict[str, list[str]]:
         if image["refused"]:
             texts.append(image["refused"])
             continue
-        if far[name] and not image["fixed"]:
+        if name in far and not image["fixed"]:
             texts.append(
                 f"its RPC is off by {lengths[name]:.1f} px, where {usual:.1f} px are usual here; "
                 "corrected"
             )
-        without = [pair for pair in own[name] if not pair["tie_points"]]
-        if len(without) == count:
-            reasons = "; ".join(sorted({pair["reason"] for pair in without}))
+        if name not in shares:
+            reasons = "; ".join(sorted({pair["reason"] for pair in own[name]}))
             texts.append(f"no tie points in any of its pairs ({count}): {reasons}")
-        elif shares[name] < MIN_USED * usual_share:
+        elif name in poor:
             texts.append(
                 f"of the places compared in its pairs {100 * shares[name]:.0f} % match at best, "
                 f"where {100 * usual_share:.0f} % are usual here: clouds, or another ground?"

@@ -182,18 +182,17 @@ class _Triplet:
         in_bc = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab, y))
         d_bc, of_bc = bc.at(*in_bc)
 
-        def by_b(along_ab: float = 0.0, along_bc: float = 0.0, *across: float) -> Floats:
-            """x in A-C by way of B; the places in both right images moved by so many px."""
-            across_ab, across_bc = across or (0.0, 0.0)
-            at = ab.model.epipolar_to_right(x - d_ab - along_ab, y + across_ab)
-            at = bc.model.left_to_epipolar(*at)
-            at = bc.model.epipolar_to_right(at[0] - d_bc - along_bc, at[1] + across_bc)
-            return ac.model.right_to_epipolar(*at)[0]
+        def by_b(along_ab: float, across_ab: float, along_bc: float, across_bc: float) -> Floats:
+            """x in A-C by way of B, with labels and rows of A-B and B-C off by so many px."""
+            in_b = ab.model.epipolar_to_right(x - d_ab - along_ab, y + across_ab)
+            x_bc, y_bc = bc.model.left_to_epipolar(*in_b)
+            in_c = bc.model.epipolar_to_right(x_bc - d_bc - along_bc, y_bc + across_bc)
+            return ac.model.right_to_epipolar(*in_c)[0]
 
-        found = by_b()
-        effects = [by_b(*move) - found for move in ((1, 0), (0, 1), (0, 0, 1, 0), (0, 0, 0, 1))]
-        roughness = np.sqrt((effects[0] * of_ab) ** 2 + (effects[1] * of_bc) ** 2 + of_ac**2)
-        of_models = (effects[2] * ab.y_parallax) ** 2 + (effects[3] * bc.y_parallax) ** 2
+        found = by_b(0.0, 0.0, 0.0, 0.0)
+        of_d_ab, of_y_ab, of_d_bc, of_y_bc = (by_b(*move) - found for move in np.eye(4))
+        roughness = np.sqrt((of_d_ab * of_ab) ** 2 + (of_d_bc * of_bc) ** 2 + of_ac**2)
+        of_models = (of_y_ab * ab.y_parallax) ** 2 + (of_y_bc * bc.y_parallax) ** 2
         return _Closures(in_a[0] - found - d_ac, roughness, of_models)
 
     def blocks(self) -> Iterator[tuple[_Closures, _Closures]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,13 @@ def hill(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
     return HEIGHT + 6.0 * np.sin(east / 35.0) * np.cos(north / 40.0)
 
 
+@cache
+def model_of(left: SensorModel, right: SensorModel) -> EpipolarModel:
+    """The epipolar model of two cameras."""
+    return fit_epipolar(left, right, SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 20, HEIGHT + 20))
+
+
+@cache
 def labels(model: EpipolarModel, higher: float = 0.0) -> np.ndarray:
     """Exact disparities of the hill, or of one that is so many metres higher."""
     y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(float)
@@ -76,16 +84,15 @@ def pair(
 ) -> PairFiles:
     """A pair with labels that are off by ``shift`` px, or of ground that is ``higher``, m, or with
     ``noise`` px of their own; its model states a ``y_parallax``, px."""
-    model = fit_epipolar(
-        cameras[left], cameras[right], SIZE, SIZE, HEIGHT, height_range=(HEIGHT - 20, HEIGHT + 20)
-    )
+    model = model_of(cameras[left], cameras[right])
     if y_parallax is not None:
+        model = EpipolarModel.from_dict(model.to_dict())
         model.report["y_parallax_over_image_footprints"]["rms_px"] = y_parallax
     path = folder / f"{left}-{right}.zarr"
     layers = {"disparity": Layer("float32", np.nan, META)}
     disparity = labels(model, higher) + shift
     rng = np.random.default_rng(ord(left) + 256 * ord(right))
-    disparity += rng.normal(0.0, noise, disparity.shape)
+    disparity = disparity + rng.normal(0.0, noise, disparity.shape)
     with atomic_store(path) as scratch:
         attrs = {"epipolar": model.to_dict()}
         arrays = create_grid(scratch, model.shape, layers, chunk=64, shard=128, attrs=attrs)
