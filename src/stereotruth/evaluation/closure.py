@@ -264,7 +264,7 @@ def _of_alignment(triplet: Triplet) -> float:
     """Variance px² of closures by the alignment, on level ground, mean of the triplet's ground.
 
     0 if each image has one correction in both of its pairs. Else the pairs' alignments count as
-    independent. They share control points and planes of the LiDAR: that is an upper bound.
+    independent. They share images and planes of the LiDAR, so that this is mostly too large.
     """
     pairs = _pairs(triplet)
     ab, bc, ac = (pair.alignment for pair in pairs)
