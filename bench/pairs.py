@@ -4,7 +4,8 @@ Each pair of a drawn site is rectified by exact sensor models, matched by SGM as
 it, and held against the exact truth: the share of the pixels that both images show whose disparity
 SGM misses by more than 1 px, or has not at all. ``--fit`` prints the coefficients of
 epipolar/pair_quality.py from sites of even numbers; without it, the rank correlation of what is
-predicted with what is found over sites of odd numbers, which no fit has seen.
+predicted with what is found over sites of odd numbers, which no fit has seen: within each site,
+since pairs are chosen within a site, and over all of them together.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -108,16 +110,34 @@ def predicted(row: dict) -> float:
     return quality_of(SitePair(**{f.name: row[f.name] for f in fields(SitePair)})).matched
 
 
+def rank(rows: list[dict]) -> float:
+    """Rank correlation of what is predicted with what is found."""
+    found = [1 - row["over_1_px"] for row in rows]
+    return float(spearmanr([predicted(row) for row in rows], found)[0])
+
+
+def interval(values: Callable[[list[int]], float], count: int) -> str:
+    """A figure of sites, and 95 % of it with sites drawn anew (bootstrap; pairs share images)."""
+    rng = np.random.default_rng(SEED)
+    drawn = [values(list(rng.integers(0, count, count))) for _ in range(1000)]
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return f"{values(list(range(count))):.2f} ({low:.2f} to {high:.2f})"
+
+
 def compare(every: list[list[dict]]) -> None:
     """Print the rank correlation of the prediction with the truth, of each site and of all."""
     print("| site | pairs | matched within 1 px | rank correlation |\n|---|---|---|---|")
-    together = [row for of_site in every for row in of_site]
-    for rows in [*every, together]:
-        found = np.array([1 - row["over_1_px"] for row in rows])
-        rank = spearmanr([predicted(row) for row in rows], found)[0]
-        name = "all" if rows is together else rows[0]["site"]
-        low, high = np.quantile(found, (0, 1))
-        print(f"| {name} | {len(rows)} | {100 * low:.0f} to {100 * high:.0f} % | {rank:.2f} |")
+    each = [rank(rows) for rows in every]
+    for rows, of_site in zip(every, each):
+        low, high = np.quantile([1 - row["over_1_px"] for row in rows], (0, 1))
+        print(
+            f"| {rows[0]['site']} | {len(rows)} | {100 * low:.0f} to {100 * high:.0f} % | "
+            f"{of_site:.2f} |"
+        )
+    within = interval(lambda chosen: float(np.mean([each[k] for k in chosen])), len(every))
+    across = interval(lambda chosen: rank([row for k in chosen for row in every[k]]), len(every))
+    print(f"\nWithin a site, mean of {len(every)} sites, and 95 % of such means: {within}")
+    print(f"Over the pairs of all sites together: {across}")
 
 
 def main() -> None:

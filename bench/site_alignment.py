@@ -53,7 +53,7 @@ SEED = 2030
 SPACING_M = 0.5  # of the LiDAR's points
 
 
-def make_site(site: SiteSpec, folder: Path) -> None:
+def make_site(site: SiteSpec, folder: Path, spacing_m: float = SPACING_M) -> None:
     """Images, point stores and control points of a site, below its folder."""
     for image in site.images:
         made = folder / f"{image.name}.tif"
@@ -63,7 +63,7 @@ def make_site(site: SiteSpec, folder: Path) -> None:
         with atomic_folder(folder / "points") as scratch:
             for file in lidar_files(site.city, site.area):
                 simulate_lidar_tile(
-                    site.city, site.area, file, scratch / file, spacing_m=SPACING_M, seed=SEED
+                    site.city, site.area, file, scratch / file, spacing_m=spacing_m, seed=SEED
                 )
                 ingest(scratch / file, scratch / f"{Path(file).stem}.points")
                 (scratch / file).unlink()
@@ -81,12 +81,13 @@ def pairs_of(site: SiteSpec, folder: Path, most: int) -> list[SitePair]:
     return sorted(best, key=lambda pair: (pair.left, pair.right))
 
 
-def some_points(folder: Path, count: int, without: str = "") -> Path:
+def some_points(folder: Path, count: int, without: str = "", table: str = "gcps") -> Path:
     """Control points: the ``count`` that most images show, far from each other.
 
-    None of them is measured in the image ``without``.
+    None of them is measured in the image ``without``. ``table``: ``gcps`` as measured, ``exact``
+    without their noise.
     """
-    with (folder / "gcps.csv").open(newline="", encoding="utf-8") as stream:
+    with (folder / f"{table}.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     ids = sorted({row["id"] for row in rows})
     seen = {name: sum(row["id"] == name for row in rows) for name in ids}
@@ -99,7 +100,7 @@ def some_points(folder: Path, count: int, without: str = "") -> Path:
         away = np.min([np.hypot(*(at - at[k]).T) for k in chosen], axis=0)
         chosen.append(int(np.argmax(away)))
     kept = set(ids) if count >= len(ids) else {often[k] for k in chosen}
-    file = folder / f"gcps_{count}{without}.csv"
+    file = folder / f"{table}_{count}{without}.csv"
     write_table(file, [row for row in rows if row["id"] in kept and row["image"] != without])
     return file
 
@@ -253,6 +254,9 @@ def of_site(number: int, options: argparse.Namespace) -> list[dict[str, Any]]:
         alone = {pair.scene: Alignment.load(pair.alignment) for pair in pairs}
         adjusted = adjust_site(site.city.name, pairs)
         together = sensors_of(adjusted, pairs)
+        noiseless = some_points(folder, count, table="exact")
+        without_noise = adjust_site(site.city.name, [replace(p, gcps=noiseless) for p in pairs])
+        by_exact = by_image(pairs, sensors_of(without_noise, pairs), places)
         single, joint = by_image(pairs, alone, places), by_image(pairs, together, places)
         errors = {name: values[0] for name, values in joint.items()}
         labels = [
@@ -267,6 +271,7 @@ def of_site(number: int, options: argparse.Namespace) -> list[dict[str, Any]]:
             "pairs": len(pairs), "joint": float(np.mean(list(errors.values()))),
             "best": float(np.mean([min(values) for values in single.values()])),
             "median": float(np.mean([np.median(values) for values in single.values()])),
+            "exact": float(np.mean([values[0] for values in by_exact.values()])),
             "sigma": float(np.mean([adjusted["images"][name]["sigma"] for name in errors])),
             "labels_alone": float(np.mean(labels[0])), "labels_joint": float(np.mean(labels[1])),
             "doubts": sum(bool(image["doubts"]) for image in adjusted["images"].values()),
@@ -307,12 +312,12 @@ def main() -> None:
             rows.append(row)
     joint = [row for row in rows if "joint" in row]
     columns = ["site", "case", "best pair", "usual pair", "joint", "joint / best", "stated σ",
-               "labels: pairs", "labels: joint", "images doubted"]  # fmt: skip
+               "exact points", "labels: pairs", "labels: joint", "images doubted"]  # fmt: skip
     title = "Error at exact places per image, px of a coordinate; of labels, mean absolute px"
     print_table(title, columns, [
         [str(r["site"]), r["case"], f"{r['best']:.3f}", f"{r['median']:.3f}", f"{r['joint']:.3f}",
-         f"{r['joint'] / r['best']:.2f}", f"{r['sigma']:.3f}", f"{r['labels_alone']:.4f}",
-         f"{r['labels_joint']:.4f}", str(r["doubts"])]
+         f"{r['joint'] / r['best']:.2f}", f"{r['sigma']:.3f}", f"{r['exact']:.3f}",
+         f"{r['labels_alone']:.4f}", f"{r['labels_joint']:.4f}", str(r["doubts"])]
         for r in joint
     ])  # fmt: skip
     columns = ["site", "spoilt image", "named", "others named", "others worse by at most, px"]

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from ..epipolar.rpc import RPC, SensorModel
 from ..errors import InputError
-from ..numerics.robust import median_and_nmad
 from ..products.files import atomic_file, read_record, sealed
 from .adjustment import over_the_image
 from .align import LARGE_SHIFT
 from .aligned_pair import Alignment, GcpResidual, ViewFit
 from .control_points import NoPoints, read_gcps
-from .refine import MIN_USED, spread_of
-from .robust_fit import BLUNDER_SIGMAS
+from .image_doubts import HEAVY, image_doubts
+from .refine import spread_of
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -53,8 +52,6 @@ UNITS = {
     "weight": "0 to 1, of a pair in the adjustment",
     "covariance": "px^2 of all parameters, images in ascending order of their names",
 }
-LEAST_SPREAD_PX = 0.5  # of corrections over images: less does not make one of them stand out
-HEAVY = 0.1  # weight of a pair that is left out, or nearly so
 
 
 @dataclass(frozen=True)
@@ -190,7 +187,7 @@ def adjust_site(
         name: _image_figures(images[name], pairs, fit, held is not None and name in held.parameters)
         for name in fit.names
     }
-    for name, doubts in _doubts(by_image, by_pair).items():
+    for name, doubts in image_doubts(by_image, by_pair).items():
         by_image[name]["doubts"] = doubts
         for text in doubts:
             log.warning("warning: image %s: %s", name, text)
@@ -296,55 +293,6 @@ def _image_figures(
         "refused": refused,
         "doubts": [],
     }
-
-
-def _doubts(
-    images: Mapping[str, Mapping[str, Any]], pairs: Mapping[str, Mapping[str, Any]]
-) -> dict[str, list[str]]:
-    """What is odd about each image beside the others of its site."""
-    lengths = {
-        name: float(np.hypot(image["correction"]["col"], image["correction"]["row"]))
-        for name, image in images.items()
-    }
-    usual, scatter = median_and_nmad(np.array(list(lengths.values())))
-    limit = usual + BLUNDER_SIGMAS * max(scatter, LEAST_SPREAD_PX)
-    own = {
-        name: [pair for pair in pairs.values() if name in (pair["left"], pair["right"])]
-        for name in images
-    }
-    shares = {name: float(np.median([pair["matched"] for pair in own[name]])) for name in images}
-    usual_share = float(np.median(list(shares.values())))
-    found: dict[str, list[str]] = {}
-    for name, image in images.items():
-        told = found.setdefault(name, [])
-        gcps, count = image["gcps"], len(own[name])
-        if image["refused"]:
-            told.append(image["refused"])
-            continue
-        if lengths[name] > limit and not image["fixed"]:
-            told.append(
-                f"its RPC is off by {lengths[name]:.1f} px, where {usual:.1f} px are usual here; "
-                "corrected"
-            )
-        without = [pair for pair in own[name] if not pair["tie_points"]]
-        if len(without) == count:
-            reasons = "; ".join(sorted({pair["reason"] for pair in without}))
-            told.append(f"no tie points in any of its pairs ({count}): {reasons}")
-        elif shares[name] < MIN_USED * usual_share:
-            told.append(
-                f"of the places compared in its pairs {100 * shares[name]:.0f} % match, where "
-                f"{100 * usual_share:.0f} % are usual here: clouds, or another ground?"
-            )
-        light = sum(pair.get("weight", 1.0) < HEAVY for pair in own[name])
-        if light > count / 2:
-            told.append(
-                f"the tie points of {light} of its {count} pairs contradict the other images"
-            )
-        if gcps["left_out"]:
-            told.append(
-                f"control points left out, which fit no correction: {', '.join(gcps['left_out'])}"
-            )
-    return found
 
 
 def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:

@@ -7,11 +7,19 @@ its rows: the disparity of A-C by way of B less its label.
 All three labels rest on one point cloud and, where the images are adjusted together, on one
 correction per image. Whatever the three corrections and the heights of the ground are, the rays
 that they define close: for one height h of a point, d_AB, d_BC and d_AC are its projections by the
-same three sensors. So the alignment's covariance has no part in a closure. The points' noise has
-none either where all three draw the same facet of one surface: what is left is that labels are read
-between the centres of pixels. The stated uncertainty of a closure has the points' part of each
-label's variance alone, as if the three were independent. That is an upper bound: no layer tells how
-much of their noise three labels share.
+same three sensors. So neither the alignment's covariance nor the noise of the points has a part in
+a closure. What is left, and makes up its uncertainty, is
+
+- *reading*: labels of B-C and A-C are read between the centres of pixels, bilinearly, and each grid
+  samples the small facets of rough ground in its own way. Both errors grow with the second
+  differences of the labels around, and are as good as independent a few pixels on. Their size is
+  therefore the scatter of closures between pixels LAG apart, in units of these second differences,
+  by classes of like roughness;
+- the *epipolar models*: the y-parallax that each leaves, as its own check states;
+- the *alignment*, where an image has not one correction in all three pairs.
+
+An error that neighbours share is no part of the first: an offset of one pair, a correction that
+differs, an RPC that is not smooth. It shows as a closure beyond its uncertainty.
 How good the corrections are shows the closure of the pairs' own refinements, each of which rests on
 tie points of its own: see :func:`closure_of_refinements`.
 """
@@ -19,7 +27,7 @@ tie points of its own: see :func:`closure_of_refinements`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +37,11 @@ from numpy.typing import NDArray
 
 from ..alignment.adjustment import PairEquations, estimate, over_the_image, parameters_of
 from ..alignment.aligned_pair import Alignment
-from ..alignment.label_uncertainty import LabelUncertainty
 from ..alignment.site_fit import rpc_prior
 from ..alignment.tie_equations import read_equations
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
-from ..numerics.bilinear import bilinear
+from ..numerics.bilinear import between_four
 from ..products.files import atomic_file, sealed
 from ..products.grids import blocks, require_complete
 
@@ -44,11 +51,15 @@ Floats = NDArray[np.float64]
 BLOCK = 1024  # px, side of what is read at once
 MOST = 250_000  # pixels of a triplet, about, that are compared
 STEP_PX = 1.0  # difference of neighbouring labels: more is a height step between them
+LAG = 3.0  # px between pixels whose errors of reading are as good as independent
+CLASSES, LEAST_OF_CLASS = 10, 200  # of like roughness, and pixels of each
+HEAVY = 4.0  # usual sizes, the most that a difference counts
+FLOAT_PX = 100.0  # disparity whose rounding is the least roughness
 NODES = 9  # places along each side of an image, of the closure of refinements
 UNITS = (
-    "px along the rows of the grid of A-C; sigma: stated standard uncertainty, of labels by the "
-    "noise of their points alone, as if the three were independent: an upper bound; of "
-    "refinements, px of image C, of both coordinates"
+    "px along the rows of the grid of A-C; sigma: standard uncertainty, of labels by their reading "
+    "between the centres of pixels, by the y-parallax of the epipolar models and, of images with "
+    "several corrections, by these; of refinements, px of image C, of both coordinates"
 )
 
 
@@ -98,75 +109,127 @@ class _Labels:
         group = require_complete(pair.disparity)
         self.model = EpipolarModel.from_dict(group.attrs["epipolar"])
         self.disparity: zarr.Array = group["disparity"]
-        self.uncertainty: zarr.Array = group["uncertainty"]
-        self.alignment = LabelUncertainty.of(Alignment.load(pair.alignment), self.model)
+        self.y_parallax = self.model.report["y_parallax_over_image_footprints"]["rms_px"]
 
-    def window(self, window: tuple[slice, slice]) -> tuple[Floats, Floats]:
-        """Disparity and, of its variance, the part of the points [h, w] px, px²."""
-        disparity = self.disparity[window].astype(float)
-        rows, cols = (
-            np.arange(part.start, part.start + size, dtype=float)
-            for part, size in zip(window, disparity.shape)
-        )
-        slope = np.zeros((2, *disparity.shape))
-        for axis, size in ((1, cols.size), (0, rows.size)):
-            if size > 1:
-                slope[1 - axis] = np.nan_to_num(np.gradient(disparity, axis=axis))
-        of_alignment = self.alignment.variance(cols, rows, slope)
-        return disparity, np.maximum(self.uncertainty[window].astype(float) ** 2 - of_alignment, 0)
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of the grid."""
+        return self.disparity.shape
 
     def at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """As :meth:`window`, [n] at places of the left grid; NaN between surfaces."""
-        rows, cols = self.disparity.shape
+        """Disparity and roughness [n] px at places of the left grid; NaN between surfaces."""
+        rows, cols = self.shape
         known = (x >= 0) & (y >= 0) & (x <= cols - 1) & (y <= rows - 1)
-        disparity, variance = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+        disparity, roughness = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
         if not known.any():
-            return disparity, variance
-        left, top = int(x[known].min()), int(y[known].min())
-        window = np.s_[top : int(y[known].max()) + 2, left : int(x[known].max()) + 2]
-        labels, of_points = self.window(window)
+            return disparity, roughness
+        left, top = max(int(x[known].min()) - 1, 0), max(int(y[known].min()) - 1, 0)
+        window = np.s_[top : int(y[known].max()) + 3, left : int(x[known].max()) + 3]
+        labels = self.disparity[window].astype(float)
+        rough = _roughness(labels)
         u, v = x[known] - left, y[known] - top
         i, j = u.astype(int), v.astype(int)
-        below = np.minimum(j + 1, labels.shape[0] - 1)
-        beside = np.minimum(i + 1, labels.shape[1] - 1)
-        corners = np.stack(
-            [labels[j, i], labels[j, beside], labels[below, i], labels[below, beside]]
-        )
-        even = np.ptp(corners, axis=0) < STEP_PX  # not where one is NaN
-        disparity[known] = np.where(even, bilinear(labels, u, v), np.nan)
-        variance[known] = bilinear(of_points, u, v)
-        return disparity, variance
+        beside, below = np.ceil(u).astype(int), np.ceil(v).astype(int)
+
+        def corners(grid: Floats) -> Floats:
+            return np.stack([grid[j, i], grid[j, beside], grid[below, i], grid[below, beside]])
+
+        four, of_four = corners(labels), corners(rough)
+        even = np.ptp(four, axis=0) < STEP_PX  # not where one is NaN
+        disparity[known] = np.where(even, between_four(*four, u - i, v - j), np.nan)
+        share = between_four(*np.isfinite(of_four).astype(float), u - i, v - j)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            roughness[known] = between_four(*np.nan_to_num(of_four), u - i, v - j) / share
+        return disparity, roughness
 
 
-def _closures(triplet: Triplet) -> Iterator[tuple[Floats, Floats]]:
-    """Closure and its uncertainty [n] px of each block of the grid of A-B."""
-    ab, bc, ac = (_Labels(pair) for pair in (triplet.ab, triplet.bc, triplet.ac))
-    rows, cols = ab.disparity.shape
-    step = max(1, round((rows * cols / MOST) ** 0.5))
-    for window in blocks((rows, cols), BLOCK):
-        d_ab, v_ab = (values[::step, ::step] for values in ab.window(window))
-        j, i = np.nonzero(np.isfinite(d_ab))
-        if not len(i):
-            continue
-        x, y = window[1].start + step * i.astype(float), window[0].start + step * j.astype(float)
-        d_ab, v_ab = d_ab[j, i], v_ab[j, i]
+def _roughness(labels: Floats) -> Floats:
+    """Mean size [h, w] px of the second differences of labels along x and y on one surface."""
+    sizes = []
+    for axis in (0, 1):
+        first = np.diff(labels, axis=axis)
+        first[~(np.abs(first) < STEP_PX)] = np.nan
+        second = np.full(labels.shape, np.nan)
+        second[(np.s_[1:-1], np.s_[:])[:: 1 if axis == 0 else -1]] = np.diff(first, axis=axis)
+        sizes.append(np.abs(second))
+    count = np.isfinite(sizes).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        return np.where(count > 0, np.nansum(sizes, axis=0) / count, np.nan)
 
-        def in_ac(in_bc: tuple[Floats, Floats], disparity: Floats) -> tuple[Floats, Floats]:
-            in_c = bc.model.epipolar_to_right(in_bc[0] - disparity, in_bc[1])
-            return ac.model.right_to_epipolar(*in_c)
 
-        in_bc = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab, y))
-        d_bc, v_bc = bc.at(*in_bc)
-        by_b = in_ac(in_bc, d_bc)[0]
+@dataclass(frozen=True, eq=False)
+class _Closures:
+    """Of n pixels of A: ``closure`` px; ``roughness`` px, of all three labels, as it counts in a
+    closure; ``of_models`` px²: variance by the y-parallax of the epipolar models."""
+
+    closure: Floats
+    roughness: Floats
+    of_models: Floats
+
+
+class _Triplet:
+    """The labels of a triplet."""
+
+    def __init__(self, triplet: Triplet) -> None:
+        self.ab, self.bc, self.ac = (_Labels(p) for p in (triplet.ab, triplet.bc, triplet.ac))
+
+    def closures(self, x: Floats, y: Floats) -> _Closures:
+        """At pixels of the grid of A-B; NaN where a label is missing."""
+        ab, bc, ac = self.ab, self.bc, self.ac
+        d_ab, of_ab = ab.at(x, y)
         in_a = ac.model.left_to_epipolar(*ab.model.epipolar_to_left(x, y))
-        d_ac, v_ac = ac.at(*in_a)
-        beside = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab - 1.0, y))
-        by_ab = in_ac(beside, d_bc)[0] - by_b
-        by_bc = in_ac(in_bc, d_bc + 1.0)[0] - by_b
-        closure = in_a[0] - by_b - d_ac
-        variance = by_ab**2 * v_ab + by_bc**2 * v_bc + v_ac
-        good = np.isfinite(closure) & np.isfinite(variance)
-        yield closure[good], np.sqrt(variance[good])
+        d_ac, of_ac = ac.at(*in_a)
+        in_bc = bc.model.left_to_epipolar(*ab.model.epipolar_to_right(x - d_ab, y))
+        d_bc, of_bc = bc.at(*in_bc)
+
+        def by_b(along_ab: float, across_ab: float, along_bc: float, across_bc: float) -> Floats:
+            """x in A-C by way of B, with labels and rows of A-B and B-C off by so many px."""
+            in_b = ab.model.epipolar_to_right(x - d_ab - along_ab, y + across_ab)
+            x_bc, y_bc = bc.model.left_to_epipolar(*in_b)
+            in_c = bc.model.epipolar_to_right(x_bc - d_bc - along_bc, y_bc + across_bc)
+            return ac.model.right_to_epipolar(*in_c)[0]
+
+        found = by_b(0.0, 0.0, 0.0, 0.0)
+        of_d_ab, of_y_ab, of_d_bc, of_y_bc = (by_b(*move) - found for move in np.eye(4))
+        roughness = np.sqrt((of_d_ab * of_ab) ** 2 + (of_d_bc * of_bc) ** 2 + of_ac**2)
+        of_models = (of_y_ab * ab.y_parallax) ** 2 + (of_y_bc * bc.y_parallax) ** 2
+        return _Closures(in_a[0] - found - d_ac, roughness, of_models)
+
+    def blocks(self) -> Iterator[tuple[_Closures, _Closures]]:
+        """Closures of pixels all over the grid of A-B, and LAG px beside each, where there are."""
+        rows, cols = self.ab.shape
+        step = max(1, round((rows * cols / MOST) ** 0.5))
+        for window in blocks((rows, cols), BLOCK):
+            y, x = (
+                grid.ravel().astype(float)
+                for grid in np.mgrid[
+                    window[0].start : window[0].stop : step, window[1].start : window[1].stop : step
+                ]
+            )
+            here = self.closures(x, y)
+            good = np.isfinite(list(vars(here).values())).all(axis=0)
+            here = _Closures(*(values[good] for values in vars(here).values()))
+            yield here, self.closures(x[good] + LAG, y[good])
+
+
+def _reading(here: _Closures, beside: _Closures) -> Floats:
+    """Standard uncertainty [n] px of closures by the reading of the labels.
+
+    In each class of like roughness the standard deviation of closure over roughness, from the
+    differences of pixels LAG apart; none counts more than HEAVY of its usual size.
+    """
+    floor = np.finfo(np.float32).eps * FLOAT_PX
+    rough, other = (np.maximum(one.roughness, floor) for one in (here, beside))
+    difference = np.abs(here.closure / rough - beside.closure / other) / 2**0.5
+    known = np.isfinite(difference)
+    order = np.argsort(rough, kind="stable")
+    sigma = np.full(rough.shape, np.nan)
+    for part in np.array_split(order, max(1, min(CLASSES, int(known.sum()) // LEAST_OF_CLASS))):
+        size = difference[part][known[part]]
+        if len(size):
+            size = np.minimum(size, HEAVY * np.quantile(size, 0.683))
+            sigma[part] = rough[part] * np.sqrt(np.mean(size**2))
+    return sigma
 
 
 def figures(closure: Floats, sigma: Floats) -> dict[str, Any]:
@@ -186,9 +249,117 @@ def figures(closure: Floats, sigma: Floats) -> dict[str, Any]:
 
 
 def closure_of_labels(triplet: Triplet) -> tuple[Floats, Floats]:
-    """Closure and stated uncertainty [n] px at pixels of A all over the triplet's ground."""
-    parts = [(np.zeros(0), np.zeros(0)), *_closures(triplet)]
-    return np.concatenate([c for c, _ in parts]), np.concatenate([s for _, s in parts])
+    """Closure and its uncertainty [n] px at pixels of A all over the triplet's ground."""
+    pairs = list(_Triplet(triplet).blocks())
+    here, beside = (
+        _Closures(*(np.concatenate(v) for v in zip(*(vars(pair[k]).values() for pair in pairs))))
+        for k in (0, 1)
+    )
+    variance = _reading(here, beside) ** 2 + here.of_models + _of_alignment(triplet)
+    known = np.isfinite(variance)
+    return here.closure[known], np.sqrt(variance[known])
+
+
+def _of_alignment(triplet: Triplet) -> float:
+    """Variance px² of closures by the alignment, on level ground, mean of the triplet's ground.
+
+    0 if each image has one correction in both of its pairs. Else the pairs' alignments count as
+    independent. They share images and planes of the LiDAR, so that this is mostly too large.
+    """
+    pairs = _pairs(triplet)
+    ab, bc, ac = (pair.alignment for pair in pairs)
+    of_image = (ab.fits[0], ac.fits[0]), (ab.fits[1], bc.fits[0]), (bc.fits[1], ac.fits[1])
+    if all(np.array_equal(one.affine, other.affine) for one, other in of_image):
+        return 0.0
+    ground = _Ground.of(pairs)
+    if not len(ground.in_c):
+        return 0.0
+    model = _Labels(triplet.ac).model
+    along = model.right_image.slopes(*ground.in_c.T)[:, 0]  # x of the grid by px of image C
+    variance = 0.0
+    for effect, pair in zip(ground.effects, pairs):
+        covariance = pair.alignment.covariance if pair.ties is None else pair.by_itself()[1]
+        moved = np.einsum("na,nap->np", along, effect)
+        variance += float(np.einsum("np,pq,nq->n", moved, covariance, moved).mean())
+    return variance
+
+
+@dataclass(frozen=True, eq=False)
+class _AlignedPair:
+    """An alignment and its tie points, in whose parameters its fits are."""
+
+    alignment: Alignment
+    ties: PairEquations | None
+
+    def by_itself(self) -> tuple[Floats, Floats]:
+        """What the tie points say by themselves: parameters [12] and their covariance.
+
+        Against the site's corrections, which are one per image: they close. Without what all tie
+        points share behind their guard: it acts as a height, and heights close.
+        """
+        prior = np.zeros((12, 12))
+        for k, fit in enumerate(self.alignment.fits):
+            prior[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = rpc_prior(fit)
+        about = np.concatenate([parameters_of(fit) for fit in self.alignment.fits])
+        found = estimate(self.ties.equations.about(about), prior)
+        return found.parameters, found.covariance
+
+
+def _pairs(triplet: Triplet) -> tuple[_AlignedPair, ...]:
+    """The alignments of a triplet, A-B, B-C, A-C."""
+    found = []
+    for pair in (triplet.ab, triplet.bc, triplet.ac):
+        alignment, ties = Alignment.load(pair.alignment), read_equations(pair.equations)[0]
+        if ties is not None:  # whose parameters are those of the images alone
+            left, right = (over_the_image(fit) for fit in alignment.fits)
+            alignment = replace(alignment, left_fit=left, right_fit=right)
+        found.append(_AlignedPair(alignment, ties))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """n places on level ground that all three images show.
+
+    ``in_c`` [n, 2] px of image C; ``effects``: three of [n, 2, 12], what the parameters of the
+    alignments of A-B, B-C and A-C do to the closure in image C.
+    """
+
+    in_c: Floats
+    effects: tuple[Floats, Floats, Floats]
+
+    @classmethod
+    def of(cls, pairs: tuple[_AlignedPair, ...]) -> _Ground:
+        ab, _, ac = (pair.alignment for pair in pairs)
+        a, b, c = ab.left, ab.right, ac.right
+        cols, rows = ab.left_fit.size
+        grid = np.meshgrid(np.linspace(0, cols - 1, NODES), np.linspace(0, rows - 1, NODES))
+        at = np.stack([axis.ravel() for axis in grid], axis=1)
+        height = ab.reference_height
+
+        def to(first: Any, second: Any, where: Floats) -> Floats:
+            return np.stack(second.project(*first.localize(*where.T, height), height), axis=1)
+
+        def slopes(first: Any, second: Any, where: Floats) -> Floats:
+            moves = [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]
+            ends = [to(first, second, where + move) for move in moves]
+            return np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1)
+
+        in_b, in_c = to(a, b, at), to(a, c, at)
+        seen = _inside(in_b, ab.right_fit.size) & _inside(in_c, ac.right_fit.size)
+        at, in_b, in_c = at[seen], in_b[seen], in_c[seen]
+        designs = [
+            [fit.design(*where.T) for fit, where in zip(pair.alignment.fits, ends)]
+            for pair, ends in zip(pairs, ((at, in_b), (in_b, in_c), (at, in_c)))
+        ]
+        a_to_b, a_to_c, b_to_c = slopes(a, b, at), slopes(a, c, at), slopes(b, c, in_b)
+        (a_of_ab, b_of_ab), (b_of_bc, c_of_bc), (a_of_ac, c_of_ac) = designs
+        effects = (
+            b_to_c @ np.concatenate([-a_to_b @ a_of_ab, b_of_ab], axis=-1),
+            np.concatenate([-b_to_c @ b_of_bc, c_of_bc], axis=-1),
+            -np.concatenate([-a_to_c @ a_of_ac, c_of_ac], axis=-1),
+        )
+        return cls(in_c, effects)
 
 
 def closure_of_refinements(triplet: Triplet) -> tuple[Floats, Floats] | None:
@@ -198,60 +369,16 @@ def closure_of_refinements(triplet: Triplet) -> tuple[Floats, Floats] | None:
     errors add up to nothing, but for the errors of the three refinements, which are independent. At
     n places of image A that all three images show; None if a pair has no tie points.
     """
-    pairs = triplet.ab, triplet.bc, triplet.ac
-    ties = [read_equations(pair.equations)[0] for pair in pairs]
-    if any(one is None for one in ties):
+    pairs = _pairs(triplet)
+    if any(pair.ties is None for pair in pairs):
         return None
-    ab, bc, ac = (Alignment.load(pair.alignment) for pair in pairs)
-    a, b, c = ab.left, ab.right, ac.right
-    cols, rows = ab.left_fit.size
-    grid = np.meshgrid(np.linspace(0, cols - 1, NODES), np.linspace(0, rows - 1, NODES))
-    at = np.stack([axis.ravel() for axis in grid], axis=1)
-    height = ab.reference_height
-
-    def to(first: Any, second: Any, where: Floats) -> Floats:
-        return np.stack(second.project(*first.localize(*where.T, height), height), axis=1)
-
-    in_b, in_c = to(a, b, at), to(a, c, at)
-    seen = _inside(in_b, ab.right_fit.size) & _inside(in_c, ac.right_fit.size)
-    if not seen.any():
-        return np.zeros(0), np.zeros(0)
-    at, in_b, in_c = at[seen], in_b[seen], in_c[seen]
-
-    def slopes(first: Any, second: Any, where: Floats) -> Floats:
-        ends = [to(first, second, where + s) for s in ([0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5])]
-        return np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1)
-
-    of_a, of_b, of_c = (
-        over_the_image(fit).design(*where.T)
-        for fit, where in ((ab.left_fit, at), (ab.right_fit, in_b), (ac.right_fit, in_c))
-    )
-    a_to_c, b_to_c = slopes(a, c, at), slopes(b, c, in_b)
-    effects = (
-        b_to_c @ np.concatenate([-slopes(a, b, at) @ of_a, of_b], axis=-1),
-        np.concatenate([-b_to_c @ of_b, of_c], axis=-1),
-        -np.concatenate([-a_to_c @ of_a, of_c], axis=-1),
-    )
-    closure, variance = np.zeros((len(at), 2)), np.zeros((len(at), 2))
-    for effect, alignment, one in zip(effects, (ab, bc, ac), ties):
-        # Against the site's corrections, which are one per image: they close.
-        about = np.concatenate([parameters_of(over_the_image(fit)) for fit in alignment.fits])
-        parameters, covariance = _by_itself(one, alignment, about)
+    ground = _Ground.of(pairs)
+    closure, variance = np.zeros(ground.in_c.shape), np.zeros(ground.in_c.shape)
+    for effect, pair in zip(ground.effects, pairs):
+        parameters, covariance = pair.by_itself()
         closure += effect @ parameters
         variance += np.einsum("nap,pq,naq->na", effect, covariance, effect)
     return closure.ravel(), np.sqrt(variance).ravel()
-
-
-def _by_itself(ties: PairEquations, alignment: Alignment, about: Floats) -> tuple[Floats, Floats]:
-    """What the tie points of a pair say by themselves: parameters [12] and their covariance.
-
-    Without what all of them share behind their guard: it acts as a height, and heights close.
-    """
-    prior = np.zeros((12, 12))
-    for k, fit in enumerate(alignment.fits):
-        prior[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = rpc_prior(over_the_image(fit))
-    found = estimate(ties.equations.about(about), prior)
-    return found.parameters, found.covariance
 
 
 def _inside(at: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
