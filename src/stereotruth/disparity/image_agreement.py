@@ -36,7 +36,14 @@ from ..epipolar.surface_correlation import correlation_and_expected
 from ..numerics.summed_area import window_sums
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
-from .shifted_agreement import SHIFTS_PX, SIGNAL, ShiftedAgreement, shifted_agreement
+from .seen_surface import box_max
+from .shifted_agreement import (
+    INDEPENDENT_PX2,
+    SHIFTS_PX,
+    SIGNAL,
+    ShiftedAgreement,
+    shifted_agreement,
+)
 from .status import VEGETATION_CLASSES, WATER_CLASS, Status, is_labelled
 from .surface_means import apart_from_steps, surface_mean, warp_to_left
 
@@ -50,13 +57,22 @@ NEARBY_PX = 8  # for what is small, pixels up to here vote,
 NEARBY_SHARE = 0.35  # of which so many fail
 DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
 TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
+CLOSE_PX = 5  # side of the windows for what is a few pixels wide
+# A pixel is held where a window of that size, centred up to HELD_PX off, correlates by more than
+# HELD: by chance one of a thousand does.
+HELD_PX, HELD = 1, 0.95
+RIM_SHARE = 0.1  # of the surface up to NEARBY_PX around is not changed, at the rim of what is
+# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation
+YOUNG_REACH_PX, YOUNG_PIXELS = 3, 12
+CONFIRMED = 0.3  # of what the same crown would agree by, as noise leaves it
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
 BESIDE_SHARE = 0.15  # of the pixels up to APART_PX around have changed: a pixel is in their rim,
 RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by less
 # Crowns that have been felled: both images see the ground below, over a few pixels
-CROWN_WINDOW_PX, CROWN_REACH_PX = 5, 2
+CROWN_REACH_PX = 2
 CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
 CROWN_AGREEMENT = 0.6  # of the images there, at least
+DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
 
@@ -68,6 +84,7 @@ class Agreement:
     where there is none or noise leaves nothing to tell, which is ``drowned``; ``disparity`` (px)
     [h, w] and its ``slope`` [2, h, w] decide what belongs to a surface. With less than
     ``threshold`` a pixel fails. ``weight`` in [0, 1] that no object fits between the points.
+    ``doubt``: standard deviation [h, w] that noise leaves the correlation of the same ground.
     """
 
     correlation: NDArray[np.floating]
@@ -76,6 +93,7 @@ class Agreement:
     threshold: float
     weight: float = 1.0
     drowned: Bools | bool = False
+    doubt: Singles | float = 0.0
 
     def outvoted(self) -> Bools:
         """Pixels [h, w] around which most of their surface fails.
@@ -92,8 +110,13 @@ class Agreement:
     def _against(self, least: float | Singles, drowned: float) -> Floats:
         """1 where pixels [h, w] correlate less than ``least``, else 0; ``drowned`` where they are;
         NaN where there is nothing to correlate."""
-        against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
+        fails = self._with_doubt() < least
+        against = np.where(np.isfinite(self.correlation), fails, np.nan)
         return np.where(self.drowned, drowned, against)
+
+    def _with_doubt(self) -> NDArray[np.floating]:
+        """The correlation [h, w] that noise may have lowered to the one that is there."""
+        return self.correlation + DOUBTS * self.doubt
 
     def _usual(self, correlation: NDArray[np.floating]) -> Singles:
         """What pixels [h, w] correlate by at least if they are as usual on their surface around
@@ -135,7 +158,7 @@ class Agreement:
             return changed.copy()
         near = window_sums(np.pad(changed, NEARBY_PX), 2 * NEARBY_PX + 1)
         unchanged = np.where(changed, np.nan, self.correlation)
-        return (near > 0) & (self.correlation < self._usual(unchanged))
+        return (near > 0) & (self._with_doubt() < self._usual(unchanged))
 
 
 class Comparison(NamedTuple):
@@ -166,7 +189,7 @@ def window_agreement(
     with_noise, expected = correlation_and_expected(
         left, warped, *surface, comparison.window_px, comparison.noise, clear
     )
-    limits = comparison.threshold, comparison.weight
+    limits = comparison.threshold, comparison.weight, comparison.window_px
     return free_of_noise(with_noise, expected, *surface, *limits), with_noise
 
 
@@ -176,13 +199,17 @@ def free_of_noise(
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     threshold: float,
-    weight: float = 1.0,
+    weight: float,
+    window_px: int,
 ) -> Agreement:
     """The agreement by the correlation ``with_noise`` and the one ``expected`` of the same ground,
-    arrays [h, w] (:func:`stereotruth.epipolar.surface_correlation.correlation_and_expected`)."""
+    arrays [h, w] of windows of ``window_px``
+    (:func:`stereotruth.epipolar.surface_correlation.correlation_and_expected`)."""
     drowned = np.isfinite(with_noise) & np.isnan(expected)
     correlation = np.minimum(with_noise / expected, np.float32(1.0))
-    return Agreement(correlation, disparity, slope, threshold, weight, drowned)
+    # of a coefficient of n pixels: (1 - r²) / sqrt(n), where r is the one expected
+    doubt = (1.0 - expected**2) / expected * np.float32(np.sqrt(INDEPENDENT_PX2) / window_px)
+    return Agreement(correlation, disparity, slope, threshold, weight, drowned, doubt)
 
 
 def contradicted(
@@ -195,13 +222,60 @@ def contradicted(
     """Which of the ``labelled`` pixels [h, w] the images contradict; the correlation of the images
     over each pixel's surface. ``surface_class`` [h, w] (ASPRS): of what the labels show."""
     agreement, correlation = window_agreement(labels, window, comparison)
-    compared = _contradicted_apart if comparison.diachronic else _contradicted_together
-    changed = compared(labels, window, comparison, labelled, agreement)
+    if comparison.diachronic:
+        changed = _contradicted_apart(labels, window, comparison, labelled)
+        closely = None
+    else:
+        closely, _ = window_agreement(labels, window, comparison._replace(window_px=CLOSE_PX))
+        changed = _contradicted_together(labels, window, comparison, labelled, agreement, closely)
+    open_to_change = labelled & ~changed
+    changed |= unconfirmed(labels, window, comparison, open_to_change, surface_class, closely)
     vegetation = labelled & ~changed & np.isin(surface_class, VEGETATION_CLASSES)
     felled = shifted_agreement(
-        labels, window, comparison.noise, CROWN_WINDOW_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
+        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
     )
     return changed | felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT), correlation
+
+
+def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
+    """Pixels [h, w] no more than YOUNG_REACH_PX from a crown of the LiDAR that is small, by the
+    ``surface_class`` [h, w] (ASPRS).
+
+    Young trees grow most. That is known before any image is compared, so that what is beside them
+    has a label only where the images confirm it.
+    """
+    vegetation = np.isin(surface_class, VEGETATION_CLASSES)
+    within = {px: window_sums(np.pad(vegetation, px), 2 * px + 1) for px in (1, 3, 6)}
+    is_young = vegetation & (within[3] <= YOUNG_PIXELS) & (within[6] <= 2 * YOUNG_PIXELS)
+    is_young &= 2 * within[1] >= within[3]
+    return box_max(is_young, YOUNG_REACH_PX)
+
+
+def unconfirmed(
+    labels: Labels,
+    window: PairWindow,
+    comparison: Comparison,
+    wanted: Bools,
+    surface_class: NDArray[np.uint8],
+    closely: Agreement | None,
+) -> Bools:
+    """Which of the ``wanted`` pixels [h, w] have no label unless the images confirm it, and do not.
+
+    Those are crowns, since they are felled and leaves come and go, and what is beside young ones.
+    ``surface_class`` [h, w] (ASPRS): of what the labels show; ``closely``: how images of one light
+    agree over windows of CLOSE_PX, None if they share none.
+    """
+    crowns = wanted & np.isin(surface_class, VEGETATION_CLASSES)
+    beside = wanted & beside_young_crowns(surface_class)
+    compared = crowns if closely else crowns | beside
+    detail = shifted_agreement(
+        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, compared, (), apart=False
+    )
+    out = crowns & ~(detail.here > CONFIRMED * detail.signal)
+    if closely is None:
+        return out | beside & ~(detail.here > DOUBT * detail.signal)
+    near = surface_mean(closely.correlation, labels.disparity, labels.slope, 1, 1, beside)
+    return out | beside & ~(near > DOUBT)
 
 
 def _contradicted_together(
@@ -210,8 +284,10 @@ def _contradicted_together(
     comparison: Comparison,
     labelled: Bools,
     agreement: Agreement,
+    closely: Agreement,
 ) -> Bools:
-    """:func:`contradicted` of images of one light, by their ``agreement``."""
+    """:func:`contradicted` of images of one light, by their ``agreement`` and the one over windows
+    of CLOSE_PX."""
     changed = agreement.outvoted()
     doubtful = labelled & (agreement.together() < DOUBT)
     shifted = shifted_agreement(
@@ -220,11 +296,15 @@ def _contradicted_together(
     changed |= shifted.contradicts
     has_signal = shifted.signal > SIGNAL
     changed |= has_signal & agreement.unusual()
+    # votes widen what has changed over the same surface: there what agrees by itself is held
+    goes_on = np.where(labelled, ~changed, np.nan)
+    is_rim = surface_mean(goes_on, labels.disparity, labels.slope, NEARBY_PX, 2) > RIM_SHARE
+    agrees = box_max(np.nan_to_num(closely.correlation, nan=-1.0), HELD_PX) > HELD
     rim = agreement.beside(changed)
     if comparison.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window vote once more.
         changed |= agreement.outvoted_nearby()
-    return (changed | rim) & labelled
+    return (changed | rim) & labelled & (shifted.is_shifted | ~(is_rim & agrees))
 
 
 def _contradicted_apart(
@@ -232,7 +312,6 @@ def _contradicted_apart(
     window: PairWindow,
     comparison: Comparison,
     labelled: Bools,
-    _: Agreement,
 ) -> Bools:
     """:func:`contradicted` of images that share no light: at once by the surface up to APART_PX
     around a pixel; beside such pixels, where that mixes what has changed with what has not, by the
