@@ -233,10 +233,12 @@ def with_crowns(
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        changed, with_noise = contradicted(merged, window, comparison, new, surface_class)
-        correlation = np.where(new, with_noise, correlation)
-        status[changed] = Status.CHANGED
-        new &= ~changed
+        found = contradicted(merged, window, comparison, new, surface_class)
+        correlation = np.where(new, found.correlation, correlation)
+        variance = np.where(new, merged.variance + found.variance, merged.variance)
+        merged = replace(merged, variance=variance)
+        status[found.changed] = Status.CHANGED
+        new &= ~found.changed
     status[new] = Status.LABELLED_CROWN
     return replace(
         labels,

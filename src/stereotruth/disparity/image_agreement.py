@@ -18,7 +18,10 @@ one surface only:
   share no light that alone counts. Crowns are compared over fewer pixels, too;
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
-- :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote.
+- :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote;
+- :func:`unconfirmed`: crowns, and what is beside young ones, which change most: they have labels
+  where the images confirm these;
+- :func:`variance_of_unseen_change`: what is left to doubt where images share no light.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
 depend on blocks.
@@ -32,6 +35,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import correlation_and_expected
 from ..numerics.summed_area import window_sums
 from .pair_window import PairWindow, WindowLabels
@@ -58,11 +62,12 @@ NEARBY_SHARE = 0.35  # of which so many fail
 DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
 TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
 CLOSE_PX = 5  # side of the windows for what is a few pixels wide
-# A pixel is held where a window of that size, centred up to HELD_PX off, correlates by more than
-# HELD: by chance one of a thousand does.
-HELD_PX, HELD = 1, 0.95
-RIM_SHARE = 0.1  # of the surface up to NEARBY_PX around is not changed, at the rim of what is
-# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation
+# At the rim of what has changed more than RIM_SHARE of the surface up to NEARBY_PX around has not.
+# There a pixel is held where a window of CLOSE_PX, centred up to HELD_PX off, correlates by more
+# than HELD, as by chance about one of a hundred changed ones does.
+HELD_PX, HELD, RIM_SHARE = 1, 0.95, 0.1
+# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
+# 2 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by one.
 YOUNG_REACH_PX, YOUNG_PIXELS = 3, 12
 CONFIRMED = 0.3  # of what the same crown would agree by, as noise leaves it
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
@@ -72,6 +77,11 @@ RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by le
 CROWN_REACH_PX = 2
 CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
 CROWN_AGREEMENT = 0.6  # of the images there, at least
+# Of labels that images of two lights leave, the share that has changed, by their agreement as a
+# share of what noise leaves the same ground; and without any. Cities of seeds 1 and 2 of
+# bench/changes.py, of whose buildings and trees a tenth to a quarter has changed.
+UNSEEN = (0.0, 0.1, 0.5, 0.7, 0.9, 1.0), (0.08, 0.02, 0.02, 0.0055, 0.0015, 0.0007)
+UNSEEN_BY_NONE = 0.1
 DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
@@ -212,19 +222,33 @@ def free_of_noise(
     return Agreement(correlation, disparity, slope, threshold, weight, drowned, doubt)
 
 
+class Contradicted(NamedTuple):
+    """What the images of a window say of its labels; arrays [h, w].
+
+    ``changed``: where they contradict these; ``correlation`` of the images over each pixel's
+    surface; ``variance`` (px²) of labels that they do not contradict, though these may have
+    changed.
+    """
+
+    changed: Bools
+    correlation: Singles
+    variance: Floats | float
+
+
 def contradicted(
     labels: Labels,
     window: PairWindow,
     comparison: Comparison,
     labelled: Bools,
     surface_class: NDArray[np.uint8],
-) -> tuple[Bools, Singles]:
-    """Which of the ``labelled`` pixels [h, w] the images contradict; the correlation of the images
-    over each pixel's surface. ``surface_class`` [h, w] (ASPRS): of what the labels show."""
+) -> Contradicted:
+    """Which of the ``labelled`` pixels [h, w] the images contradict. ``surface_class`` [h, w]
+    (ASPRS): of what the labels show."""
     agreement, correlation = window_agreement(labels, window, comparison)
+    unseen: Floats | float = 0.0
     if comparison.diachronic:
-        changed = _contradicted_apart(labels, window, comparison, labelled)
-        closely = None
+        changed, compared = _contradicted_apart(labels, window, comparison, labelled)
+        closely, unseen = None, variance_of_unseen_change(compared)
     else:
         closely, _ = window_agreement(labels, window, comparison._replace(window_px=CLOSE_PX))
         changed = _contradicted_together(labels, window, comparison, labelled, agreement, closely)
@@ -234,7 +258,21 @@ def contradicted(
     felled = shifted_agreement(
         labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
     )
-    return changed | felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT), correlation
+    changed |= felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT)
+    return Contradicted(changed, correlation, unseen)
+
+
+def variance_of_unseen_change(agreement: ShiftedAgreement) -> Floats:
+    """Variance (px², [h, w]) of labels of images that share no light, since what these show may
+    have changed though they do not contradict it.
+
+    Its probability follows from their ``agreement``, as a share of what noise leaves the same
+    ground. A label of what has changed counts as off by SURFACE_PX, the least that is another
+    surface (eq. 17 of docs/explanation/surface.md).
+    """
+    share = agreement.here / np.maximum(agreement.signal, SIGNAL)
+    probability = np.interp(share, *UNSEEN)
+    return np.where(np.isnan(share), UNSEEN_BY_NONE, probability) * SURFACE_PX**2
 
 
 def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
@@ -245,9 +283,12 @@ def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
     has a label only where the images confirm it.
     """
     vegetation = np.isin(surface_class, VEGETATION_CLASSES)
-    within = {px: window_sums(np.pad(vegetation, px), 2 * px + 1) for px in (1, 3, 6)}
-    is_young = vegetation & (within[3] <= YOUNG_PIXELS) & (within[6] <= 2 * YOUNG_PIXELS)
-    is_young &= 2 * within[1] >= within[3]
+    beside, around, beyond = (
+        window_sums(np.pad(vegetation, px), 2 * px + 1)
+        for px in (1, YOUNG_REACH_PX, 2 * YOUNG_REACH_PX)
+    )
+    is_small = (around <= YOUNG_PIXELS) & (beyond <= 2 * YOUNG_PIXELS)
+    is_young = vegetation & is_small & (2 * beside >= around)  # compact, no branches of a canopy
     return box_max(is_young, YOUNG_REACH_PX)
 
 
@@ -312,22 +353,23 @@ def _contradicted_apart(
     window: PairWindow,
     comparison: Comparison,
     labelled: Bools,
-) -> Bools:
-    """:func:`contradicted` of images that share no light: at once by the surface up to APART_PX
-    around a pixel; beside such pixels, where that mixes what has changed with what has not, by the
-    surface up to TOGETHER_PX."""
+) -> tuple[Bools, ShiftedAgreement]:
+    """:func:`contradicted` of images that share no light, and how they agree: at once by the
+    surface up to APART_PX around a pixel; beside such pixels, where that mixes what has changed
+    with what has not, by the surface up to TOGETHER_PX."""
 
     def compared(reach: int, wanted: Bools) -> ShiftedAgreement:
         return shifted_agreement(
             labels, window, comparison.noise, comparison.window_px, reach, wanted
         )
 
-    changed = compared(APART_PX, labelled).contradicts
+    widely = compared(APART_PX, labelled)
+    changed = widely.contradicts
     side = 2 * APART_PX + 1
     beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
     rim = labelled & beside & ~changed
     closer = compared(TOGETHER_PX, rim)
-    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT)
+    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT), widely
 
 
 def without_changes(
@@ -336,10 +378,9 @@ def without_changes(
     """Labels without those that the images contradict, and without water; with the correlation of
     the images over each pixel's surface."""
     labelled = is_labelled(labels.status)
-    changed, correlation = contradicted(
-        labels.labels, window, comparison, labelled, labels.surface_class
-    )
-    changed |= labelled & (labels.surface_class == WATER_CLASS)
+    found = contradicted(labels.labels, window, comparison, labelled, labels.surface_class)
+    changed = found.changed | labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
     status[changed] = Status.CHANGED
-    return replace(labels, status=status, correlation=correlation)
+    with_unseen = replace(labels.labels, variance=labels.labels.variance + found.variance)
+    return replace(labels, status=status, labels=with_unseen, correlation=found.correlation)

@@ -53,7 +53,8 @@ def wanted_run(wanted: Bools, y: int, x: int) -> tuple[int, int]:
 @inner
 def columns_inside(x0: int, size: int, cols: int, across: int) -> tuple[int, int]:
     """Pixels [first, end) of a block whose neighbour ``across`` columns on lies in the image."""
-    return max(0, -across - x0), min(size, cols - across - x0)
+    first = max(0, -across - x0)
+    return first, max(first, min(size, cols - across - x0))
 
 
 @inner
