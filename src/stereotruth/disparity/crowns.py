@@ -233,12 +233,12 @@ def with_crowns(
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        found = contradicted(merged, window, comparison, new, surface_class)
-        correlation = np.where(new, found.correlation, correlation)
-        variance = np.where(new, merged.variance + found.variance, merged.variance)
+        by_images = contradicted(merged, window, comparison, new, surface_class)
+        correlation = np.where(new, by_images.correlation, correlation)
+        variance = np.where(new, merged.variance + by_images.variance, merged.variance)
         merged = replace(merged, variance=variance)
-        status[found.changed] = Status.CHANGED
-        new &= ~found.changed
+        status[by_images.changed] = Status.CHANGED
+        new &= ~by_images.changed
     status[new] = Status.LABELLED_CROWN
     return replace(
         labels,

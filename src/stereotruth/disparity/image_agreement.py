@@ -19,8 +19,8 @@ one surface only:
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
 - :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote;
-- :func:`unconfirmed`: crowns, and what is beside young ones, which change most: they have labels
-  where the images confirm these;
+- crowns, and what is beside young ones, change most: they have labels where the images confirm
+  these;
 - :func:`variance_of_unseen_change`: what is left to doubt where images share no light.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import correlation_and_expected
-from ..numerics.summed_area import window_sums
+from ..numerics.summed_area import summed_area, window_sums
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .seen_surface import box_max
@@ -186,10 +186,10 @@ class Comparison(NamedTuple):
 
 
 def window_agreement(
-    labels: Labels, window: PairWindow, comparison: Comparison
+    labels: Labels, window: PairWindow, comparison: Comparison, wanted: Bools | None = None
 ) -> tuple[Agreement, Singles]:
     """Of both images of a window, over the surfaces of its ``labels``: free of noise, and their
-    correlation [h, w] as it is."""
+    correlation [h, w] as it is. Of the ``wanted`` [h, w] pixels alone where these are given."""
     rows, cols = labels.disparity.shape
     warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
     top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
@@ -197,7 +197,7 @@ def window_agreement(
     surface = labels.disparity, labels.slope
     clear = apart_from_steps(labels.disparity)
     with_noise, expected = correlation_and_expected(
-        left, warped, *surface, comparison.window_px, comparison.noise, clear
+        left, warped, *surface, comparison.window_px, comparison.noise, clear, wanted
     )
     limits = comparison.threshold, comparison.weight, comparison.window_px
     return free_of_noise(with_noise, expected, *surface, *limits), with_noise
@@ -242,18 +242,31 @@ def contradicted(
     labelled: Bools,
     surface_class: NDArray[np.uint8],
 ) -> Contradicted:
-    """Which of the ``labelled`` pixels [h, w] the images contradict. ``surface_class`` [h, w]
-    (ASPRS): of what the labels show."""
+    """Which of the ``labelled`` pixels [h, w] the images contradict; or do not confirm, where that
+    is asked: crowns, since they are felled and leaves come and go, and what is beside young ones.
+    ``surface_class`` [h, w] (ASPRS): of what the labels show."""
     agreement, correlation = window_agreement(labels, window, comparison)
     unseen: Floats | float = 0.0
+    crowns = labelled & np.isin(surface_class, VEGETATION_CLASSES)
+    beside = labelled & beside_young_crowns(surface_class)
     if comparison.diachronic:
         changed, compared = _contradicted_apart(labels, window, comparison, labelled)
-        closely, unseen = None, variance_of_unseen_change(compared)
+        unseen = variance_of_unseen_change(compared)
     else:
-        closely, _ = window_agreement(labels, window, comparison._replace(window_px=CLOSE_PX))
-        changed = _contradicted_together(labels, window, comparison, labelled, agreement, closely)
-    open_to_change = labelled & ~changed
-    changed |= unconfirmed(labels, window, comparison, open_to_change, surface_class, closely)
+        changed, may_hold = _contradicted_together(labels, window, comparison, labelled, agreement)
+        near = box_max(may_hold | beside, HELD_PX)
+        close = comparison._replace(window_px=CLOSE_PX)
+        closely = window_agreement(labels, window, close, near)[0].correlation
+        changed &= ~(may_hold & (box_max(np.nan_to_num(closely, nan=-1.0), HELD_PX) > HELD))
+        together = surface_mean(closely, labels.disparity, labels.slope, HELD_PX, 1, beside)
+        changed |= beside & ~(together > DOUBT)
+        beside = np.zeros_like(beside)
+    asked = (crowns | beside) & ~changed
+    detail = shifted_agreement(
+        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, asked, (), apart=False
+    )
+    changed |= crowns & ~changed & ~(detail.here > CONFIRMED * detail.signal)
+    changed |= beside & ~changed & ~(detail.here > DOUBT * detail.signal)
     vegetation = labelled & ~changed & np.isin(surface_class, VEGETATION_CLASSES)
     felled = shifted_agreement(
         labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
@@ -282,41 +295,21 @@ def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
     Young trees grow most. That is known before any image is compared, so that what is beside them
     has a label only where the images confirm it.
     """
-    vegetation = np.isin(surface_class, VEGETATION_CLASSES)
-    beside, around, beyond = (
-        window_sums(np.pad(vegetation, px), 2 * px + 1)
-        for px in (1, YOUNG_REACH_PX, 2 * YOUNG_REACH_PX)
-    )
-    is_small = (around <= YOUNG_PIXELS) & (beyond <= 2 * YOUNG_PIXELS)
-    is_young = vegetation & is_small & (2 * beside >= around)  # compact, no branches of a canopy
+    is_young = np.isin(surface_class, VEGETATION_CLASSES)
+    row, col = np.nonzero(is_young)
+    margin = 2 * YOUNG_REACH_PX
+    table = summed_area(np.pad(is_young, margin))
+
+    def count(px: int) -> NDArray[np.int64]:
+        """Of vegetation up to ``px`` around each of its pixels."""
+        top, side = row + margin - px, col + margin - px
+        end, far = top + 2 * px + 1, side + 2 * px + 1
+        return table[end, far] - table[top, far] - table[end, side] + table[top, side]
+
+    around = count(YOUNG_REACH_PX)
+    is_small = (around <= YOUNG_PIXELS) & (count(margin) <= 2 * YOUNG_PIXELS)
+    is_young[row, col] = is_small & (2 * count(1) >= around)  # compact, no branches of a canopy
     return box_max(is_young, YOUNG_REACH_PX)
-
-
-def unconfirmed(
-    labels: Labels,
-    window: PairWindow,
-    comparison: Comparison,
-    wanted: Bools,
-    surface_class: NDArray[np.uint8],
-    closely: Agreement | None,
-) -> Bools:
-    """Which of the ``wanted`` pixels [h, w] have no label unless the images confirm it, and do not.
-
-    Those are crowns, since they are felled and leaves come and go, and what is beside young ones.
-    ``surface_class`` [h, w] (ASPRS): of what the labels show; ``closely``: how images of one light
-    agree over windows of CLOSE_PX, None if they share none.
-    """
-    crowns = wanted & np.isin(surface_class, VEGETATION_CLASSES)
-    beside = wanted & beside_young_crowns(surface_class)
-    compared = crowns if closely else crowns | beside
-    detail = shifted_agreement(
-        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, compared, (), apart=False
-    )
-    out = crowns & ~(detail.here > CONFIRMED * detail.signal)
-    if closely is None:
-        return out | beside & ~(detail.here > DOUBT * detail.signal)
-    near = surface_mean(closely.correlation, labels.disparity, labels.slope, 1, 1, beside)
-    return out | beside & ~(near > DOUBT)
 
 
 def _contradicted_together(
@@ -325,10 +318,9 @@ def _contradicted_together(
     comparison: Comparison,
     labelled: Bools,
     agreement: Agreement,
-    closely: Agreement,
-) -> Bools:
-    """:func:`contradicted` of images of one light, by their ``agreement`` and the one over windows
-    of CLOSE_PX."""
+) -> tuple[Bools, Bools]:
+    """:func:`contradicted` of images of one light, by their ``agreement``; and which of these are
+    at the rim of a change, where they agree nowhere better."""
     changed = agreement.outvoted()
     doubtful = labelled & (agreement.together() < DOUBT)
     shifted = shifted_agreement(
@@ -337,15 +329,16 @@ def _contradicted_together(
     changed |= shifted.contradicts
     has_signal = shifted.signal > SIGNAL
     changed |= has_signal & agreement.unusual()
-    # votes widen what has changed over the same surface: there what agrees by itself is held
-    goes_on = np.where(labelled, ~changed, np.nan)
-    is_rim = surface_mean(goes_on, labels.disparity, labels.slope, NEARBY_PX, 2) > RIM_SHARE
-    agrees = box_max(np.nan_to_num(closely.correlation, nan=-1.0), HELD_PX) > HELD
     rim = agreement.beside(changed)
+    inner = changed & labelled
     if comparison.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window vote once more.
         changed |= agreement.outvoted_nearby()
-    return (changed | rim) & labelled & (shifted.is_shifted | ~(is_rim & agrees))
+    changed = (changed | rim) & labelled
+    # votes widen what has changed over the same surface
+    goes_on = np.where(labelled, ~inner, np.nan)
+    unchanged = surface_mean(goes_on, labels.disparity, labels.slope, NEARBY_PX, 2, changed)
+    return changed, changed & ~shifted.is_shifted & (unchanged > RIM_SHARE)
 
 
 def _contradicted_apart(
@@ -378,9 +371,9 @@ def without_changes(
     """Labels without those that the images contradict, and without water; with the correlation of
     the images over each pixel's surface."""
     labelled = is_labelled(labels.status)
-    found = contradicted(labels.labels, window, comparison, labelled, labels.surface_class)
-    changed = found.changed | labelled & (labels.surface_class == WATER_CLASS)
+    by_images = contradicted(labels.labels, window, comparison, labelled, labels.surface_class)
+    changed = by_images.changed | labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
     status[changed] = Status.CHANGED
-    with_unseen = replace(labels.labels, variance=labels.labels.variance + found.variance)
-    return replace(labels, status=status, labels=with_unseen, correlation=found.correlation)
+    with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
+    return replace(labels, status=status, labels=with_unseen, correlation=by_images.correlation)

@@ -10,6 +10,7 @@ noise, lower the correlation at all disparities alike.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ class ShiftedAgreement:
     signal: Singles
     pixels: int
 
-    @property
+    @cached_property
     def is_shifted(self) -> Bools:
         """Where the images agree significantly better elsewhere [h, w]."""
         z_here, z_elsewhere = (
