@@ -1,7 +1,7 @@
 """What changed between LiDAR and images: who notices, what is lost, which reason is told.
 
 python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
-                        [--figure docs/changes.png]
+                        [--without-classes] [--figure docs/changes.png]
 
 Cities are drawn by seed, one for each kind of change and one with many (mixed), and each of them is
 made under two conditions: both images of one day three years after the LiDAR; or the right image a
@@ -12,10 +12,11 @@ worlds of both images and of the LiDAR.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import laspy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
@@ -49,6 +50,7 @@ FIRST_CITY = 4000  # of the numbers of cities
 SIDE_PX = 800
 CHANGED_M = 1.0  # of height
 YEAR = 365.0
+UNCLASSIFIED = 1  # ASPRS
 VIEWS = ("left", "right")
 BLOCK_PX = 220  # side of the figure's block
 COLOURS = {  # apart for all eyes
@@ -83,12 +85,14 @@ LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun 
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²."""
+    """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²,
+    whose points have classes or none."""
 
     kind: str
     condition: str
     seed: int
     density: float
+    classed: bool = True
 
     @property
     def apart(self) -> bool:
@@ -136,18 +140,27 @@ class Case:
         for file in lidar_files(city, spec):
             simulate_lidar_tile(city, spec, file, folder / file,
                                 spacing_m=self.density**-0.5, seed=self.seed)  # fmt: skip
+            if not self.classed:
+                _unclass(folder / file)
             ingest(folder / file, folder / f"{Path(file).stem}.points")
             (folder / file).unlink()
         rectify_by(align(*images, tables[1], provenance={}), images, folder)
 
     def made(self, folder: Path) -> Path:
         """The folder of :meth:`make`, made once."""
-        name = "-".join(f"{v}" for v in asdict(self).values()).replace(" ", "_")
+        parts = self.kind, self.condition.replace(" ", "_"), str(self.seed), str(self.density)
+        name = "-".join(parts if self.classed else (*parts, "unclassed"))
         path = folder / name
         if not path.is_dir():
             with atomic_folder(path) as scratch:
                 self.make(scratch)
         return path
+
+
+def _unclass(file: Path) -> None:
+    points = laspy.read(file)
+    points.classification[:] = UNCLASSIFIED
+    points.write(file)
 
 
 def _spoil(images: list[Path], seed: int) -> None:
@@ -204,7 +217,8 @@ def settings_of(case: Case) -> Settings:
 @dataclass
 class Row:
     """Counts of pixels: changed, without a label; visible and unchanged, lost to `changed`; found,
-    of the right reason; errors (px) of labels of what is unchanged."""
+    of the right reason; errors (px) of labels of what is unchanged, their uncertainties (px), and
+    how many lie within one and two of these."""
 
     changed: int = 0
     unlabelled: int = 0
@@ -213,6 +227,9 @@ class Row:
     found: int = 0
     right: int = 0
     error: float = 0.0
+    sigma: float = 0.0
+    within: int = 0
+    within_two: int = 0
     labels: int = 0
 
     def add(self, case: Case, of: Labelled) -> None:
@@ -243,6 +260,10 @@ class Row:
         self.labels += int(labels.sum())
         error = np.abs(of.layers["disparity"][labels] - truth["disparity"][labels])
         self.error += float(error.sum(dtype=np.float64))
+        sigma = of.layers["uncertainty"][labels]
+        self.sigma += float(sigma.sum(dtype=np.float64))
+        self.within += int((error <= sigma).sum())
+        self.within_two += int((error <= 2.0 * sigma).sum())
 
     def cells(self) -> list[str]:
         """Of the table."""
@@ -254,11 +275,14 @@ class Row:
             f"{self.changed / 1e3:.0f}", share(self.unlabelled, self.changed),
             share(self.found, self.changed), share(self.right, self.found),
             share(self.lost, self.kept), f"{self.error / max(self.labels, 1):.3f}",
+            f"{self.sigma / max(self.labels, 1):.3f}",
+            share(self.within, self.labels), share(self.within_two, self.labels),
         ]  # fmt: skip
 
 
 HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these `changed`, %",
-          "right reason, %", "unchanged lost, %", "error, px"]  # fmt: skip
+          "right reason, %", "unchanged lost, %", "error, px", "σ, px", "within σ, %",
+          "within 2 σ, %"]  # fmt: skip
 
 
 def richest(changes: NDArray[np.uint8]) -> tuple[slice, slice]:
@@ -334,6 +358,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--kinds", nargs="+", default=list(SHARES), choices=list(SHARES))
     parser.add_argument("--density", type=float, default=4.0)
+    parser.add_argument("--without-classes", action="store_true", help="of the LiDAR's points")
     parser.add_argument("--figure", type=Path, help="draw a block of the city mixed, no table")
     given = parser.parse_args()
     if given.figure:
@@ -347,7 +372,7 @@ def main() -> None:
                 continue
             row = Row()
             for seed in given.seeds:
-                case = Case(kind, condition, seed, given.density)
+                case = Case(kind, condition, seed, given.density, not given.without_classes)
                 row.add(case, Labelled.of(case, given.folder))
             print("| " + " | ".join([kind, condition, *row.cells()]) + " |", flush=True)
 

@@ -237,10 +237,12 @@ def with_crowns(
         np.where(new, crowns.labels.variance, labels.labels.variance),
     )
     if inside.any():
-        changed, with_noise = contradicted(merged, window, comparison, new, surface_class)
-        correlation = np.where(new, with_noise, correlation)
-        status[changed] = Status.CHANGED
-        new &= ~changed
+        by_images = contradicted(merged, window, comparison, new, surface_class)
+        correlation = np.where(new, by_images.correlation, correlation)
+        variance = np.where(new, merged.variance + by_images.variance, merged.variance)
+        merged = replace(merged, variance=variance)
+        status[by_images.changed] = Status.CHANGED
+        new &= ~by_images.changed
     status[new] = Status.LABELLED_CROWN
     return replace(
         labels,

@@ -18,7 +18,10 @@ one surface only:
   share no light that alone counts. Crowns are compared over fewer pixels, too;
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
-- :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote.
+- :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote;
+- crowns, and what is beside young ones, change most: they have labels where the images confirm
+  these;
+- :func:`variance_of_unseen_change`: what is left to doubt where images share no light.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
 depend on blocks.
@@ -32,11 +35,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import correlation_and_expected
-from ..numerics.summed_area import window_sums
+from ..numerics.summed_area import summed_area, window_sums
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
-from .shifted_agreement import SHIFTS_PX, SIGNAL, ShiftedAgreement, shifted_agreement
+from .seen_surface import box_max
+from .shifted_agreement import (
+    INDEPENDENT_PX2,
+    SHIFTS_PX,
+    SIGNAL,
+    ShiftedAgreement,
+    shifted_agreement,
+)
 from .status import VEGETATION_CLASSES, WATER_CLASS, Status, is_labelled
 from .surface_means import apart_from_steps, surface_mean, warp_to_left
 
@@ -50,13 +61,28 @@ NEARBY_PX = 8  # for what is small, pixels up to here vote,
 NEARBY_SHARE = 0.35  # of which so many fail
 DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
 TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
+CLOSE_PX = 5  # side of the windows for what is a few pixels wide
+# At the rim of what has changed more than RIM_SHARE of the surface up to NEARBY_PX around has not.
+# There a pixel is held where a window of CLOSE_PX, centred up to HELD_PX off, correlates by more
+# than HELD, as by chance about one of a hundred changed ones does.
+HELD_PX, HELD, RIM_SHARE = 1, 0.95, 0.1
+# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
+# 2 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by one.
+YOUNG_REACH_PX, YOUNG_PIXELS = 3, 12
+CONFIRMED = 0.3  # of what the same crown would agree by, as noise leaves it
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
 BESIDE_SHARE = 0.15  # of the pixels up to APART_PX around have changed: a pixel is in their rim,
 RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by less
 # Crowns that have been felled: both images see the ground below, over a few pixels
-CROWN_WINDOW_PX, CROWN_REACH_PX = 5, 2
+CROWN_REACH_PX = 2
 CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
 CROWN_AGREEMENT = 0.6  # of the images there, at least
+# Of labels that images of two lights leave, the share that has changed, by their agreement as a
+# share of what noise leaves the same ground; and without any. Cities of seeds 1 and 2 of
+# bench/changes.py, of whose buildings and trees a tenth to a quarter has changed.
+UNSEEN = (0.0, 0.1, 0.5, 0.7, 0.9, 1.0), (0.08, 0.02, 0.02, 0.0055, 0.0015, 0.0007)
+UNSEEN_BY_NONE = 0.1
+DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
 
@@ -68,6 +94,7 @@ class Agreement:
     where there is none or noise leaves nothing to tell, which is ``drowned``; ``disparity`` (px)
     [h, w] and its ``slope`` [2, h, w] decide what belongs to a surface. With less than
     ``threshold`` a pixel fails. ``weight`` in [0, 1] that no object fits between the points.
+    ``doubt``: standard deviation [h, w] that noise leaves the correlation of the same ground.
     """
 
     correlation: NDArray[np.floating]
@@ -76,6 +103,7 @@ class Agreement:
     threshold: float
     weight: float = 1.0
     drowned: Bools | bool = False
+    doubt: Singles | float = 0.0
 
     def outvoted(self) -> Bools:
         """Pixels [h, w] around which most of their surface fails.
@@ -92,8 +120,13 @@ class Agreement:
     def _against(self, least: float | Singles, drowned: float) -> Floats:
         """1 where pixels [h, w] correlate less than ``least``, else 0; ``drowned`` where they are;
         NaN where there is nothing to correlate."""
-        against = np.where(np.isfinite(self.correlation), self.correlation < least, np.nan)
+        fails = self._with_doubt() < least
+        against = np.where(np.isfinite(self.correlation), fails, np.nan)
         return np.where(self.drowned, drowned, against)
+
+    def _with_doubt(self) -> NDArray[np.floating]:
+        """The correlation [h, w] that noise may have lowered to the one that is there."""
+        return self.correlation + DOUBTS * self.doubt
 
     def _usual(self, correlation: NDArray[np.floating]) -> Singles:
         """What pixels [h, w] correlate by at least if they are as usual on their surface around
@@ -135,7 +168,7 @@ class Agreement:
             return changed.copy()
         near = window_sums(np.pad(changed, NEARBY_PX), 2 * NEARBY_PX + 1)
         unchanged = np.where(changed, np.nan, self.correlation)
-        return (near > 0) & (self.correlation < self._usual(unchanged))
+        return (near > 0) & (self._with_doubt() < self._usual(unchanged))
 
 
 class Comparison(NamedTuple):
@@ -153,10 +186,10 @@ class Comparison(NamedTuple):
 
 
 def window_agreement(
-    labels: Labels, window: PairWindow, comparison: Comparison
+    labels: Labels, window: PairWindow, comparison: Comparison, wanted: Bools | None = None
 ) -> tuple[Agreement, Singles]:
     """Of both images of a window, over the surfaces of its ``labels``: free of noise, and their
-    correlation [h, w] as it is."""
+    correlation [h, w] as it is. Of the ``wanted`` [h, w] pixels alone where these are given."""
     rows, cols = labels.disparity.shape
     warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
     top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
@@ -164,9 +197,9 @@ def window_agreement(
     surface = labels.disparity, labels.slope
     clear = apart_from_steps(labels.disparity)
     with_noise, expected = correlation_and_expected(
-        left, warped, *surface, comparison.window_px, comparison.noise, clear
+        left, warped, *surface, comparison.window_px, comparison.noise, clear, wanted
     )
-    limits = comparison.threshold, comparison.weight
+    limits = comparison.threshold, comparison.weight, comparison.window_px
     return free_of_noise(with_noise, expected, *surface, *limits), with_noise
 
 
@@ -176,13 +209,30 @@ def free_of_noise(
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     threshold: float,
-    weight: float = 1.0,
+    weight: float,
+    window_px: int,
 ) -> Agreement:
     """The agreement by the correlation ``with_noise`` and the one ``expected`` of the same ground,
-    arrays [h, w] (:func:`stereotruth.epipolar.surface_correlation.correlation_and_expected`)."""
+    arrays [h, w] of windows of ``window_px``
+    (:func:`stereotruth.epipolar.surface_correlation.correlation_and_expected`)."""
     drowned = np.isfinite(with_noise) & np.isnan(expected)
     correlation = np.minimum(with_noise / expected, np.float32(1.0))
-    return Agreement(correlation, disparity, slope, threshold, weight, drowned)
+    # of a coefficient of n pixels: (1 - r²) / sqrt(n), where r is the one expected
+    doubt = (1.0 - expected**2) / expected * np.float32(np.sqrt(INDEPENDENT_PX2) / window_px)
+    return Agreement(correlation, disparity, slope, threshold, weight, drowned, doubt)
+
+
+class Contradicted(NamedTuple):
+    """What the images of a window say of its labels; arrays [h, w].
+
+    ``changed``: where they contradict these; ``correlation`` of the images over each pixel's
+    surface; ``variance`` (px²) of labels that they do not contradict, though these may have
+    changed.
+    """
+
+    changed: Bools
+    correlation: Singles
+    variance: Floats | float
 
 
 def contradicted(
@@ -191,17 +241,75 @@ def contradicted(
     comparison: Comparison,
     labelled: Bools,
     surface_class: NDArray[np.uint8],
-) -> tuple[Bools, Singles]:
-    """Which of the ``labelled`` pixels [h, w] the images contradict; the correlation of the images
-    over each pixel's surface. ``surface_class`` [h, w] (ASPRS): of what the labels show."""
+) -> Contradicted:
+    """Which of the ``labelled`` pixels [h, w] the images contradict; or do not confirm, where that
+    is asked: crowns, since they are felled and leaves come and go, and what is beside young ones.
+    ``surface_class`` [h, w] (ASPRS): of what the labels show."""
     agreement, correlation = window_agreement(labels, window, comparison)
-    compared = _contradicted_apart if comparison.diachronic else _contradicted_together
-    changed = compared(labels, window, comparison, labelled, agreement)
+    unseen: Floats | float = 0.0
+    crowns = labelled & np.isin(surface_class, VEGETATION_CLASSES)
+    beside = labelled & beside_young_crowns(surface_class)
+    if comparison.diachronic:
+        changed, compared = _contradicted_apart(labels, window, comparison, labelled)
+        unseen = variance_of_unseen_change(compared)
+    else:
+        changed, may_hold = _contradicted_together(labels, window, comparison, labelled, agreement)
+        near = box_max(may_hold | beside, HELD_PX)
+        close = comparison._replace(window_px=CLOSE_PX)
+        closely = window_agreement(labels, window, close, near)[0].correlation
+        changed &= ~(may_hold & (box_max(np.nan_to_num(closely, nan=-1.0), HELD_PX) > HELD))
+        together = surface_mean(closely, labels.disparity, labels.slope, HELD_PX, 1, beside)
+        changed |= beside & ~(together > DOUBT)
+        beside = np.zeros_like(beside)
+    asked = (crowns | beside) & ~changed
+    detail = shifted_agreement(
+        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, asked, (), apart=False
+    )
+    changed |= crowns & ~changed & ~(detail.here > CONFIRMED * detail.signal)
+    changed |= beside & ~changed & ~(detail.here > DOUBT * detail.signal)
     vegetation = labelled & ~changed & np.isin(surface_class, VEGETATION_CLASSES)
     felled = shifted_agreement(
-        labels, window, comparison.noise, CROWN_WINDOW_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
+        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
     )
-    return changed | felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT), correlation
+    changed |= felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT)
+    return Contradicted(changed, correlation, unseen)
+
+
+def variance_of_unseen_change(agreement: ShiftedAgreement) -> Floats:
+    """Variance (px², [h, w]) of labels of images that share no light, since what these show may
+    have changed though they do not contradict it.
+
+    Its probability follows from their ``agreement``, as a share of what noise leaves the same
+    ground. A label of what has changed counts as off by SURFACE_PX, the least that is another
+    surface (eq. 17 of docs/explanation/surface.md).
+    """
+    share = agreement.here / np.maximum(agreement.signal, SIGNAL)
+    probability = np.interp(share, *UNSEEN)
+    return np.where(np.isnan(share), UNSEEN_BY_NONE, probability) * SURFACE_PX**2
+
+
+def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
+    """Pixels [h, w] no more than YOUNG_REACH_PX from a crown of the LiDAR that is small, by the
+    ``surface_class`` [h, w] (ASPRS).
+
+    Young trees grow most. That is known before any image is compared, so that what is beside them
+    has a label only where the images confirm it.
+    """
+    is_young = np.isin(surface_class, VEGETATION_CLASSES)
+    row, col = np.nonzero(is_young)
+    margin = 2 * YOUNG_REACH_PX
+    table = summed_area(np.pad(is_young, margin))
+
+    def count(px: int) -> NDArray[np.int64]:
+        """Of vegetation up to ``px`` around each of its pixels."""
+        top, side = row + margin - px, col + margin - px
+        end, far = top + 2 * px + 1, side + 2 * px + 1
+        return table[end, far] - table[top, far] - table[end, side] + table[top, side]
+
+    around = count(YOUNG_REACH_PX)
+    is_small = (around <= YOUNG_PIXELS) & (count(margin) <= 2 * YOUNG_PIXELS)
+    is_young[row, col] = is_small & (2 * count(1) >= around)  # compact, no branches of a canopy
+    return box_max(is_young, YOUNG_REACH_PX)
 
 
 def _contradicted_together(
@@ -210,8 +318,9 @@ def _contradicted_together(
     comparison: Comparison,
     labelled: Bools,
     agreement: Agreement,
-) -> Bools:
-    """:func:`contradicted` of images of one light, by their ``agreement``."""
+) -> tuple[Bools, Bools]:
+    """:func:`contradicted` of images of one light, by their ``agreement``; and which of these are
+    at the rim of a change, where they agree nowhere better."""
     changed = agreement.outvoted()
     doubtful = labelled & (agreement.together() < DOUBT)
     shifted = shifted_agreement(
@@ -221,10 +330,15 @@ def _contradicted_together(
     has_signal = shifted.signal > SIGNAL
     changed |= has_signal & agreement.unusual()
     rim = agreement.beside(changed)
+    inner = changed & labelled
     if comparison.points_per_px < DENSE:
         # Points far apart miss what is small: the pixels of one window vote once more.
         changed |= agreement.outvoted_nearby()
-    return (changed | rim) & labelled
+    changed = (changed | rim) & labelled
+    # votes widen what has changed over the same surface
+    goes_on = np.where(labelled, ~inner, np.nan)
+    unchanged = surface_mean(goes_on, labels.disparity, labels.slope, NEARBY_PX, 2, changed)
+    return changed, changed & ~shifted.is_shifted & (unchanged > RIM_SHARE)
 
 
 def _contradicted_apart(
@@ -232,23 +346,23 @@ def _contradicted_apart(
     window: PairWindow,
     comparison: Comparison,
     labelled: Bools,
-    _: Agreement,
-) -> Bools:
-    """:func:`contradicted` of images that share no light: at once by the surface up to APART_PX
-    around a pixel; beside such pixels, where that mixes what has changed with what has not, by the
-    surface up to TOGETHER_PX."""
+) -> tuple[Bools, ShiftedAgreement]:
+    """:func:`contradicted` of images that share no light, and how they agree: at once by the
+    surface up to APART_PX around a pixel; beside such pixels, where that mixes what has changed
+    with what has not, by the surface up to TOGETHER_PX."""
 
     def compared(reach: int, wanted: Bools) -> ShiftedAgreement:
         return shifted_agreement(
             labels, window, comparison.noise, comparison.window_px, reach, wanted
         )
 
-    changed = compared(APART_PX, labelled).contradicts
+    widely = compared(APART_PX, labelled)
+    changed = widely.contradicts
     side = 2 * APART_PX + 1
     beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
     rim = labelled & beside & ~changed
     closer = compared(TOGETHER_PX, rim)
-    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT)
+    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT), widely
 
 
 def without_changes(
@@ -257,10 +371,9 @@ def without_changes(
     """Labels without those that the images contradict, and without water; with the correlation of
     the images over each pixel's surface."""
     labelled = is_labelled(labels.status)
-    changed, correlation = contradicted(
-        labels.labels, window, comparison, labelled, labels.surface_class
-    )
-    changed |= labelled & (labels.surface_class == WATER_CLASS)
+    by_images = contradicted(labels.labels, window, comparison, labelled, labels.surface_class)
+    changed = by_images.changed | labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
     status[changed] = Status.CHANGED
-    return replace(labels, status=status, correlation=correlation)
+    with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
+    return replace(labels, status=status, labels=with_unseen, correlation=by_images.correlation)

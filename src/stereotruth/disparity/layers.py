@@ -76,7 +76,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "height": Layer("float32", np.nan, height),
         "point_count": Layer("uint16", 0, count),
         "correlation": Layer("float32", np.nan, _correlation(settings, view)),
-        "uncertainty": Layer("float32", np.nan, _uncertainty(on_surface)),
+        "uncertainty": Layer("float32", np.nan, _uncertainty(settings)),
         "surface_class": Layer("uint8", 0, surface_class),
         **date,
         "change": Layer("uint8", 0, _change()),
@@ -179,7 +179,7 @@ def _correlation(settings: Settings, view: str) -> dict[str, str]:
     return {"units": "1", "long_name": compared, "nodata": "NaN"}
 
 
-def _uncertainty(on_surface: bool) -> dict[str, str]:
+def _uncertainty(settings: Settings) -> dict[str, str]:
     """Attributes of the layer uncertainty."""
     attributes = {
         "units": "px",
@@ -190,8 +190,13 @@ def _uncertainty(on_surface: bool) -> dict[str, str]:
         "the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey) errors of a ground "
         "point's disparity and place by the alignment, whose covariance is that of alignment.json",
     }
-    if on_surface:
+    if settings.on_surface:
         attributes["labelled_crown"] = (
             "v / n + p is what the roughness of the tops of the surface leaves between them"
+        )
+    if settings.on_surface and settings.diachronic:
+        attributes["diachronic"] = (
+            "p has the probability, px², that the surface has changed though images of two lights "
+            "do not contradict it"
         )
     return attributes

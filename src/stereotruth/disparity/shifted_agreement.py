@@ -10,6 +10,7 @@ noise, lower the correlation at all disparities alike.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +47,9 @@ class ShiftedAgreement:
 
     ``here``: at the labels' disparity; ``elsewhere``: the greatest of shifted ones, which is at
     ``shift`` px. NaN where nothing was asked, and where there is nothing to correlate. ``signal``:
-    what the images of the same ground would correlate by, as their noise leaves it; 0 where either
-    has no value. ``pixels``: that a mean takes in, at most.
+    what the images of the same ground would correlate by, as their noise leaves it, the less of the
+    pixel's own and its surface's; 0 where either has no value. ``pixels``: that a mean takes in, at
+    most.
     """
 
     here: Singles
@@ -56,7 +58,7 @@ class ShiftedAgreement:
     signal: Singles
     pixels: int
 
-    @property
+    @cached_property
     def is_shifted(self) -> Bools:
         """Where the images agree significantly better elsewhere [h, w]."""
         z_here, z_elsewhere = (
@@ -84,11 +86,13 @@ def shifted_agreement(
     reach: int,
     wanted: Bools,
     shifts: tuple[float, ...] = SHIFTS_PX,
+    apart: bool = True,
 ) -> ShiftedAgreement:
     """At the ``wanted`` pixels [h, w] of a window, over its ``labels``' surfaces.
 
     ``noise``: variances of both images, DN²; ``window_px``: side of the correlation's window;
-    ``reach``: px up to which the surface is averaged; ``shifts`` of the disparity, px.
+    ``reach``: px up to which the surface is averaged; ``shifts`` of the disparity, px; ``apart``:
+    whether pixels beside a step count for nothing.
     """
     shape = wanted.shape
     out = np.full((4, *shape), np.nan, np.float32)
@@ -111,7 +115,7 @@ def shifted_agreement(
             ]
             here = np.zeros_like(wanted[around])
             here[inside] = wanted[rows, cols]
-            part = _means(labels, window, images, around, here, window_px, reach, shifts)
+            part = _means(labels, window, images, around, here, window_px, reach, shifts, apart)
             for k, values in enumerate(part):
                 out[k, rows, cols] = np.where(wanted[rows, cols], values[inside], np.nan)
     return ShiftedAgreement(*out, (2 * reach + window_px) ** 2)
@@ -126,6 +130,7 @@ def _means(
     window_px: int,
     reach: int,
     shifts: tuple[float, ...],
+    apart: bool,
 ) -> tuple[Singles, Singles, Singles, Singles]:
     """The arrays of :class:`ShiftedAgreement` of a part of a window, of which some pixels are
     ``wanted``."""
@@ -134,7 +139,7 @@ def _means(
     rows, cols = disparity.shape
     row, col = window.rows.start + around[0].start, window.cols.start + around[1].start
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
-    clear = apart_from_steps(disparity)
+    clear = apart_from_steps(disparity) if apart else np.isfinite(disparity)
     every = max(reach // 4, 1)
     averaged = box_max(wanted, reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
@@ -154,7 +159,9 @@ def _means(
         here = mean(shift)
         better = here > np.where(np.isnan(elsewhere), -np.inf, elsewhere)
         elsewhere[better], shifted[better] = here[better], shift
-    return mean(0.0), elsewhere, shifted, _signal(images, row, col, disparity)
+    signal = _signal(images, row, col, disparity)
+    around_it = surface_mean(signal, disparity, slope, reach, every, wanted)
+    return mean(0.0), elsewhere, shifted, np.fmin(signal, around_it)
 
 
 def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:

@@ -76,7 +76,7 @@ def test_what_has_grown_agrees_at_another_disparity(by: int, reach: int) -> None
 def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
     """Where images share no light, their brightness tells nothing."""
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
-    changed, _ = contradicted(LEVEL, shadowed(), comparison, ALL, GROUND)
+    changed = contradicted(LEVEL, shadowed(), comparison, ALL, GROUND).changed
     assert changed.any() != diachronic
 
 
@@ -84,7 +84,7 @@ def test_a_change_is_found_under_another_sun() -> None:
     window = grown(3)
     window.right.pixels[:, 60:] *= 0.2
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), True)
-    changed, _ = contradicted(LEVEL, window, comparison, ALL, GROUND)
+    changed = contradicted(LEVEL, window, comparison, ALL, GROUND).changed
     assert changed[47:73, 58:92].all() and not changed[:30].any()
 
 
@@ -116,7 +116,7 @@ def test_a_small_crown_that_was_felled(diachronic: bool) -> None:
     left = texture()
     window = pair(left, right_of(left, np.full((160, 260), 4)))
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
-    changed, _ = contradicted(labels, window, comparison, ALL, classes)
+    changed = contradicted(labels, window, comparison, ALL, classes).changed
     assert changed[57:66, 72:81].all()
     changed[crown] = False
     assert not changed.any()
@@ -148,3 +148,46 @@ def test_single_pixels_at_the_borders_of_a_wide_window():
         lambda chosen: surface_correlation(values, warped, *flat, 9, None, chosen),
     ):
         assert np.array_equal(of(wanted)[wanted], of(None)[wanted], equal_nan=True)
+
+
+@pytest.mark.parametrize("diachronic", [False, True])
+def test_beside_a_young_crown_labels_are_confirmed(diachronic: bool) -> None:
+    """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings."""
+    grown, still, tree = np.s_[56:65, 66:75], np.s_[30:33, 20:23], 5
+    classes, disparity = GROUND.copy(), np.full((160, 260), 4)
+    classes[59:62, 69:72] = classes[still] = tree
+    disparity[20:140, 60:200][grown] += 3
+    left = texture()
+    window = pair(left, right_of(left, disparity))
+    comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
+    changed = contradicted(LEVEL, window, comparison, ALL, classes).changed
+    assert changed[grown].mean() > 0.9
+    assert not changed[25:38, 15:28].any()
+
+
+def test_the_rim_of_a_change_keeps_what_agrees() -> None:
+    """Votes of images of one light do not widen a change over ground that both show alike."""
+    left, other = texture(), texture(5)
+    right = right_of(left, np.full((160, 260), 4))
+    left[20:140, 60:200][FIELD] = other[20:140, 60:200][FIELD]
+    comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0))
+    changed = contradicted(LEVEL, pair(left, right), comparison, ALL, GROUND).changed
+    assert changed[FIELD].mean() > 0.97
+    changed[38:82, 48:102] = False
+    assert changed.sum() < 0.02 * 40 * 50
+
+
+def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
+    """The more, the less the images agree; those of images of one light are as they were."""
+    apart = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic=True)
+    left = texture()
+    right = right_of(left, np.full((160, 260), 4))
+    blank = np.full_like(left, 700.0)
+    sure, unsure = (
+        contradicted(LEVEL, pair(*images), apart, ALL, GROUND).variance
+        for images in ((left, right), (blank, blank))
+    )
+    inner = np.s_[20:-20, 20:-20]
+    assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
+    same = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0))
+    assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0

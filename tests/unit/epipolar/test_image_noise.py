@@ -72,11 +72,11 @@ def test_noise_is_no_change(contrast: float) -> None:
     ground, noise = texture(6, contrast), (100.0, 100.0)
     left, right = (noisy(ground, 10.0, seed).astype(np.float32) for seed in (7, 8))
     found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, noise)
-    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5).outvoted().mean() < 0.01
+    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5, 1.0, 9).outvoted().mean() < 0.01
 
 
 def test_change_shows_through_noise() -> None:
     """Other ground, of a contrast of twice the noise."""
     left, right = (noisy(texture(seed, 20.0), 10.0, seed + 9).astype(np.float32) for seed in (1, 2))
     found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, (100.0, 100.0))
-    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5).outvoted().mean() > 0.95
+    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5, 1.0, 9).outvoted().mean() > 0.95
