@@ -15,14 +15,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import laspy
 import numpy as np
-from laspy.header import GpsTimeType
 from numpy.typing import NDArray
 
 from ..kernels import kernel
+
+if TYPE_CHECKING:
+    import laspy
 
 Words = NDArray[np.uint32]
 Days = NDArray[np.uint16]
@@ -35,12 +36,6 @@ LAST_DAY = np.iinfo(np.uint16).max
 EPOCH_DAY = (date(1980, 1, 6) - FIRST_DAY).days
 CODES = 255  # of days; 0: not known
 BY_CATALOGUE = "catalogue"
-
-
-def has_days(header: laspy.LasHeader) -> bool:
-    """Whether the points' times tell the day."""
-    names = set(header.point_format.dimension_names)
-    return "gps_time" in names and header.global_encoding.gps_time_type == GpsTimeType.STANDARD
 
 
 @kernel

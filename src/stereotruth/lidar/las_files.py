@@ -9,12 +9,13 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+from laspy.header import GpsTimeType
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import inner, kernel
 from ..products.remote_files import size_of
-from .gps_times import GpsDays, has_days
+from .gps_times import GpsDays
 from .las_layout import check_layout, wrong_count
 from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 
@@ -28,6 +29,12 @@ _ANEW = "fetch the file again, or have its header written anew if that is what i
 SAMPLES = 16  # points all over a file that its header's bounds are held against
 LAZ_CHUNK = 50_000  # points of a chunk, as all software writes it
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
+
+
+def has_days(header: laspy.LasHeader) -> bool:
+    """Whether the points' times tell the day."""
+    names = set(header.point_format.dimension_names)
+    return "gps_time" in names and header.global_encoding.gps_time_type == GpsTimeType.STANDARD
 
 
 @contextmanager
