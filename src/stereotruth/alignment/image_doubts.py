@@ -17,6 +17,8 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 HEAVY = 0.1  # weight of a pair that is left out, or nearly so
 CHANCE = 0.05  # that a site without a fault has an image that stands out
+FEWEST = 4  # values that a largest one is held against, itself included: of three, two that are
+# alike by chance, as an image and its crop are by right, would always condemn the third
 MOST_OUT = 0.25  # share of the images that may stand out
 NORMAL = 2.0 / 3.0  # power of a length that is normal if both coordinates are (Wilson, Hilferty)
 LEAST_SPREAD_PX = 0.3  # px to that power, of corrections: less makes none of them stand out
@@ -35,7 +37,7 @@ def stand_out(values: Floats, least_spread: float) -> Bools:
     for k in range(max(1, int(MOST_OUT * len(values)))):
         rest = values[order[k:]]
         n = len(rest)
-        if n < 3:
+        if n < FEWEST:
             break
         t = stdtrit(n - 2, 1.0 - CHANCE / n)
         limit = (n - 1) * t / np.sqrt((n - 2 + t**2) * n)

@@ -49,7 +49,7 @@ class Settings:
     seasons. Their brightness is not compared then, since shadows and leaves change it where no
     height has changed; their detail is, at the labels' disparity and at others, and a pixel is
     `changed` where the labels' one is no better. Column `diachronic` of the scenes sheet says it of
-    a scene"""
+    a scene. Their `uncertainty` has the probability of a change that the images do not show"""
 
     @property
     def on_surface(self) -> bool:

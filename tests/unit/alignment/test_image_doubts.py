@@ -40,6 +40,11 @@ def test_few_sites_without_a_fault_name_an_rpc(count):
     assert 0.5 * CHANCE < np.mean(sites) < 2.0 * CHANCE
 
 
+def test_of_three_images_none_is_named_for_two_that_are_alike():
+    """As an image and its crop are."""
+    assert not stand_out(np.array([0.2, 0.2, 9.0]), 0.3).any()
+
+
 def test_an_rpc_off_by_15_px_more_is_named_in_most_sites():
     """Of twelve images whose RPCs are off as the simulator's are, 6 to 16 px."""
     rng, named = np.random.default_rng(4), 0
