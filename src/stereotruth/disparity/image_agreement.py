@@ -65,7 +65,7 @@ CLOSE_PX = 5  # side of the windows for what is a few pixels wide
 # At the rim of what has changed more than RIM_SHARE of the surface up to NEARBY_PX around has not.
 # There a pixel is held where a window of CLOSE_PX, centred up to HELD_PX off, correlates by more
 # than HELD, as by chance about one of a hundred changed ones does.
-HELD_PX, HELD, RIM_SHARE = 1, 0.95, 0.1
+HELD_PX, HELD, RIM_SHARE = 1, 0.95, 0.3
 # A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
 # 2 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by one.
 YOUNG_REACH_PX, YOUNG_PIXELS = 3, 12
