@@ -94,15 +94,15 @@ class PixelValues(NamedTuple):
 
 
 @inner
-def _triple(values: Floats, t: Steps) -> tuple[float, float, float]:
+def _triple(values: Floats, t: Steps | tuple) -> tuple[float, float, float]:
     return values[t[0]], values[t[1]], values[t[2]]
 
 
 @inner
-def _between_rows(y: tuple, first: int, rows: int) -> bool:
-    """Whether a triangle meets none of the ``rows`` from the ``first`` one on, as most do."""
-    low, high = min(y[0], y[1], y[2]), max(y[0], y[1], y[2])
-    return max(np.ceil(low), first) > min(np.floor(high), first + rows - 1)
+def _misses(low: float, high: float, first: int, count: int) -> bool:
+    """Whether no centre of the ``count`` rows or columns from the ``first`` one on lies in a range,
+    as in those of most triangles."""
+    return max(np.ceil(low), first) > min(np.floor(high), first + count - 1)
 
 
 @inner
@@ -159,7 +159,7 @@ def raster_facets(
     rows = z_buffer.shape[0]
     for t in range(len(corner)):
         y = _triple(xy[1], corner[t])
-        if _between_rows(y, first[0], rows):
+        if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
         x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
@@ -203,7 +203,7 @@ def hide_by_facets(xy: Floats, corner: Steps, pixels: RightPixels, hidden: Bools
     rows = (pixels.start.size - 1) // pixels.width
     for t in range(len(corner)):
         y = _triple(xy[3], corner[t])
-        if _between_rows(y, pixels.first[0], rows):
+        if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), pixels.first[0], rows):
             continue
         x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
@@ -231,21 +231,24 @@ def _range(values: Floats) -> tuple[float, float]:
 
 
 @inner
-def _three(values: Floats, a: int, b: int, c: int) -> tuple[float, float, float]:
-    return values[a], values[b], values[c]
+def _faces_seen(x: Floats, y: Floats, d: Floats, faces: Steps) -> int:
+    """Triangles [n, 3] of a prism's corners [6] that a camera sees from outside, to ``faces``
+    [7, 3]; their number. ``x``, ``y``: positions in its image, ``d``: disparity.
 
-
-@inner
-def _faces_camera(x: Floats, y: Floats, d: Floats, i: int) -> bool:
-    """Whether a camera sees the side of a prism from corner ``i`` of its triangle to the next one
-    from outside: then the third corner lies behind the side's plane. ``x``, ``y``, ``d`` [6]:
-    position in its image and disparity.
-
-    All corners at the top have one height, as those below have, so that sides are planes.
+    That is the top, and each side whose plane the third corner lies behind. Both the upper and the
+    lower corners have one height, so that sides are planes.
     """
-    j, k = (i + 1) % 3, (i + 2) % 3
-    gx, gy = plane_slopes(_three(x, i, j, 3 + i), _three(y, i, j, 3 + i), _three(d, i, j, 3 + i))
-    return d[i] + gx * (x[k] - x[i]) + gy * (y[k] - y[i]) > d[k]
+    faces[0] = 0, 1, 2
+    n = 1
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        side = i, j, 3 + i
+        gx, gy = plane_slopes(_triple(x, side), _triple(y, side), _triple(d, side))
+        if d[i] + gx * (x[k] - x[i]) + gy * (y[k] - y[i]) > d[k]:
+            faces[n] = side
+            faces[n + 1] = j, 3 + i, 3 + j
+            n += 2
+    return n
 
 
 @kernel
@@ -253,27 +256,23 @@ def raster_prisms(prisms: Prisms, first: tuple[int, int], z_buffer: Floats) -> N
     """Raises ``z_buffer`` to the greatest disparity that prisms may have (eq. 7 of
     docs/explanation/surface.md)."""
     rows, cols = z_buffer.shape
+    any_prism, faces = np.empty(z_buffer.shape, np.int32), np.empty((7, 3), np.int32)
     x, y, xr, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    to = first, 0, z_buffer, np.empty(z_buffer.shape, np.int32)
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 1, y)
         low, high = _range(y)
-        # most prisms lie between the centres of pixels
-        if max(np.ceil(low), first[0]) > min(np.floor(high), first[0] + rows - 1):
+        if _misses(low, high, first[0], rows):
             continue
         _at_heights(prisms, t, 0, x)
         low, high = _range(x)
-        if max(np.ceil(low), first[1]) > min(np.floor(high), first[1] + cols - 1):
+        if _misses(low, high, first[1], cols):
             continue
         _at_heights(prisms, t, 2, xr)
         for k in range(6):
             d[k] = x[k] - xr[k]
-        _raster_left(_three(x, 0, 1, 2), _three(y, 0, 1, 2), _three(d, 0, 1, 2), *to)
-        for i in range(3):
-            j = (i + 1) % 3
-            if _faces_camera(x, y, d, i):
-                for a, b, c in ((i, j, 3 + i), (j, 3 + i, 3 + j)):
-                    _raster_left(_three(x, a, b, c), _three(y, a, b, c), _three(d, a, b, c), *to)
+        for face in faces[: _faces_seen(x, y, d, faces)]:
+            corners = _triple(x, face), _triple(y, face), _triple(d, face)
+            _raster_left(*corners, first, t, z_buffer, any_prism)
 
 
 @kernel
@@ -282,26 +281,22 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
     docs/explanation/surface.md)."""
     first, width = pixels.first, pixels.width
     rows = (pixels.start.size - 1) // width
+    faces = np.empty((7, 3), np.int32)
     x, y, xr, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    to = pixels, hidden
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 3, y)
         low, high = _range(y)
-        if max(np.ceil(low), first[0]) > min(np.floor(high), first[0] + rows - 1):
+        if _misses(low, high, first[0], rows):
             continue
         _at_heights(prisms, t, 2, xr)
         low, high = _range(xr)
-        if max(np.floor(low), first[1]) > min(np.floor(high), first[1] + width - 1):
+        if np.floor(high) < first[1] or np.floor(low) >= first[1] + width:
             continue
         _at_heights(prisms, t, 0, x)
         for k in range(6):
             d[k] = x[k] - xr[k]
-        _hide_right(_three(xr, 0, 1, 2), _three(y, 0, 1, 2), _three(d, 0, 1, 2), *to)
-        for i in range(3):
-            j = (i + 1) % 3
-            if _faces_camera(xr, y, d, i):
-                for a, b, c in ((i, j, 3 + i), (j, 3 + i, 3 + j)):
-                    _hide_right(_three(xr, a, b, c), _three(y, a, b, c), _three(d, a, b, c), *to)
+        for face in faces[: _faces_seen(xr, y, d, faces)]:
+            _hide_right(_triple(xr, face), _triple(y, face), _triple(d, face), pixels, hidden)
 
 
 @kernel

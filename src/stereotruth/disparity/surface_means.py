@@ -11,7 +11,7 @@ from ..epipolar.surface_correlation import (
     columns_inside,
     surface_of_row,
     tolerance_px,
-    wanted_run,
+    wanted_runs,
 )
 from ..epipolar.warping import warp_rows
 from ..kernels import kernel
@@ -20,6 +20,7 @@ from .image_patches import Patch
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
 
 VOTE_PX = 12  # pixels up to here vote,
 VOTE_STEP = 3  # every so many: 81 votes at most
@@ -55,43 +56,38 @@ def _surface_mean(
     slope: Singles,
     reach: int,
     every: int,
-    wanted: Bools,
+    runs: Steps,
     out: Singles,
 ) -> None:
-    """``voters``: disparity of the pixels that count, else NaN. NaN where nothing is ``wanted``,
-    but for some gaps."""
+    """``voters``: disparity of the pixels that count, else NaN; ``runs`` of wanted pixels, outside
+    of which all is NaN."""
     rows, cols = disparity.shape
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     sums = np.empty(2 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
-    for y in range(rows):
-        end_of_run = 0
-        while True:
-            x0, end_of_run = wanted_run(wanted, y, end_of_run)
-            if x0 == cols:
-                break
-            size = end_of_run - x0
-            surface_of_row(disparity, slope, y, x0, size, surface)
-            sums[:] = zero
-            for step_down in range(-reach, reach + 1, every):
-                b = y + step_down
-                if b < 0 or b >= rows:
-                    continue
-                down = np.float32(step_down)
-                for step in range(-reach, reach + 1, every):
-                    across, tolerance = np.float32(step), tolerance_px(step_down, step)
-                    first, end = columns_inside(x0, size, cols, step)
-                    d = voters[b, x0 + step + first : x0 + step + end]
-                    value = values[b, x0 + step + first : x0 + step + end]
-                    p, s = surface[first:], sums[first:]
-                    for k in range(d.size):
-                        plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                        same = one if abs(d[k] - plane) <= tolerance else zero
-                        s[k] += same
-                        s[BLOCK + k] += same * value[k]
-            for k in range(size):
-                out[y, x0 + k] = sums[BLOCK + k] / sums[k]
+    for run in runs:
+        y, x0, size = run[0], run[1], run[2] - run[1]
+        surface_of_row(disparity, slope, y, x0, size, surface)
+        sums[:] = zero
+        for step_down in range(-reach, reach + 1, every):
+            b = y + step_down
+            if b < 0 or b >= rows:
+                continue
+            down = np.float32(step_down)
+            for step in range(-reach, reach + 1, every):
+                across, tolerance = np.float32(step), tolerance_px(step_down, step)
+                first, end = columns_inside(x0, size, cols, step)
+                d = voters[b, x0 + step + first : x0 + step + end]
+                value = values[b, x0 + step + first : x0 + step + end]
+                p, s = surface[first:], sums[first:]
+                for k in range(d.size):
+                    plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
+                    same = one if abs(d[k] - plane) <= tolerance else zero
+                    s[k] += same
+                    s[BLOCK + k] += same * value[k]
+        for k in range(size):
+            out[y, x0 + k] = sums[BLOCK + k] / sums[k]
 
 
 def surface_mean(
@@ -118,7 +114,7 @@ def surface_mean(
         np.ascontiguousarray(slope, dtype=np.float32),
         reach,
         every,
-        np.ones(disparity.shape, np.bool_) if wanted is None else wanted,
+        wanted_runs(np.ones(disparity.shape, np.bool_) if wanted is None else wanted),
         out,
     )
     return out

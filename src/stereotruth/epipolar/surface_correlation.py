@@ -13,6 +13,7 @@ from .one_surface import BEND, SURFACE_PX
 
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
 
 # Pixels of a row that are worked on at once, one per vector lane: each window's sums are added in
 # one order, whatever the block. 52 ns a pixel (window 9) against 240 window by window. What belongs
@@ -33,21 +34,29 @@ def surface_of_row(
         c[2 * BLOCK + k] = slope[1, y, x0 + k]
 
 
-@inner
-def wanted_run(wanted: Bools, y: int, x: int) -> tuple[int, int]:
-    """The next pixels [start, end) of a row from column ``x`` on that are worked on at once: all
-    ``wanted`` ones up to a gap, BLOCK at most; ``start`` is the number of columns if none is left.
+@kernel
+def wanted_runs(wanted: Bools) -> Steps:
+    """Pixels that are worked on at once, [n, 3]: row, first column and that after the last one.
+
+    All ``wanted`` pixels [h, w] of a row up to a gap of more than GAP, BLOCK at most.
     """
-    cols = wanted.shape[1]
-    while x < cols and not wanted[y, x]:
-        x += 1
-    end = x
-    for k in range(x, min(x + BLOCK, cols)):
-        if wanted[y, k]:
-            end = k + 1
-        elif k - end >= GAP:
-            break
-    return x, end
+    rows, cols = wanted.shape
+    out = np.empty((rows * (cols // (GAP + 1) + 1), 3), np.int32)
+    n = 0
+    for y in range(rows):
+        end = 0
+        for x in range(cols):
+            if not wanted[y, x] or x < end:
+                continue
+            end = x + 1
+            for k in range(end, min(x + BLOCK, cols)):
+                if wanted[y, k]:
+                    end = k + 1
+                elif k - end >= GAP:
+                    break
+            out[n] = y, x, end
+            n += 1
+    return out[:n]
 
 
 @inner
@@ -72,69 +81,64 @@ def _correlation(
     slope: Singles,
     half: int,
     noise: tuple[float, float],
-    wanted: Bools,
+    runs: Steps,
     out: Singles,
     expected: Singles,
 ) -> None:
     """``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both
-    images. NaN where nothing is ``wanted``, but for some gaps."""
+    images; ``runs`` of wanted pixels, outside of which all is NaN."""
     rows, cols = left.shape
     out[:], expected[:] = np.nan, np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     centre = np.empty(2 * BLOCK, np.float32)
     sums = np.empty(6 * BLOCK, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
-    for y in range(rows):
-        end_of_run = 0
-        while True:
-            x0, end_of_run = wanted_run(wanted, y, end_of_run)
-            if x0 == cols:
-                break
-            size = end_of_run - x0
-            surface_of_row(disparity, slope, y, x0, size, surface)
-            centre[:size] = left[y, x0 : x0 + size]
-            centre[BLOCK : BLOCK + size] = warped[y, x0 : x0 + size]
-            sums[:] = zero
-            for b in range(max(y - half, 0), min(y + half + 1, rows)):
-                down = np.float32(b - y)
-                for step in range(-half, half + 1):
-                    across, tolerance = np.float32(step), tolerance_px(b - y, step)
-                    first, end = columns_inside(x0, size, cols, step)
-                    d, uu, vv = (
-                        counted[b, x0 + step + first : x0 + step + end],
-                        left[b, x0 + step + first : x0 + step + end],
-                        warped[b, x0 + step + first : x0 + step + end],
-                    )
-                    p, c, s = surface[first:], centre[first:], sums[first:]
-                    for k in range(d.size):
-                        plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                        same = one if abs(d[k] - plane) <= tolerance else zero
-                        u = (uu[k] - c[k]) * same
-                        v = (vv[k] - c[BLOCK + k]) * same
-                        s[k] += same
-                        s[BLOCK + k] += u
-                        s[2 * BLOCK + k] += v
-                        s[3 * BLOCK + k] += u * u
-                        s[4 * BLOCK + k] += v * v
-                        s[5 * BLOCK + k] += u * v
-            for k in range(size):
-                n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
-                # A few pixels correlate by chance: they neither agree nor disagree.
-                expected[y, x0 + k] = np.nan
-                if n < 2 * half + 1:
-                    out[y, x0 + k] = np.nan
-                    continue
-                suu = sums[3 * BLOCK + k] - su * su / n
-                svv = sums[4 * BLOCK + k] - sv * sv / n
-                suv = sums[5 * BLOCK + k] - su * sv / n
-                out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
-                here, there = noise[0] * (n - 1), noise[1] * (n - 1)
-                signal = max(suu * there, svv * here) - here * there  # of that with more texture
-                share = signal / (signal + here * there) if signal > 0 else 0.0
-                if here * there == 0.0:
-                    share = 1.0
-                if share * np.sqrt(n) >= DECIDED:
-                    expected[y, x0 + k] = share
+    for run in runs:
+        y, x0, size = run[0], run[1], run[2] - run[1]
+        surface_of_row(disparity, slope, y, x0, size, surface)
+        centre[:size] = left[y, x0 : x0 + size]
+        centre[BLOCK : BLOCK + size] = warped[y, x0 : x0 + size]
+        sums[:] = zero
+        for b in range(max(y - half, 0), min(y + half + 1, rows)):
+            down = np.float32(b - y)
+            for step in range(-half, half + 1):
+                across, tolerance = np.float32(step), tolerance_px(b - y, step)
+                first, end = columns_inside(x0, size, cols, step)
+                d, uu, vv = (
+                    counted[b, x0 + step + first : x0 + step + end],
+                    left[b, x0 + step + first : x0 + step + end],
+                    warped[b, x0 + step + first : x0 + step + end],
+                )
+                p, c, s = surface[first:], centre[first:], sums[first:]
+                for k in range(d.size):
+                    plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
+                    same = one if abs(d[k] - plane) <= tolerance else zero
+                    u = (uu[k] - c[k]) * same
+                    v = (vv[k] - c[BLOCK + k]) * same
+                    s[k] += same
+                    s[BLOCK + k] += u
+                    s[2 * BLOCK + k] += v
+                    s[3 * BLOCK + k] += u * u
+                    s[4 * BLOCK + k] += v * v
+                    s[5 * BLOCK + k] += u * v
+        for k in range(size):
+            n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
+            # A few pixels correlate by chance: they neither agree nor disagree.
+            expected[y, x0 + k] = np.nan
+            if n < 2 * half + 1:
+                out[y, x0 + k] = np.nan
+                continue
+            suu = sums[3 * BLOCK + k] - su * su / n
+            svv = sums[4 * BLOCK + k] - sv * sv / n
+            suv = sums[5 * BLOCK + k] - su * sv / n
+            out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
+            here, there = noise[0] * (n - 1), noise[1] * (n - 1)
+            signal = max(suu * there, svv * here) - here * there  # of that with more texture
+            share = signal / (signal + here * there) if signal > 0 else 0.0
+            if here * there == 0.0:
+                share = 1.0
+            if share * np.sqrt(n) >= DECIDED:
+                expected[y, x0 + k] = share
 
 
 def surface_correlation(
@@ -187,7 +191,7 @@ def correlation_and_expected(
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
         noise,
-        np.ones(left.shape, np.bool_) if wanted is None else wanted,
+        wanted_runs(np.ones(left.shape, np.bool_) if wanted is None else wanted),
         out,
         expected,
     )
