@@ -17,8 +17,7 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 HEAVY = 0.1  # weight of a pair that is left out, or nearly so
 CHANCE = 0.05  # that a site without a fault has an image that stands out
-FEWEST = 4  # values that a largest one is held against, itself included: of three, two that are
-# alike by chance, as an image and its crop are by right, would always condemn the third
+FEWEST = 4  # values of a test: if two of three are alike, the third is always an outlier
 MOST_OUT = 0.25  # share of the images that may stand out
 NORMAL = 2.0 / 3.0  # power of a length that is normal if both coordinates are (Wilson, Hilferty)
 LEAST_SPREAD_PX = 0.3  # px to that power, of corrections: less makes none of them stand out

@@ -252,27 +252,41 @@ def contradicted(
     if comparison.diachronic:
         changed, compared = _contradicted_apart(labels, window, comparison, labelled)
         unseen = variance_of_unseen_change(compared)
+        by_detail = crowns | beside
     else:
-        changed, may_hold = _contradicted_together(labels, window, comparison, labelled, agreement)
-        near = box_max(may_hold | beside, HELD_PX)
-        close = comparison._replace(window_px=CLOSE_PX)
-        closely = window_agreement(labels, window, close, near)[0].correlation
-        changed &= ~(may_hold & (box_max(np.nan_to_num(closely, nan=-1.0), HELD_PX) > HELD))
-        together = surface_mean(closely, labels.disparity, labels.slope, HELD_PX, 1, beside)
-        changed |= beside & ~(together > DOUBT)
-        beside = np.zeros_like(beside)
-    asked = (crowns | beside) & ~changed
-    detail = shifted_agreement(
-        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, asked, (), apart=False
-    )
-    changed |= crowns & ~changed & ~(detail.here > CONFIRMED * detail.signal)
-    changed |= beside & ~changed & ~(detail.here > DOUBT * detail.signal)
-    vegetation = labelled & ~changed & np.isin(surface_class, VEGETATION_CLASSES)
-    felled = shifted_agreement(
-        labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, vegetation, CROWN_SHIFTS
-    )
+        changed, rim = _contradicted_together(labels, window, comparison, labelled, agreement)
+        changed = _compared_closely(labels, window, comparison, changed, rim, beside)
+        by_detail = crowns
+
+    def close_detail(wanted: Bools, shifts: tuple[float, ...], apart: bool) -> ShiftedAgreement:
+        return shifted_agreement(
+            labels, window, comparison.noise, CLOSE_PX, CROWN_REACH_PX, wanted, shifts, apart
+        )
+
+    detail = close_detail(by_detail & ~changed, (), apart=False)
+    changed |= crowns & ~(detail.here > CONFIRMED * detail.signal)
+    if comparison.diachronic:
+        changed |= beside & ~(detail.here > DOUBT * detail.signal)
+    felled = close_detail(crowns & ~changed, CROWN_SHIFTS, apart=True)
     changed |= felled.is_shifted & (felled.elsewhere > CROWN_AGREEMENT)
     return Contradicted(changed, correlation, unseen)
+
+
+def _compared_closely(
+    labels: Labels,
+    window: PairWindow,
+    comparison: Comparison,
+    changed: Bools,
+    rim: Bools,
+    beside: Bools,
+) -> Bools:
+    """Which pixels [h, w] have ``changed`` by windows of CLOSE_PX, of images of one light: those of
+    the ``rim`` that agree there have not, those ``beside`` young crowns that do not agree have."""
+    near, close = box_max(rim | beside, HELD_PX), comparison._replace(window_px=CLOSE_PX)
+    closely = window_agreement(labels, window, close, near)[0].correlation
+    is_held = rim & (box_max(np.nan_to_num(closely, nan=-1.0), HELD_PX) > HELD)
+    together = surface_mean(closely, labels.disparity, labels.slope, HELD_PX, 1, beside)
+    return changed & ~is_held | beside & ~(together > DOUBT)
 
 
 def variance_of_unseen_change(agreement: ShiftedAgreement) -> Floats:
@@ -320,7 +334,7 @@ def _contradicted_together(
     agreement: Agreement,
 ) -> tuple[Bools, Bools]:
     """:func:`contradicted` of images of one light, by their ``agreement``; and which of these are
-    at the rim of a change, where they agree nowhere better."""
+    at the rim of a change, where the images agree at no other disparity better."""
     changed = agreement.outvoted()
     doubtful = labelled & (agreement.together() < DOUBT)
     shifted = shifted_agreement(

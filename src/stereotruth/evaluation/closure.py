@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
@@ -157,8 +157,7 @@ def _roughness(labels: Floats) -> Floats:
         return np.where(count > 0, np.nansum(sizes, axis=0) / count, np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class _Closures:
+class _Closures(NamedTuple):
     """Of n pixels of A: ``closure`` px; ``roughness`` px, of all three labels, as it counts in a
     closure; ``of_models`` px²: variance by the y-parallax of the epipolar models."""
 
@@ -207,9 +206,11 @@ class _Triplet:
                 ]
             )
             here = self.closures(x, y)
-            good = np.isfinite(list(vars(here).values())).all(axis=0)
-            here = _Closures(*(values[good] for values in vars(here).values()))
-            yield here, self.closures(x[good] + LAG, y[good])
+            good = np.isfinite(here).all(axis=0)
+            yield (
+                _Closures(*(values[good] for values in here)),
+                self.closures(x[good] + LAG, y[good]),
+            )
 
 
 def _reading(here: _Closures, beside: _Closures) -> Floats:
@@ -250,18 +251,19 @@ def figures(closure: Floats, sigma: Floats) -> dict[str, Any]:
 
 def closure_of_labels(triplet: Triplet) -> tuple[Floats, Floats]:
     """Closure and its uncertainty [n] px at pixels of A all over the triplet's ground."""
-    pairs = list(_Triplet(triplet).blocks())
+    labels = _Triplet(triplet)
     here, beside = (
-        _Closures(*(np.concatenate(v) for v in zip(*(vars(pair[k]).values() for pair in pairs))))
-        for k in (0, 1)
+        _Closures(*map(np.concatenate, zip(*of_blocks))) for of_blocks in zip(*labels.blocks())
     )
-    variance = _reading(here, beside) ** 2 + here.of_models + _of_alignment(triplet)
+    of_alignment = _of_alignment(triplet, labels.ac.model)
+    variance = _reading(here, beside) ** 2 + here.of_models + of_alignment
     known = np.isfinite(variance)
     return here.closure[known], np.sqrt(variance[known])
 
 
-def _of_alignment(triplet: Triplet) -> float:
-    """Variance px² of closures by the alignment, on level ground, mean of the triplet's ground.
+def _of_alignment(triplet: Triplet, model: EpipolarModel) -> float:
+    """Variance px² of closures by the alignment, on level ground, mean of the triplet's ground;
+    ``model``: of A-C.
 
     0 if each image has one correction in both of its pairs. Else the pairs' alignments count as
     independent. They share images and planes of the LiDAR, so that this is mostly too large.
@@ -274,7 +276,6 @@ def _of_alignment(triplet: Triplet) -> float:
     ground = _Ground.of(pairs)
     if not len(ground.in_c):
         return 0.0
-    model = _Labels(triplet.ac).model
     along = model.right_image.slopes(*ground.in_c.T)[:, 0]  # x of the grid by px of image C
     variance = 0.0
     for effect, pair in zip(ground.effects, pairs):
