@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..epipolar.warping import agreement, warp_rows
 from ..errors import InputError
-from ..lidar.gps_times import number_of
 from ..products.files import link
 from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
@@ -327,7 +326,8 @@ def _lidar_days(
         cell = f"lidar_days_{view}"
         found[cell] = ""
         if taken and days.size:
-            found[cell] = number_of(taken) - int(days[days.size // 2])
+            since_1970 = int(np.datetime64(taken, "D").astype(np.int64))
+            found[cell] = since_1970 - int(days[days.size // 2])
     return found
 
 
