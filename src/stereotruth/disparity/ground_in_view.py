@@ -1,26 +1,31 @@
-"""The ground that a window may see, which limits the surface that is made for it.
+"""The ground that a window may see: blocks of the surface's store, then squares of these.
 
-A square of ground is in view if a surface there, at any height of the points around it, may be seen
-in the window's pixels from either camera. The points of a window hold more: low ground where only a
-tower would hide something.
+Ground is in view if a surface there, at any height of the points around it, may be seen in the
+window's pixels from either camera. The points of a window hold more: low ground where only a tower
+would hide something.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import kernel
+from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..surface.region import SQUARE_BITS, Region, greatest_around
 from ..surface.scale import PART_BITS
+from ..surface.surface_store import Block
 from ..surface.vertices import Vertices
 from .local_projection import LocalProjection
+from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-SPARE_PX = 3.0  # for what is not linear in a square, and roundings
+SPARE_PX = 3.0  # for what is not linear in a square or between places of a block, and roundings
 # A pixel may see a surface that is extrapolated beyond its points: its position in the right image
 # lies up to this much farther off.
 EXTRAPOLATED_PX = 16.0
@@ -32,6 +37,30 @@ def _ranges(x: Ints, y: Ints, h: Ints, low: Ints, high: Ints) -> None:
     for k in range(x.size):
         j, i = y[k] >> SQUARE_BITS, x[k] >> SQUARE_BITS
         low[j, i], high[j, i] = min(low[j, i], h[k]), max(high[j, i], h[k])
+
+
+def blocks_in_view(
+    blocks: Sequence[Block], model: ViewGeometry, first: tuple[int, int], shape: tuple[int, int]
+) -> tuple[Block, ...]:
+    """Of the ``blocks`` around a window, those that hold a square of :func:`ground_in_view`.
+
+    The box around the ground of a turned window holds up to twice as many. One at least, if there
+    are any, since a window may have points and no surface.
+    """
+    if not blocks:
+        return ()
+    box = np.array([block.box for block in blocks], dtype=np.float64)
+    heights = np.array([block.heights for block in blocks]) * LATTICE_M
+    share = np.linspace(0.0, 1.0, 3)[:, None]
+    lon, lat = (box[:, k] + share * (box[:, k + 2] - box[:, k]) for k in (0, 1))
+    at = [  # three places along each side, at the lowest and the highest surface around
+        model.ground_to_epipolar(x * LATTICE_DEG, y * LATTICE_DEG, np.full(len(box), height))
+        for x in lon
+        for y in lat
+        for height in (heights.min(), heights.max())
+    ]
+    seen = _in_view(np.stack(at, axis=1), first, shape)
+    return tuple(block for block, in_view in zip(blocks, seen) if in_view) or tuple(blocks[:1])
 
 
 def ground_in_view(
@@ -87,7 +116,8 @@ def _corners(
 
 
 def _in_view(xy: Floats, first: tuple[int, int], shape: tuple[int, int]) -> Bools:
-    """Which squares a window may see, by the positions ``xy`` [4, 8, n] of their corners (px)."""
+    """Which parts [n] of the ground a window may see, by the positions ``xy`` [4, k, n] (px) of k
+    places around each."""
     (top, side), (rows, cols) = first, shape
     unknown = ~np.isfinite(xy).all(axis=(0, 1))
     disparity = xy[0] - xy[2]

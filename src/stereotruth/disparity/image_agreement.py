@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
-from ..epipolar.surface_correlation import correlation_and_expected
+from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
 from ..numerics.summed_area import summed_area, window_sums
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
@@ -195,9 +195,10 @@ def window_agreement(
     top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
     left = window.left.pixels[top : top + rows, side : side + cols]
     surface = labels.disparity, labels.slope
+    runs = None if wanted is None else wanted_runs(wanted)
     clear = apart_from_steps(labels.disparity)
     with_noise, expected = correlation_and_expected(
-        left, warped, *surface, comparison.window_px, comparison.noise, clear, wanted
+        left, warped, *surface, comparison.window_px, comparison.noise, clear, runs
     )
     limits = comparison.threshold, comparison.weight, comparison.window_px
     return free_of_noise(with_noise, expected, *surface, *limits), with_noise
@@ -285,7 +286,9 @@ def _compared_closely(
     near, close = box_max(rim | beside, HELD_PX), comparison._replace(window_px=CLOSE_PX)
     closely = window_agreement(labels, window, close, near)[0].correlation
     is_held = rim & (box_max(np.nan_to_num(closely, nan=-1.0), HELD_PX) > HELD)
-    together = surface_mean(closely, labels.disparity, labels.slope, HELD_PX, 1, beside)
+    together = surface_mean(
+        closely, labels.disparity, labels.slope, HELD_PX, 1, wanted_runs(beside)
+    )
     return changed & ~is_held | beside & ~(together > DOUBT)
 
 
@@ -351,7 +354,9 @@ def _contradicted_together(
     changed = (changed | rim) & labelled
     # votes widen what has changed over the same surface
     goes_on = np.where(labelled, ~inner, np.nan)
-    unchanged = surface_mean(goes_on, labels.disparity, labels.slope, NEARBY_PX, 2, changed)
+    unchanged = surface_mean(
+        goes_on, labels.disparity, labels.slope, NEARBY_PX, 2, wanted_runs(changed)
+    )
     return changed, changed & ~shifted.is_shifted & (unchanged > RIM_SHARE)
 
 

@@ -19,6 +19,7 @@ from ..products.provenance import digest
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
+from .ground_in_view import blocks_in_view
 from .image_patches import MaskedImage
 from .pixel_scale import PixelScale
 from .point_windows import PointWindows
@@ -157,4 +158,7 @@ class SceneInputs:
         footprint = self.windows.footprint(rows, cols)
         if footprint is None or not self.settings.on_surface:
             return ()
-        return self.ground.blocks(footprint.around)
+        margin = self.settings.margin
+        first = rows.start - margin, cols.start - margin
+        shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
+        return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)

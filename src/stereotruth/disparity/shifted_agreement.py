@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.surface_correlation import surface_correlation
+from ..epipolar.surface_correlation import surface_correlation, wanted_runs
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
@@ -143,15 +143,18 @@ def _means(
     every = max(reach // 4, 1)
     averaged = box_max(wanted, reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
+    compared[original == 0.0] = np.nan
+    to_compare, to_average = wanted_runs(averaged), wanted_runs(wanted)
+    surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
+    level, slope = surface
 
     def mean(shift: float) -> Singles:
         at = slice(row, row + rows), slice(col, col + cols)
         warped = warp_to_left(right, *at, compared + shift)
-        warped = np.where(original == 0.0, np.nan, warped)
         correlation = surface_correlation(
-            original, warped, disparity, slope, window_px, clear, averaged
+            original, warped, level, slope, window_px, clear, to_compare
         )
-        return surface_mean(correlation, disparity, slope, reach, every, wanted)
+        return surface_mean(correlation, level, slope, reach, every, to_average)
 
     elsewhere = np.full((rows, cols), np.nan, np.float32)
     shifted = np.full((rows, cols), np.nan, np.float32)
@@ -160,7 +163,7 @@ def _means(
         better = here > np.where(np.isnan(elsewhere), -np.inf, elsewhere)
         elsewhere[better], shifted[better] = here[better], shift
     signal = _signal(images, row, col, disparity)
-    around_it = surface_mean(signal, disparity, slope, reach, every, wanted)
+    around_it = surface_mean(signal, level, slope, reach, every, to_average)
     return mean(0.0), elsewhere, shifted, np.fmin(signal, around_it)
 
 

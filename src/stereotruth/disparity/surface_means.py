@@ -49,6 +49,18 @@ def apart_from_steps(disparity: Floats) -> Bools:
 
 
 @kernel
+def _voters(values: NDArray, disparity: Singles, known: Singles, voters: Singles) -> None:
+    """Fills ``known`` with the ``values`` [h, w], 0 for none; ``voters`` with the disparity of
+    those that have one."""
+    for y in range(known.shape[0]):
+        for x in range(known.shape[1]):
+            value = values[y, x]
+            has_value = np.isfinite(value)
+            known[y, x] = value if has_value else 0.0
+            voters[y, x] = disparity[y, x] if has_value else np.float32(np.nan)
+
+
+@kernel
 def _surface_mean(
     values: Singles,
     disparity: Singles,
@@ -96,25 +108,19 @@ def surface_mean(
     slope: NDArray[np.floating],
     reach: int = VOTE_PX,
     every: int = VOTE_STEP,
-    wanted: Bools | None = None,
+    runs: Steps | None = None,
 ) -> Singles:
     """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
 
     ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
     ``reach`` px off count, one of so many (``every``) along each axis, if they have a value. Of the
-    ``wanted`` [h, w] pixels alone where these are given.
+    pixels of ``runs`` (:func:`.wanted_runs`) alone where these are given.
     """
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    known = np.isfinite(values)
-    out = np.empty(disparity.shape, dtype=np.float32)
-    _surface_mean(
-        np.where(known, values, 0).astype(np.float32),
-        disparity,
-        np.where(known, disparity, np.float32(np.nan)),
-        np.ascontiguousarray(slope, dtype=np.float32),
-        reach,
-        every,
-        wanted_runs(np.ones(disparity.shape, np.bool_) if wanted is None else wanted),
-        out,
-    )
+    known, voters, out = np.empty((3, *disparity.shape), np.float32)
+    _voters(values, disparity, known, voters)
+    slope = np.ascontiguousarray(slope, dtype=np.float32)
+    if runs is None:
+        runs = wanted_runs(np.ones(disparity.shape, np.bool_))
+    _surface_mean(known, disparity, voters, slope, reach, every, runs, out)
     return out

@@ -141,6 +141,21 @@ def _correlation(
                 expected[y, x0 + k] = share
 
 
+@kernel
+def _as_compared(
+    warped: NDArray, disparity: Singles, clear: Bools, values: Singles, known: Singles, out: Singles
+) -> None:
+    """Fills ``values``: those of ``warped``, 0 for none; ``known``: disparity where there is one;
+    ``out``: of these, those that are ``clear``. All arrays [h, w]."""
+    for y in range(values.shape[0]):
+        for x in range(values.shape[1]):
+            value, d = np.float32(warped[y, x]), disparity[y, x]
+            has_value = np.isfinite(value)
+            values[y, x] = value if has_value else np.float32(0.0)
+            known[y, x] = d if has_value else np.float32(np.nan)
+            out[y, x] = d if has_value and clear[y, x] else np.float32(np.nan)
+
+
 def surface_correlation(
     left: NDArray[np.floating],
     warped: NDArray[np.floating],
@@ -148,12 +163,12 @@ def surface_correlation(
     slope: NDArray[np.floating],
     window: int,
     clear: Bools | None = None,
-    wanted: Bools | None = None,
+    runs: Steps | None = None,
 ) -> Singles:
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
 
-    Of these, the ``clear`` [h, w] ones alone where that is given; of the ``wanted`` [h, w] pixels
-    alone where these are.
+    Of these, the ``clear`` [h, w] ones alone where that is given; of the pixels of ``runs``
+    (:func:`wanted_runs`) alone where these are.
 
     ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
     where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
@@ -161,7 +176,7 @@ def surface_correlation(
     1e-5 of float64.
     """
     none = 0.0, 0.0
-    return correlation_and_expected(left, warped, disparity, slope, window, none, clear, wanted)[0]
+    return correlation_and_expected(left, warped, disparity, slope, window, none, clear, runs)[0]
 
 
 def correlation_and_expected(
@@ -172,7 +187,7 @@ def correlation_and_expected(
     window: int,
     noise: tuple[float, float],
     clear: Bools | None = None,
-    wanted: Bools | None = None,
+    runs: Steps | None = None,
 ) -> tuple[Singles, Singles]:
     """:func:`surface_correlation`, and the one that images of the same ground have on the average.
 
@@ -180,18 +195,19 @@ def correlation_and_expected(
     window in the image that varies more: the attenuation of a correlation by errors of measurement
     (Spearman 1904). NaN also where noise leaves so little of it that chance may do as well.
     """
-    known = np.isfinite(warped)
-    disparity = np.where(known, disparity, np.float32(np.nan)).astype(np.float32, copy=False)
-    out, expected = np.empty((2, *left.shape), np.float32)
+    every = np.ones(left.shape, np.bool_)
+    values, known, counted, out, expected = np.empty((5, *left.shape), np.float32)
+    disparity = np.ascontiguousarray(disparity, dtype=np.float32)
+    _as_compared(warped, disparity, every if clear is None else clear, values, known, counted)
     _correlation(
         np.ascontiguousarray(left, dtype=np.float32),
-        np.where(known, warped, 0).astype(np.float32, copy=False),
-        disparity,
-        disparity if clear is None else np.where(clear, disparity, np.float32(np.nan)),
+        values,
+        known,
+        counted,
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
         noise,
-        wanted_runs(np.ones(left.shape, np.bool_) if wanted is None else wanted),
+        wanted_runs(every) if runs is None else runs,
         out,
         expected,
     )

@@ -1,4 +1,4 @@
-"""Sums over all rectangles of a grid by one table of sums from its upper left corner."""
+"""Sums over rectangles of a grid: of any size by one table, of one size by running sums."""
 
 from __future__ import annotations
 
@@ -7,17 +7,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels import kernel
+
 
 def summed_area(values: NDArray[Any]) -> NDArray[Any]:
     """Table [h + 1, w + 1] of the sums of ``values`` [h, w] above and to the left of each corner.
 
     Whole numbers and booleans are summed as int64 and exactly, others as float64.
     """
-    whole = np.issubdtype(values.dtype, np.integer) or values.dtype == np.bool_
-    table = np.zeros((values.shape[0] + 1, values.shape[1] + 1), np.int64 if whole else np.float64)
+    shape = values.shape[0] + 1, values.shape[1] + 1
+    table = np.zeros(shape, np.int64 if _is_whole(values) else np.float64)
     np.cumsum(values, axis=0, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
     return table
+
+
+def _is_whole(values: NDArray[Any]) -> bool:
+    return np.issubdtype(values.dtype, np.integer) or values.dtype == np.bool_
+
+
+@kernel
+def _running_sums(values: NDArray[Any], size: int, out: NDArray[np.int64]) -> None:
+    """Fills ``out`` with the sums of all squares of whole numbers."""
+    rows, cols = values.shape
+    of_column = np.zeros(cols, np.int64)
+    for y in range(rows):
+        for x in range(cols):
+            of_column[x] += values[y, x]
+        if y >= size:
+            for x in range(cols):
+                of_column[x] -= values[y - size, x]
+        if y < size - 1:
+            continue
+        total, sums = np.int64(0), out[y - size + 1]
+        for x in range(size - 1):
+            total += of_column[x]
+        for x in range(sums.size):
+            total += of_column[x + size - 1]
+            sums[x] = total
+            total -= of_column[x]
 
 
 def window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
@@ -25,8 +53,13 @@ def window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
 
     Empty along an axis that is shorter than a square.
     """
+    rows, cols = (max(n - size + 1, 0) for n in values.shape)
+    if _is_whole(values):
+        out = np.empty((rows, cols), np.int64)
+        if out.size:
+            _running_sums(values, size, out)
+        return out
     table = summed_area(values)
-    rows, cols = (max(n - size, 0) for n in table.shape)
     upper, lower = table[:rows], table[size : size + rows]
     left, right = np.s_[:, :cols], np.s_[:, size : size + cols]
     return lower[right] - upper[right] - lower[left] + upper[left]

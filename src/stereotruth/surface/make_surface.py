@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..job import progress
+from ..kernels import kernel
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from ..lidar.point_store import PointStore
@@ -33,15 +35,16 @@ from ..products.locks import FileLock
 from ..products.provenance import describe, digest
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround
-from .surface import Core, GroundSurface, ground_surface
+from .surface import Core, GroundSurface, Parts, ground_surface
 from .surface_store import ARRAYS, ATTRIBUTES, BLOCKS, FORMAT, write_block
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
+Ints = NDArray[np.int64]
 Group = tuple[Number, ...]  # of blocks, in their order
 
 BLOCK_SPACINGS = 128  # spacings of points along a block's side, at least,
-BLOCK_CELLS = 512  # and cells
+BLOCK_CELLS = 256  # and cells
 HALOS = 12  # a group is so many halos wide: these cost a third more
 MOST_CELLS = 4096  # along a group's side
 
@@ -60,6 +63,22 @@ def group_blocks(scale: SurfaceScale, side: int) -> int:
     while blocks * side < min(HALOS * scale.halo_cells, MOST_CELLS):
         blocks *= 2
     return blocks
+
+
+@kernel
+def _parts_of(x: Ints, y: Ints, boxes: Ints) -> Parts:
+    """In which of ``boxes`` [k, 2, 2] (first (x, y), that after the last), of which no two overlap,
+    each of n vertices lies; -1 for none. Most lie in that of the vertex before them."""
+    out = np.full(x.size, -1, np.int16)
+    last = 0
+    for n in range(x.size):
+        for step in range(len(boxes)):
+            k = (last + step) % len(boxes)
+            low, high = boxes[k, 0], boxes[k, 1]
+            if low[0] <= x[n] < high[0] and low[1] <= y[n] < high[1]:
+                out[n] = last = k
+                break
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,16 +142,12 @@ class _Maker:
             builder.add(*lattice, points.classification, points.return_number, points.day)
         if not some:
             return
-        first = [q // size for q, size in zip(low, self.scale.cell)]
-
-        def core(box: Box) -> Core:
-            """The same in parts of a cell from the first one on."""
-            low, high = (tuple((k - f) * PART for k, f in zip(end, first)) for end in box)
-            return Core(low, high)
-
-        every = ground_surface(builder.built(), self.scale, core(_around(parts.values())))
-        for number, box in parts.items():
-            surface = every.within(core(box))
+        first = np.array([q // size for q, size in zip(low, self.scale.cell)])
+        boxes = (np.array(list(parts.values())) - first) * PART
+        around = Core(tuple(boxes[:, 0].min(axis=0)), tuple(boxes[:, 1].max(axis=0)))
+        every = ground_surface(builder.built(), self.scale, around)
+        part = _parts_of(every.vertices.x, every.vertices.y, boxes)
+        for number, surface in zip(parts, every.split(part, len(parts))):
             if len(surface.facet) + len(surface.undecided) + len(surface.tops.corner):
                 yield number, surface
 

@@ -16,7 +16,9 @@ figure: docs/explanation/surface.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +36,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
+Parts = NDArray[np.int16]
 
 
 class Core(NamedTuple):
@@ -81,25 +84,35 @@ class GroundSurface:
         """Those of the undecided triangles that are strips along breaklines."""
         return slice(self.whole, len(self.undecided))
 
-    def within(self, core: Core) -> GroundSurface:
-        """The triangles whose first vertex lies in a box, with all vertices.
+    def split(self, part: Parts, parts: int) -> Iterator[GroundSurface]:
+        """The triangles whose first vertex lies in each of so many ``parts``, with all vertices.
 
-        Of a triangle that is cut, it is that of the whole triangle.
+        ``part`` [n] of each vertex, -1 for none. Of a triangle that is cut, the part is that of the
+        whole triangle.
         """
-        own = core.holds(self.vertices)
-        facet, undecided = own[self.facet_origin], own[self.undecided_origin]
-        return replace(
-            self,
-            facet=self.facet[facet],
-            variance=self.variance[facet],
-            bulge=self.bulge[facet],
-            undecided=self.undecided[undecided],
-            height_range=self.height_range[undecided],
-            whole=int(undecided[: self.whole].sum()),
-            tops=self.tops.taken(own[self.tops.corner[:, 0]]),
-            facet_origin=self.facet_origin[facet],
-            undecided_origin=self.undecided_origin[undecided],
-        )
+        facets = _by_part(part[self.facet_origin], parts)
+        undecided = _by_part(part[self.undecided_origin], parts)
+        tops = _by_part(part[self.tops.corner[:, 0]], parts)
+        for facet, triangle, top in zip(facets, undecided, tops):
+            yield replace(
+                self,
+                facet=self.facet[facet],
+                variance=self.variance[facet],
+                bulge=self.bulge[facet],
+                undecided=self.undecided[triangle],
+                height_range=self.height_range[triangle],
+                whole=int(np.searchsorted(triangle, self.whole)),
+                tops=self.tops.taken(top),
+                facet_origin=self.facet_origin[facet],
+                undecided_origin=self.undecided_origin[triangle],
+            )
+
+
+def _by_part(part: Parts, parts: int) -> list[Ints]:
+    """Which triangles, of the ``part`` [m] of each, lie in each of so many; in their order."""
+    order = np.argsort(part, kind="stable")
+    ends = np.searchsorted(part[order], np.arange(parts + 1))
+    return [order[first:end] for first, end in pairwise(ends)]
 
 
 def ground_surface(

@@ -81,9 +81,11 @@ def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> 
     used = np.zeros(surface.vertices.x.size, np.bool_)
     for corners in triangles:
         used[corners.reshape(-1)] = True
-    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    taken = np.flatnonzero(used)
+    number = np.empty(used.size, np.int32)  # of those that are used, which are few of a group's
+    number[taken] = np.arange(taken.size, dtype=np.int32)
     facet, whole, strip, top = (number[corners] for corners in triangles)
-    vertices = surface.vertices.taken(used)
+    vertices = surface.vertices.taken(taken)
     np.savez(
         path,
         lon=(vertices.lon_q - corner[0]).astype(np.int32),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity import recipe as module
+from stereotruth.disparity import scene_inputs
 from stereotruth.disparity.ground_in_view import ground_in_view
 from stereotruth.disparity.settings import Settings
 from stereotruth.surface.region import Region
@@ -90,3 +91,17 @@ def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) 
             assert values.tobytes() == layers[name].tobytes(), name
     whole, seen = np.sum(sizes, axis=0)
     assert seen < 0.7 * whole
+
+
+@pytest.mark.parametrize("view", ["left", "right"])
+def test_labels_are_those_of_all_blocks(tmp_path, monkeypatch, view) -> None:
+    monkeypatch.setattr("stereotruth.surface.make_surface.block_side", lambda scale: 32)
+    scene = Scene(tmp_path, box=True, spacing=2.5).inputs(Settings(), view)
+    windows = [(slice(r, r + 50), slice(c, c + 50)) for r in (90, 140) for c in (60, 110, 160)]
+    labels = [module.label_window(scene, *window)[0] for window in windows]
+    taken = [len(scene.surface_blocks(*window)) for window in windows]
+    monkeypatch.setattr(scene_inputs, "blocks_in_view", lambda blocks, *_: blocks)
+    for window, layers in zip(windows, labels):
+        for name, values in module.label_window(scene, *window)[0].items():
+            assert values.tobytes() == layers[name].tobytes(), name
+    assert sum(taken) < 0.7 * sum(len(scene.surface_blocks(*window)) for window in windows)

@@ -11,7 +11,7 @@ from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
 from stereotruth.disparity.shifted_agreement import ShiftedAgreement, shifted_agreement
 from stereotruth.disparity.surface_means import surface_mean
-from stereotruth.epipolar.surface_correlation import BLOCK, surface_correlation
+from stereotruth.epipolar.surface_correlation import BLOCK, surface_correlation, wanted_runs
 
 ROWS, COLS = slice(20, 140), slice(60, 200)
 SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
@@ -144,10 +144,10 @@ def test_single_pixels_at_the_borders_of_a_wide_window():
     wanted = np.zeros(shape, np.bool_)
     wanted[:, [0, 1, 40, BLOCK - 1, BLOCK, -2, -1]] = True
     for of in (
-        lambda chosen: surface_mean(values, *flat, 9, 1, chosen),
-        lambda chosen: surface_correlation(values, warped, *flat, 9, None, chosen),
+        lambda runs: surface_mean(values, *flat, 9, 1, runs),
+        lambda runs: surface_correlation(values, warped, *flat, 9, None, runs),
     ):
-        assert np.array_equal(of(wanted)[wanted], of(None)[wanted], equal_nan=True)
+        assert np.array_equal(of(wanted_runs(wanted))[wanted], of(None)[wanted], equal_nan=True)
 
 
 @pytest.mark.parametrize("diachronic", [False, True])
