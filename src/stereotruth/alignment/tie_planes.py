@@ -79,18 +79,11 @@ class SitePoints(NamedTuple):
         parallax: Floats,
     ) -> SitePoints:
         """Points outside the box are left out of it."""
-        rows, cols = shape
-        inside = (col > -0.5) & (col < cols - 0.5) & (row > -0.5) & (row < rows - 0.5)
-        col, row, height, firm = (values[inside] for values in (col, row, height, firm))
-        pixel = np.rint(row).astype(np.int64) * cols + np.rint(col).astype(np.int64)
-        first = np.zeros(rows * cols + 1, np.int64)
-        np.cumsum(np.bincount(pixel, minlength=rows * cols), out=first[1:])
-        order = np.empty(pixel.size, np.int64)  # whatever the order of files
-        _sort_by_height(pixel, height, first[:-1].copy(), order)
+        first = np.zeros(shape[0] * shape[1] + 1, np.int64)
+        order = _by_pixel(col, row, height, shape[1], first)  # whatever the order of files
+        col, row, height, firm = (values[order] for values in (col, row, height, firm))
         heights = float(height.min(initial=np.inf)), float(height.max(initial=-np.inf))
-        return cls(
-            *(values[order] for values in (col, row, height, firm)), first, heights, shape, parallax
-        )
+        return cls(col, row, height, firm, first, heights, shape, parallax)
 
     def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
         """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
@@ -106,20 +99,32 @@ class SitePoints(NamedTuple):
 
 
 @kernel
-def _sort_by_height(pixel: Integers, height: Floats, end: Integers, order: Integers) -> None:
-    """Fill ``order`` [n]: points by ``pixel``, those of a pixel by height, equal ones as they come.
+def _by_pixel(col: Floats, row: Floats, height: Floats, cols: int, first: Integers) -> Integers:
+    """The points [n] of a box of so many ``cols`` by pixel, those of a pixel by height, equal ones
+    as they come; without those outside.
 
-    ``end`` [pixels]: where the points of each pixel begin; overwritten. A pixel has few points.
+    Fills ``first`` [rows * cols + 1]: where the points of each pixel begin; 0 before.
     """
-    first = end.copy()
-    for k in range(pixel.size):
+    pixel = np.full(col.size, -1, np.int32)
+    rows = (first.size - 1) // cols
+    for k in range(col.size):
+        if -0.5 < col[k] < cols - 0.5 and -0.5 < row[k] < rows - 0.5:
+            pixel[k] = np.int64(np.rint(row[k])) * cols + np.int64(np.rint(col[k]))
+            first[pixel[k] + 1] += 1
+    for p in range(first.size - 1):
+        first[p + 1] += first[p]
+    end, order = first[:-1].copy(), np.empty(first[-1], np.int64)
+    for k in range(col.size):
         p = pixel[k]
+        if p < 0:
+            continue
         at = end[p]
-        while at > first[p] and height[order[at - 1]] > height[k]:
+        while at > first[p] and height[order[at - 1]] > height[k]:  # a pixel has few points
             order[at] = order[at - 1]
             at -= 1
         order[at] = k
         end[p] += 1
+    return order
 
 
 @inner

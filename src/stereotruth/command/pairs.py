@@ -21,12 +21,13 @@ from .site import images_of
 
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
+Names = tuple[str, str]  # of a pair's left and right image
 OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which pairs are written: the best ``most`` of those within limits.
+    """Which pairs are written: ``most`` of those within limits.
 
     ``convergence`` (degrees) and ``days``: least and greatest, None: any; pairs without dates have
     any number of days if no ``days`` are given. ``diachronic``: pairs of more than DIACHRONIC_DAYS.
@@ -52,20 +53,51 @@ class Choice:
         return first <= pair.days <= last and (not self.diachronic or pair.days > DIACHRONIC_DAYS)
 
     def of(self, pairs: Sequence[RatedPair]) -> list[RatedPair]:
-        """The chosen of pairs that are listed best first."""
-        chosen: list[RatedPair] = []
+        """The chosen of pairs that are listed best first, in that order.
+
+        First those that join all images, since images that no pair joins are not adjusted together
+        (a spanning forest, Kruskal 1956); then the best. If ``most`` are too few to join all, the
+        best alone.
+        """
+        allowed = [rated for rated in pairs if self.allows(rated.pair)]
+        names = [(rated.pair.left, rated.pair.right) for rated in allowed]
         used: Counter[str] = Counter()
-        for rated in pairs:
-            names = rated.pair.left, rated.pair.right
-            if self.most is not None and len(chosen) >= self.most:
-                break
-            if not self.allows(rated.pair):
-                continue
-            if self.each is not None and max(used[name] for name in names) >= self.each:
-                continue
-            chosen.append(rated)
-            used.update(names)
+        joining = self._joining(names, used)
+        most = len(names) if self.most is None else self.most
+        if len(joining) > most:
+            joining = set()
+            used.clear()
+        chosen = joining | self._others(names, joining, used, most - len(joining))
+        return [rated for rated, pair in zip(allowed, names) if pair in chosen]
+
+    def _joining(self, pairs: Sequence[Names], used: Counter[str]) -> set[Names]:
+        """The best pairs that join images which those before them have not joined; ``used``: pairs
+        of each image, which are counted on."""
+        group = {name: name for pair in pairs for name in pair}
+        chosen: set[Names] = set()
+        for pair in pairs:
+            one, other = (group[name] for name in pair)
+            if one != other and self._take(pair, used):
+                chosen.add(pair)
+                group = {name: one if of == other else of for name, of in group.items()}
         return chosen
+
+    def _others(
+        self, pairs: Sequence[Names], chosen: set[Names], used: Counter[str], most: int
+    ) -> set[Names]:
+        """The best pairs but for the ``chosen``, ``most`` at most."""
+        others: set[Names] = set()
+        for pair in pairs:
+            if len(others) < most and pair not in chosen and self._take(pair, used):
+                others.add(pair)
+        return others
+
+    def _take(self, pair: Names, used: Counter[str]) -> bool:
+        """Whether neither image of a pair is in as many as it may be, in which case it is counted."""
+        if self.each is not None and max(used[name] for name in pair) >= self.each:
+            return False
+        used.update(pair)
+        return True
 
 
 def rated_pairs(city: str, settings: Configuration) -> list[RatedPair]:

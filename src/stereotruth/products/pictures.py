@@ -90,8 +90,10 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     ticks = {id(label) for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
     for text in figure.findobj(Text):
         text.set_parse_math(id(text) in ticks)  # powers of ten of logarithmic axes
+    # a layout that leaves room for all needs no first drawing that finds what the texts take
+    bounds = "tight" if figure.get_layout_engine() is None else None
     with atomic_file(path) as scratch:
-        figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches="tight")
+        figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches=bounds)
 
 
 QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks

@@ -137,6 +137,14 @@ def test_each_image_in_few_or_many(choice, taken):
     assert [one.pair.left + one.pair.right for one in chosen] == taken
 
 
+@pytest.mark.parametrize(
+    ("most", "taken"), [(2, ["AB", "AC"]), (3, ["AB", "AC", "CD"]), (4, ["AB", "AC", "BC", "CD"])]
+)
+def test_chosen_pairs_join_all_images_where_they_are_enough(most, taken):
+    chosen = Choice(most=most).of(rated("AB", "AC", "BC", "CD"))
+    assert [one.pair.left + one.pair.right for one in chosen] == taken
+
+
 def test_the_table_has_a_line_a_pair(capsys):
     pairs = rated("AB", "AC")
     assert all(len(line) == len(command.COLUMNS) for line in table(pairs))
