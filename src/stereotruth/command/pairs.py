@@ -93,7 +93,7 @@ class Choice:
         return others
 
     def _take(self, pair: Names, used: Counter[str]) -> bool:
-        """Whether neither image of a pair is in as many as it may be, in which case it is counted."""
+        """Whether neither image of a pair is in as many as it may be; then the pair is counted."""
         if self.each is not None and max(used[name] for name in pair) >= self.each:
             return False
         used.update(pair)
