@@ -198,9 +198,7 @@ def _asset(assets: Any, number: int, location: str) -> str:
         str(asset["href"])
         for asset in every
         if isinstance(asset, Mapping) and isinstance(asset.get("href"), str)
-        if not (
-            isinstance(roles := asset.get("roles"), list) and NO_DATA_ROLES & set(map(str, roles))
-        )
+        if not _without_data(asset.get("roles"))
     ]
     for kind in (LIDAR_SUFFIXES, (EPT,), RASTER_SUFFIXES):
         if fitting := [href for href in held if _path(href).endswith(kind)]:

@@ -92,8 +92,10 @@ COLUMNS = tuple(field.name for field in fields(ListedTile))
 
 
 def is_catalogue(location: str) -> bool:
-    """Whether a part of a cell names a catalogue, by its ending."""
+    """Whether a part of a cell names a catalogue, by its ending; of a URL, that of its path."""
     lowered = location.lower()
+    if is_remote(location):
+        lowered = re.split(r"[?#]", lowered, maxsplit=1)[0]
     return lowered.endswith(CATALOGUES) and lowered.rpartition("/")[2] != EPT
 
 

@@ -207,16 +207,34 @@ def test_a_list_of_another_ground_is_told_by_check(folder):
     assert any("km² of the ground of scene Good-1: write it again" in text for text in doubts)
 
 
-def test_a_scene_is_added_with_a_catalogue(folder):
-    name = catalogue(folder, items_of(folder))
+def add_with(folder: Path, catalogue: str) -> list[str]:
+    """Add the good scene once more, as Good-2."""
     (folder / "named").mkdir()
     for view in ("left", "right"):
         (folder / "named" / f"{view}.tif").write_bytes((folder / f"{view}.tif").read_bytes())
-    lines = add_scene([folder / "named"], lidar=name, gcps="gcps.csv", city="Good")
+    return add_scene([folder / "named"], lidar=catalogue, gcps="gcps.csv", city="Good")
+
+
+def test_a_scene_is_added_with_a_catalogue(folder):
+    name = catalogue(folder, items_of(folder))
+    lines = add_with(folder, name)
     _, scenes = read_scenes(configured()[0])
     assert read_list("lidar/Good-2.tsv").catalogue == name
     assert scenes["Good-2"].lidar.count(";") + 1 == len(read_list("lidar/Good-2.tsv").tiles)
     assert any("lie on the" in line for line in lines)
+
+
+def test_a_scene_is_added_with_a_signed_catalogue(folder):
+    with serving() as site:
+        url = with_catalogue(site, folder)
+        signed = f"{url}?sig=verysecret"
+        site.answers["/lidar/tiles.json?sig=verysecret"] = site.answers.pop("/lidar/tiles.json")
+        lines = add_with(folder, signed)
+    assert read_list("lidar/Good-2.tsv").catalogue == f"{url}?…"
+    assert "lidar/Good-2.tsv" in Path("scenes.tsv").read_text()
+    assert not any("verysecret" in text for text in lines)
+    written = [file for file in folder.rglob("*") if file.is_file()]
+    assert not any(b"verysecret" in file.read_bytes() for file in written)
 
 
 def test_a_run_looks_into_no_catalogue(folder):

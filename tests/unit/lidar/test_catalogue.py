@@ -496,9 +496,15 @@ def test_ground_that_a_list_was_not_asked_for_is_told(tmp_path):
 
 def test_cells_that_name_lists_and_catalogues():
     assert is_list("lidar/a.tsv") and not is_list("https://host/a.tsv") and not is_list("a.laz")
-    for name in ("a.vpc", "https://host/a.json", "a.GPKG", "x/a.geojson"):
+    for name in (
+        "a.vpc",
+        "https://host/a.json",
+        "https://host/a.json?sig=x",
+        "a.GPKG",
+        "x/a.geojson",
+    ):
         assert is_catalogue(name)
-    for name in ("https://host/x/ept.json", "ept.json", "lidar/*.laz", "a.tsv"):
+    for name in ("https://host/x/ept.json", "ept.json", "https://host/a.laz?of=a.json", "a.tsv"):
         assert not is_catalogue(name)
 
 
