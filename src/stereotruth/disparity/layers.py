@@ -12,7 +12,6 @@ from .right_view import Pair
 from .settings import Settings
 from .status import Status, is_labelled
 
-LIDAR_DATE = "lidar_date"
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
 
@@ -38,8 +37,7 @@ def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str,
     count = np.where(kept, np.minimum(labels.point_count, GREATEST_COUNT), 0)
     layers["point_count"] = count.astype(np.uint16)
     layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
-    if labels.day is not None:
-        layers[LIDAR_DATE] = np.where(known, labels.day, 0).astype(np.uint16)
+    layers["lidar_date"] = np.where(known, labels.day, 0).astype(np.uint16)
     layers["status"] = labels.status
     layers["change"] = labels.change
     return layers
@@ -69,7 +67,6 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "long_name": "LAS class (ASPRS) of the highest point used",
         "comment": "0: never classified, or no label",
     }
-    date = {LIDAR_DATE: Layer("uint16", 0, _lidar_date())} if on_surface else {}
     return {
         "disparity": Layer("float32", np.nan, _disparity(on_surface, view)),
         "status": Layer("uint8", 0, _status(settings, view, masked)),
@@ -78,7 +75,7 @@ def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Lay
         "correlation": Layer("float32", np.nan, _correlation(settings, view)),
         "uncertainty": Layer("float32", np.nan, _uncertainty(settings)),
         "surface_class": Layer("uint8", 0, surface_class),
-        **date,
+        "lidar_date": Layer("uint16", 0, _lidar_date(on_surface)),
         "change": Layer("uint8", 0, _change()),
     }
 
@@ -155,14 +152,16 @@ def _change() -> dict[str, object]:
     }
 
 
-def _lidar_date() -> dict[str, object]:
+def _lidar_date(on_surface: bool) -> dict[str, object]:
     """Attributes of the layer lidar_date, which xarray reads as dates."""
+    point = "nearest vertex of the surface, by the GPS time of its highest point"
+    if not on_surface:
+        point = "highest point used, by its GPS time"
     return {
         "units": "days since 1970-01-01",
         "calendar": "proleptic_gregorian",
-        "long_name": "day on which the LiDAR measured what the label shows: that of the nearest "
-        "vertex of the surface, by the GPS time of its highest point, else the middle of the days "
-        "of its file by the list of tiles",
+        "long_name": f"day on which the LiDAR measured what the label shows: that of the {point}, "
+        "else the middle of the days of its file by the list of tiles",
         "nodata": 0,
         "_FillValue": 0,  # not known, or no label
     }

@@ -83,19 +83,18 @@ class WindowLabels:
 
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
-    1970-01-01, 0 for not known (None with the recipe paper); ``point_count``: points used;
-    ``correlation``: coefficient of both images; ``change``: why a pixel has changed
-    (:class:`.reason.Reason`).
+    1970-01-01, 0 for not known; ``point_count``: points used; ``correlation``: coefficient of both
+    images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
     """
 
     status: Bytes
     labels: Labels
     height: Floats
     surface_class: Bytes
+    day: NDArray[np.uint16]
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
-    day: NDArray[np.uint16] | None = None
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -107,10 +106,10 @@ class WindowLabels:
             labels=labels,
             height=self.height[part],
             surface_class=self.surface_class[part],
+            day=self.day[part],
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],
-            day=None if self.day is None else self.day[part],
         )
 
     def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:

@@ -34,11 +34,12 @@ def paper_labels(
     points: PixelPoints,
     window: PairWindow,
     px_per_m: float,
+    days: NDArray[np.uint16],
 ) -> WindowLabels:
     """Labels of a window from its points in both frames.
 
     ``window``: its patches are read for the settings' window. ``px_per_m``: disparity of a metre of
-    height.
+    height. ``days``: of the points, by their numbers.
     """
 
     def at_highest(sums: Ints, highest: Floats) -> Floats:
@@ -72,6 +73,7 @@ def paper_labels(
         labels=labels,
         height=pixels.highest,
         surface_class=pixels.surface_class,
+        day=days[pixels.day],
         point_count=pixels.count,
         correlation=pixels.correlation,
         change=np.zeros(status.shape, np.uint8),

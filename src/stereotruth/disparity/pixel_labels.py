@@ -42,9 +42,9 @@ class Pixels:
 
     ``count`` of the points used; ``x``, ``y`` (px, left grid) and ``disparity`` (px) of the point
     that stands for the pixel; ``highest`` (m); ``correlation`` mean of the points';
-    ``surface_class`` ASPRS class of the highest point; ``moments`` [h, w, 6]: sums over the points,
-    about their mean, of uu, uv, vv, uz, vz, zz, with (u, v) the position in the left grid and z the
-    disparity, px².
+    ``surface_class`` ASPRS class of the highest point, ``day`` number of its day among those of the
+    scene's points, 0 for not known; ``moments`` [h, w, 6]: sums over the points, about their mean,
+    of uu, uv, vv, uz, vz, zz, with (u, v) the position in the left grid and z the disparity, px².
     """
 
     count: NDArray[np.int64]
@@ -54,6 +54,7 @@ class Pixels:
     highest: Floats
     correlation: Floats
     surface_class: NDArray[np.uint8]
+    day: NDArray[np.uint8]
     moments: Floats
 
 
@@ -66,17 +67,18 @@ def _collect(
     correlation: NDArray[np.float32],
     sums: Ints,
     highest: Floats,
-    surface_class: NDArray[np.uint8],
+    attributes: NDArray[np.uint8],
     mean_correlation: Floats,
     moments: Floats,
 ) -> None:
     """Per pixel from its points in ``use``; sums of products are of steps about the pixel's
-    centre."""
+    centre. ``attributes`` [2, pixels]: class and day of the highest point, of several the greater
+    class, then the later day."""
     square = float(PX) * PX
     for p in range(start.size - 1):
         n = lon = lat = height = 0
         top = np.int32(-(1 << 31))
-        top_class = np.uint8(0)
+        top_class = top_day = np.uint8(0)
         least = np.int32((1 << 31) - 1)
         for k in range(start[p], start[p + 1]):
             if not use[k]:
@@ -87,11 +89,12 @@ def _collect(
             lat += point.lat
             height += point.height
             least = min(least, point.disparity)
-            if point.height > top or (point.height == top and point.surface_class > top_class):
-                top, top_class = point.height, point.surface_class
+            now = point.height, point.surface_class, point.day
+            if now > (top, top_class, top_day):
+                top, top_class, top_day = now
         sums[p, 0], sums[p, 3] = n, height
         sums[p, 1], sums[p, 2] = lon + n * origin[0], lat + n * origin[1]
-        surface_class[p] = top_class
+        attributes[0, p], attributes[1, p] = top_class, top_day
         highest[p] = top / PER_M if n else np.nan
         mean_correlation[p] = np.nan
         moments[p] = 0.0
@@ -141,7 +144,7 @@ def condense(
     size, shape = window.start.size - 1, window.shape
     sums = np.empty((size, 4), dtype=np.int64)
     highest, mean, moments = np.empty(size), np.empty(size), np.empty((size, 6))
-    surface_class = np.empty(size, dtype=np.uint8)
+    attributes = np.empty((2, size), dtype=np.uint8)
     _collect(
         window.points,
         window.start,
@@ -150,7 +153,7 @@ def condense(
         np.empty(0, dtype=np.float32) if correlation is None else correlation,
         sums,
         highest,
-        surface_class,
+        attributes,
         mean,
         moments,
     )
@@ -162,7 +165,8 @@ def condense(
         disparity=(xy[0] - xy[2]).reshape(shape),
         highest=highest.reshape(shape),
         correlation=mean.reshape(shape),
-        surface_class=surface_class.reshape(shape),
+        surface_class=attributes[0].reshape(shape),
+        day=attributes[1].reshape(shape),
         moments=moments.reshape(*shape, 6),
     )
 

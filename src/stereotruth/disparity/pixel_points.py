@@ -38,6 +38,7 @@ POINT = np.dtype(
         ("v", np.int16),
         ("parallax", np.int16),  # y_right - y_left, steps; half a pixel at most
         ("surface_class", np.uint8),
+        ("day", np.uint8),  # number among the days of the scene's points
     ],
     align=True,  # 24 bytes
 )
@@ -68,12 +69,14 @@ class PixelPoints:
 
 
 class _Block(NamedTuple):
-    """Points [n]: lattice coordinates, ASPRS class, ``xy`` [4, n] (px) in both images."""
+    """Points [n]: lattice coordinates, ASPRS class, number of the day, ``xy`` [4, n] (px) in both
+    images."""
 
     lon_q: Ints
     lat_q: Ints
     h_q: Ints
     surface_class: Bytes
+    day: Bytes
     xy: Floats
 
 
@@ -104,7 +107,7 @@ class _Pixels(NamedTuple):
 def _take(block: _Block, frames: _Frames, points: Records, pixel: Counts, pixels: _Pixels) -> int:
     """Fills ``points`` and ``pixel`` with those in both frames; returns how many these are."""
     lon_q, lat_q, h_q, xy = block.lon_q, block.lat_q, block.h_q, block.xy
-    surface_class = block.surface_class
+    surface_class, day = block.surface_class, block.day
     shape, first, origin = frames.shape, frames.first, frames.origin
     left, right = frames.left, frames.right
     left_origin, right_origin = frames.left_origin, frames.right_origin
@@ -147,6 +150,7 @@ def _take(block: _Block, frames: _Frames, points: Records, pixel: Counts, pixels
         point.v = v - (row << BITS)
         point.parallax = shift
         point.surface_class = surface_class[k]
+        point.day = day[k]
         pixel[n] = p
         count[p + 1] += 1
         n += 1
@@ -188,15 +192,16 @@ class Collection:
         )
 
     def add(
-        self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: NDArray[np.uint8], xy: Floats
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, surface_class: Bytes, day: Bytes, xy: Floats
     ) -> None:
-        """Points by lattice coordinates and class, and where they are seen: ``xy`` [4, n], px."""
+        """Points by lattice coordinates, class and number of the day, and where they are seen:
+        ``xy`` [4, n], px."""
         if not self.parts or self.taken + lon_q.size > self.parts[-1][1].size:
             self._close()
             size = max(_PART, lon_q.size)
             self.parts.append((np.empty(size, dtype=POINT), np.empty(size, dtype=np.int32)))
         points, pixel = (array[self.taken :] for array in self.parts[-1])
-        block = _Block(lon_q, lat_q, h_q, surface_class, xy)
+        block = _Block(lon_q, lat_q, h_q, surface_class, day, xy)
         self.taken += _take(block, self.frames, points, pixel, self.pixels)
 
     def _close(self) -> None:

@@ -113,4 +113,4 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
     """The labels of a window by each pixel's own points."""
     model, px_per_m = scene.pair.model, scene.rays.px_per_m
-    return paper_labels(scene.settings, model, points.by_pixel, window, px_per_m)
+    return paper_labels(scene.settings, model, points.by_pixel, window, px_per_m, scene.days)

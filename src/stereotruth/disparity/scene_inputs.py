@@ -8,6 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
@@ -27,6 +30,8 @@ from .rays import Rays
 from .right_view import Pair, seen_from
 from .settings import Settings
 from .status import Status
+
+DAYS = 256  # of the points of a scene that have a number: 8 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +133,22 @@ class SceneInputs:
     def stores(self) -> tuple[PointStore, ...]:
         """The points."""
         return open_stores(self.point_stores)
+
+    @cached_property
+    def days(self) -> NDArray[np.uint16]:
+        """Days of the points since 1970-01-01, in their order behind a 0 for not known.
+
+        The first 255 of them: points of further days count as of none.
+        """
+        every = np.concatenate([[0], *(store.days for store in self.stores)])
+        return np.unique(every)[:DAYS].astype(np.uint16)
+
+    @cached_property
+    def day_numbers(self) -> NDArray[np.uint8]:
+        """Index of each day [65536] in :attr:`days`."""
+        numbers = np.zeros(1 << 16, np.uint8)
+        numbers[self.days] = np.arange(self.days.size)
+        return numbers
 
     @cached_property
     def scale(self) -> PixelScale:

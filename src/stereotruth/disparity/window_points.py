@@ -97,8 +97,8 @@ def _points(
             for start in range(0, len(points), BLOCK):
                 block = slice(start, start + BLOCK)
                 lattice = points.lon_q[block], points.lat_q[block], points.h_q[block]
-                classes = points.classification[block]
-                collection.add(*lattice, classes, projection.at_points(*lattice))
+                attributes = points.classification[block], scene.day_numbers[points.day[block]]
+                collection.add(*lattice, *attributes, projection.at_points(*lattice))
     by_pixel = collection.sorted()
     if by_pixel.points.size == 0 and not by_pixel.outside.any():
         return None

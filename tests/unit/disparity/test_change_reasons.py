@@ -58,9 +58,9 @@ def lidar(
     labels = Labels(disparity, level, zeros)
     count = np.ones(SHAPE, np.int64)
     nothing = np.zeros(SHAPE, np.uint8)
-    found = WindowLabels(status, labels, height, classes, count, zeros, nothing)
+    found = WindowLabels(status, labels, height, classes, zeros, count, zeros, nothing)
     moments = np.zeros((*SHAPE, 6))
-    return found, Pixels(count, zeros, zeros, disparity, height, zeros, classes, moments)
+    return found, Pixels(count, zeros, zeros, disparity, height, zeros, classes, nothing, moments)
 
 
 def reasons(

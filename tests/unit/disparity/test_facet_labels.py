@@ -29,11 +29,11 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
         bulging=np.arange(8) + zeros == 5,
         projected=None,
     )
-    points = np.full(shape, np.nan)
+    points, nothing = np.full(shape, np.nan), np.zeros(shape, np.uint8)
     points[2, 2:6] = 10.2, 4.0, 16.0, 10.2  # on the surface, behind, before it; where it bulges
     own = OwnLabels(
         Labels(points, np.zeros((2, *shape)), zeros),
-        Pixels(zeros, points, points, points, points, points, zeros.astype(np.uint8), zeros),
+        Pixels(zeros, points, points, points, points, points, nothing, nothing, zeros),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.int32),
     )

@@ -20,7 +20,7 @@ from ...synthetic.box_scene import Scene, project_with, surfaces_of, write_point
 from ...synthetic.cameras import LON
 from ...synthetic.stores import tree_digest
 
-WEST, EAST = 17_000, 18_400  # days
+WEST, EAST, UNDER = 17_000, 18_400, 18_500  # days
 NEAR_M = 1.5  # of the border of both surveys: two spacings of points and a pixel
 
 
@@ -110,7 +110,15 @@ def test_xarray_reads_dates(box, tmp_path):
     assert found == {day_of(WEST), "NaT"}
 
 
-def test_the_recipe_paper_has_no_dates(box, tmp_path):
+@pytest.mark.parametrize("view", ["left", "right"])
+def test_labels_of_the_recipe_paper_have_the_day_of_their_highest_point(box, tmp_path, view):
+    """A third survey has each point once more, 1 cm lower: it is the highest where the other one
+    lies in the next pixel."""
     stores = surveys(box, tmp_path, {"day": WEST}, {"day": EAST})
-    project_with(*box.images, stores, tmp_path / "out.zarr", recipe="paper")
-    assert "lidar_date" not in require_complete(tmp_path / "out.zarr")
+    stores.append(write_points(tmp_path, box.points - [0.0, 0.0, 0.01], "lower", day=UNDER))
+    project_with(*box.images, stores, tmp_path / "out.zarr", view=view, recipe="paper")
+    days, metres = dates(tmp_path / "out.zarr", view)
+    assert (days == UNDER).mean() < 0.02
+    of_two = days != UNDER
+    days, metres = days[of_two], metres[of_two]
+    assert (days[metres < -NEAR_M] == WEST).all() and (days[metres > NEAR_M] == EAST).all()

@@ -21,8 +21,9 @@ def collected(lattice: np.ndarray, xy: np.ndarray, order: np.ndarray) -> PixelPo
     shape = ROWS.stop - ROWS.start, COLS.stop - COLS.start
     collection = Collection(shape, (ROWS.start, COLS.start), ORIGIN, left, right)
     for part in np.array_split(order, 7):
-        surface_class = (lattice[0, part] % 7).astype(np.uint8)
-        collection.add(*np.ascontiguousarray(lattice[:, part]), surface_class, xy[:, part].copy())
+        surface_class, day = ((lattice[0, part] % n).astype(np.uint8) for n in (7, 251))
+        points = np.ascontiguousarray(lattice[:, part])
+        collection.add(*points, surface_class, day, xy[:, part].copy())
     return collection.sorted()
 
 
@@ -65,5 +66,6 @@ def test_each_pixel_has_its_points() -> None:
         assert (
             np.abs(found[:, here][:, order] - xy[:, members[by_lon]]).max(initial=0.0) <= 1.01 / PX
         )
-        classes = window.points["surface_class"][here][order]
-        assert np.array_equal(classes, lattice[0, members[by_lon]] % 7)
+        for name, n in (("surface_class", 7), ("day", 251)):
+            found_here = window.points[name][here][order]
+            assert np.array_equal(found_here, lattice[0, members[by_lon]] % n)
