@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 Row = tuple[Mapping[str, Any], tuple[Floats, ...]]  # of a tile index: columns, outline
 
 MOST_TILES = 1_000_000
+FARTHEST = 1e9  # coordinate, in metres or feet
 SIDE_PARTS = 8  # of a side in a projection, which is no straight line in degrees
 
 
@@ -53,6 +54,8 @@ def in_degrees(rings: list[Floats], crs: CRS | None) -> tuple[Floats, ...]:
     are bent by a projection.
     """
     if not rings or any(ring.ndim != 2 or ring.shape[1] < 3 for ring in rings):
+        return ()
+    if not all((np.abs(ring) < FARTHEST).all() for ring in rings):  # nor NaN
         return ()
     change: Callable[..., Any] | None = None
     if crs is not None:

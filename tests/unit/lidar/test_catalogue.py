@@ -248,6 +248,14 @@ DAMAGED = {
 }
 
 
+@pytest.mark.parametrize("far", [float("inf"), float("nan"), 1e308])
+@pytest.mark.filterwarnings("error")
+def test_own_coordinates_without_end_leave_those_in_degrees(tmp_path, far):
+    one = item(0, **{"proj:code": "EPSG:2154", "proj:bbox": [-far, -far, far, far]})
+    (tile,) = read_catalogue(written(tmp_path, collection([one]))).tiles
+    assert tile.box == (WEST, SOUTH, WEST + SIDE, SOUTH + SIDE)
+
+
 @pytest.mark.parametrize("fault", DAMAGED)
 def test_a_damaged_catalogue_is_refused(tmp_path, fault):
     file = tmp_path / "tiles.json"
