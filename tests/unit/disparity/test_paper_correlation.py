@@ -21,7 +21,7 @@ def value_of(left, right, xy, window, rows=ROWS, cols=COLS, order=None) -> np.nd
     collection = Collection(shape, (rows.start, cols.start), (0, 0), *patches)
     number = np.arange(xy.shape[1]) if order is None else order
     classes = np.zeros(number.size, np.uint8)
-    collection.add(number, number, number, classes, np.ascontiguousarray(xy[:, number]))
+    collection.add(number, number, number, classes, classes, np.ascontiguousarray(xy[:, number]))
     points = collection.sorted()
     value = np.full(xy.shape[1], np.nan, dtype=np.float32)
     everyone = np.ones(points.points.size, dtype=bool)
