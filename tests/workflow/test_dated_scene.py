@@ -19,7 +19,11 @@ from stereotruth.simulate.surfaces import WATER
 
 from ..synthetic.project import SIZE, TINY, row_of
 
-CITY = replace(TINY, dates=Dates(1000.0, 1001.0, 0.0, built=0.3, demolished=0.3, felled=0.3))
+CITY = replace(
+    TINY,
+    scenes=(replace(TINY.scenes[0], rows=400, cols=400),),
+    dates=Dates(1000.0, 1001.0, 0.0, built=0.3, demolished=0.3, felled=0.3),
+)
 GRID = "results/project/Tiny/Tiny-1.zarr"
 CHANGED_M, SAME_M = 1.0, 0.01
 

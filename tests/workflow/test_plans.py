@@ -8,6 +8,9 @@ import time
 import pytest
 import yaml
 
+from stereotruth.errors import InputError
+from stereotruth.project import configured, lidar_of, read_scenes
+
 
 def test_a_city_is_planned_from_nothing(project):
     jobs = project.plan("tiles/Qichun")
@@ -103,16 +106,27 @@ def test_a_report_plans_no_city_that_nobody_asked_for(project):
     assert project.plan("report", "--configfile", mine)["report_city"] == 1
 
 
-@pytest.mark.parametrize("column", ["left_image", "right_image", "lidar", "geoid", "gcps"])
-def test_a_missing_file_is_named(project, column):
+def test_a_missing_file_is_named(project, monkeypatch):
+    """By what a plan asks of each scene, and by a plan."""
     row = {"scene": "Mine-1", "city": "Mine"}
-    for name in ("left_image", "right_image", "lidar", "geoid", "gcps"):
+    columns = ("left_image", "right_image", "lidar", "geoid", "gcps")
+    for name in columns:
         (project.folder / f"{name}.laz").touch()
         row[name] = f"{name}.laz"
-    (project.folder / f"{column}.laz").unlink()
-    run = project.refuse("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
-    for word in ("Mine-1", f"{column}.laz", "mine_scenes.tsv", "Remedy"):
-        assert word in run.text
+    mine = project.add_scene("mine", [row])
+    monkeypatch.chdir(project.folder)
+    for column in columns:
+        file = project.folder / f"{column}.laz"
+        file.unlink()
+        with pytest.raises(InputError) as refused:
+            settings, _ = configured([mine])
+            lidar_of(read_scenes(settings)[1]["Mine-1"], settings)
+        for word in ("Mine-1", file.name, "mine_scenes.tsv", "Remedy"):
+            assert word in str(refused.value)
+        file.touch()
+    file.unlink()
+    run = project.refuse("tiles/Mine", "--configfile", mine)
+    assert str(refused.value) in run.text
 
 
 def test_a_scene_without_gcps_is_refused_unless_it_is_refined(project):

@@ -21,7 +21,7 @@ LOW = np.array([500_000.0, 3_300_000.0, 30.0])
 SYSTEM = pyproj.CRS("EPSG:32650").to_3d()
 
 
-def las_of(form: int, points: int = 40_000, relief: float = 60.0, seed: int = 0) -> laspy.LasData:
+def las_of(form: int, points: int = 12_000, relief: float = 60.0, seed: int = 0) -> laspy.LasData:
     """Strewn points of a surface, some far above it, of a point format."""
     rng = np.random.default_rng(seed)
     header = laspy.LasHeader(point_format=form, version="1.4")
