@@ -15,7 +15,8 @@ one surface only:
   failures among agreeing pixels, by noise or in shadow, do not;
 - :meth:`Agreement.unusual`: whether pixels together correlate less than is usual around them;
 - :mod:`.shifted_agreement`: whether the images agree better at another disparity. Of images that
-  share no light that alone counts. Crowns are compared over fewer pixels, too;
+  share no light that alone counts, with predicted shadows left apart. Crowns are compared over
+  fewer pixels, too;
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
 - :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote;
@@ -43,6 +44,7 @@ from .pixel_labels import Labels
 from .seen_surface import box_max
 from .shifted_agreement import (
     INDEPENDENT_PX2,
+    LEAST,
     SHIFTS_PX,
     SIGNAL,
     ShiftedAgreement,
@@ -73,6 +75,8 @@ CONFIRMED = 0.3  # of what the same crown would agree by, as noise leaves it
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
 BESIDE_SHARE = 0.15  # of the pixels up to APART_PX around have changed: a pixel is in their rim,
 RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by less
+# Where shadows are predicted: in place of LEAST and RIM_AGREEMENT
+LEAST_LIT, RIM_AGREEMENT_LIT = 0.5, 0.5
 # Crowns that have been felled: both images see the ground below, over a few pixels
 CROWN_REACH_PX = 2
 CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
@@ -82,6 +86,12 @@ CROWN_AGREEMENT = 0.6  # of the images there, at least
 # bench/changes.py, of whose buildings and trees a tenth to a quarter has changed.
 UNSEEN = (0.0, 0.1, 0.5, 0.7, 0.9, 1.0), (0.08, 0.02, 0.02, 0.0055, 0.0015, 0.0007)
 UNSEEN_BY_NONE = 0.1
+# Where shadows are predicted
+UNSEEN_LIT = (
+    (0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    (0.9, 0.2, 0.1, 0.065, 0.035, 0.016, 0.0035, 0.0007),
+)
+UNSEEN_LIT_BY_NONE = 0.05
 DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
@@ -252,7 +262,7 @@ def contradicted(
     beside = labelled & beside_young_crowns(surface_class)
     if comparison.diachronic:
         changed, compared = _contradicted_apart(labels, window, comparison, labelled)
-        unseen = variance_of_unseen_change(compared)
+        unseen = variance_of_unseen_change(compared, window.shaded is not None)
         by_detail = crowns | beside
     else:
         changed, rim = _contradicted_together(labels, window, comparison, labelled, agreement)
@@ -292,17 +302,18 @@ def _compared_closely(
     return changed & ~is_held | beside & ~(together > DOUBT)
 
 
-def variance_of_unseen_change(agreement: ShiftedAgreement) -> Floats:
+def variance_of_unseen_change(agreement: ShiftedAgreement, by_light: bool) -> Floats:
     """Variance (px², [h, w]) of labels of images that share no light, since what these show may
     have changed though they do not contradict it.
 
     Its probability follows from their ``agreement``, as a share of what noise leaves the same
-    ground. A label of what has changed counts as off by SURFACE_PX, the least that is another
-    surface (eq. 17 of docs/explanation/surface.md).
+    ground, with what lies in shadow left apart (``by_light``) or not. A label of what has changed
+    counts as off by SURFACE_PX, the least that is another surface (eq. 17 of
+    docs/explanation/surface.md).
     """
     share = agreement.here / np.maximum(agreement.signal, SIGNAL)
-    probability = np.interp(share, *UNSEEN)
-    return np.where(np.isnan(share), UNSEEN_BY_NONE, probability) * SURFACE_PX**2
+    table, none = (UNSEEN_LIT, UNSEEN_LIT_BY_NONE) if by_light else (UNSEEN, UNSEEN_BY_NONE)
+    return np.where(np.isnan(share), none, np.interp(share, *table)) * SURFACE_PX**2
 
 
 def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
@@ -343,7 +354,7 @@ def _contradicted_together(
     shifted = shifted_agreement(
         labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, doubtful
     )
-    changed |= shifted.contradicts
+    changed |= shifted.contradicts()
     has_signal = shifted.signal > SIGNAL
     changed |= has_signal & agreement.unusual()
     rim = agreement.beside(changed)
@@ -368,20 +379,25 @@ def _contradicted_apart(
 ) -> tuple[Bools, ShiftedAgreement]:
     """:func:`contradicted` of images that share no light, and how they agree: at once by the
     surface up to APART_PX around a pixel; beside such pixels, where that mixes what has changed
-    with what has not, by the surface up to TOGETHER_PX."""
+    with what has not, by the surface up to TOGETHER_PX.
+
+    Where the shadows of both images are known, their edges lower no agreement, and more is asked.
+    """
+    limits = (LEAST, RIM_AGREEMENT) if window.shaded is None else (LEAST_LIT, RIM_AGREEMENT_LIT)
+    least, rim_agreement = limits
 
     def compared(reach: int, wanted: Bools) -> ShiftedAgreement:
         return shifted_agreement(
-            labels, window, comparison.noise, comparison.window_px, reach, wanted
+            labels, window, comparison.noise, comparison.window_px, reach, wanted, by_light=True
         )
 
     widely = compared(APART_PX, labelled)
-    changed = widely.contradicts
+    changed = widely.contradicts(least)
     side = 2 * APART_PX + 1
     beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
     rim = labelled & beside & ~changed
     closer = compared(TOGETHER_PX, rim)
-    return changed | (closer.signal > SIGNAL) & (closer.here < RIM_AGREEMENT), widely
+    return changed | (closer.signal > SIGNAL) & (closer.here < rim_agreement), widely
 
 
 def without_changes(

@@ -78,9 +78,10 @@ class _Blocks:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
         touched = self.scene.windows.touched(rows, self.scene.pair.cols(cols))
         points = sorted(_identity(store.attrs) for store in touched)
-        surface = [
-            block.sha256 for block in self.scene.surface_blocks(rows, self.scene.pair.cols(cols))
-        ]
+        here = self.scene.pair.cols(cols)
+        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
+        for view in self.scene.sun_views or ():
+            surface += [block.sha256 for block in self.scene.casters(view, rows, here)]
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
@@ -171,7 +172,7 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
     if inputs.alignment is not None:
         made_of |= checksums([inputs.alignment])
-    parameters = {"view": inputs.view} | asdict(inputs.settings)
+    parameters = _parameters(inputs)
     return {
         "kind": "disparity",
         "scene": scene,
@@ -189,10 +190,16 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     }
 
 
+def _parameters(inputs: SceneInputs) -> dict[str, Any]:
+    """Of a scene's labels: its view, the settings, and the suns whose shadows are predicted."""
+    suns = {} if inputs.predicted_suns is None else {"suns": inputs.predicted_suns}
+    return {"view": inputs.view} | asdict(inputs.settings) | suns
+
+
 def _content(inputs: SceneInputs, code: str) -> str:
     """Digest of all that the labels follow from but the points."""
     left, right = (require_complete(p).attrs for p in (inputs.left_store, inputs.right_store))
-    parameters = {"view": inputs.view} | asdict(inputs.settings)
+    parameters = _parameters(inputs)
     if inputs.settings.on_surface:
         parameters["scale"] = asdict(inputs.scale)
     return digest(

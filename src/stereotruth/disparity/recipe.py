@@ -11,12 +11,14 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
    and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
    has the label of its nearest facet if nothing may hide it in either view; if its own points are
    the surer ones, theirs (:mod:`.facet_labels`).
-4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
+4. *Shadows.* What the surface puts in shadow in each of two images of different suns
+   (:mod:`.shadows`).
+5. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
    (:mod:`.image_agreement`). Rough surfaces, of which no triangle is a facet, get labels of their
    own, which the images confirm (:mod:`.crowns`).
-5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
+6. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
    (:mod:`.change_reasons`).
-6. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
+7. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
 
 The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_recipe`).
 """
@@ -39,6 +41,7 @@ from .paper_recipe import paper_labels
 from .pixel_labels import own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
+from .shadows import shaded
 from .status import Status
 from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
@@ -98,6 +101,9 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     see_through = scale.spacing_px > MAX_COVER_PX / 2.0
     labels = facet_labels(visible, own, window, see_through)
 
+    # shadows of both images
+    window = replace(window, shaded=shadows_of(scene, window, projected))
+
     # agreement of the images
     rough = crowns(visible, scale)
     labels = without_contours(labels, rough, visible, scale)
@@ -108,6 +114,26 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
 
     # reasons of changes
     return with_reasons(labels, ~is_facet, own.pixels, window, comparison, scale.px_per_m)
+
+
+def shadows_of(
+    scene: SceneInputs, window: PairWindow, projected: ProjectedSurface
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """What of both images of a window lies in shadow by the suns of the ``scene``, see
+    :attr:`.SceneInputs.predicted_suns`."""
+    if scene.sun_views is None:
+        return None
+    rows, cols = (
+        slice(grid.start + window.margin, grid.stop - window.margin)
+        for grid in (window.rows, window.cols)
+    )
+    left, right = (
+        shaded(projected, patch, is_right, view, scene.ground, scene.casters(view, rows, cols))
+        for patch, is_right, view in zip(
+            (window.left, window.right), (False, True), scene.sun_views
+        )
+    )
+    return left, right
 
 
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:

@@ -67,14 +67,13 @@ class ShiftedAgreement:
         limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
         return z_elsewhere - z_here > limit
 
-    @property
-    def contradicts(self) -> Bools:
+    def contradicts(self, least: float = LEAST) -> Bools:
         """Where the images contradict the labels [h, w].
 
         That is, where they agree significantly better elsewhere; or, with more signal than noise,
-        where the agreement and its advantage over that elsewhere sum up to less than LEAST.
+        where the agreement and its advantage over that elsewhere sum up to less than ``least``.
         """
-        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < LEAST)
+        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < least)
         return is_none | self.is_shifted
 
 
@@ -87,12 +86,14 @@ def shifted_agreement(
     wanted: Bools,
     shifts: tuple[float, ...] = SHIFTS_PX,
     apart: bool = True,
+    by_light: bool = False,
 ) -> ShiftedAgreement:
     """At the ``wanted`` pixels [h, w] of a window, over its ``labels``' surfaces.
 
     ``noise``: variances of both images, DN²; ``window_px``: side of the correlation's window;
     ``reach``: px up to which the surface is averaged; ``shifts`` of the disparity, px; ``apart``:
-    whether pixels beside a step count for nothing.
+    whether pixels beside a step count for nothing; ``by_light``: whether what lies in shadow is
+    left apart, if that is known.
     """
     shape = wanted.shape
     out = np.full((4, *shape), np.nan, np.float32)
@@ -104,7 +105,7 @@ def shifted_agreement(
             if row.size == 0:
                 continue
             if images is None:
-                images = window.details(noise)
+                images = window.details(noise, by_light)
             rows = slice(top + row.min(), top + row.max() + 1)
             cols = slice(side + col.min(), side + col.max() + 1)
             first = max(rows.start - pad, 0), max(cols.start - pad, 0)

@@ -192,11 +192,14 @@ def rectify_image(
     }
 
 
-def _acquired(source: Source, sensor: SensorModel) -> str | None:
-    """The day (ISO, UTC) on which an image was taken, by its delivery; None: not told."""
+def _acquired(source: Source, sensor: SensorModel) -> dict[str, Any]:
+    """The day (ISO, UTC) on which an image was taken, and the ``sun`` (azimuth, elevation in
+    degrees), by its delivery; None: not told."""
     place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
-    time = read_acquisition(source.path, place).time
-    return None if time is None else time.date().isoformat()
+    delivery = read_acquisition(source.path, place)
+    day = None if delivery.time is None else delivery.time.date().isoformat()
+    sun = None if delivery.sun is None else [round(angle, 4) for angle in delivery.sun]
+    return {"acquired": day, "sun": sun}
 
 
 def rectify(
@@ -251,9 +254,8 @@ def rectify(
             attrs = {
                 "view": view,
                 "epipolar": model.to_dict(),
-                "acquired": _acquired(source, getattr(model, view)),
                 "provenance": dict(provenance or {}),
-            }
+            } | _acquired(source, getattr(model, view))
             source.check_blocks(workers)
             grid = stack.enter_context(
                 resumable_grid(

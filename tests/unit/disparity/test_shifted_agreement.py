@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,9 +69,9 @@ def test_what_has_grown_agrees_at_another_disparity(by: int, reach: int) -> None
     inner, outside = np.zeros(SHAPE, np.bool_), np.ones(SHAPE, np.bool_)
     inner[47:73, 58:92] = True
     outside[32:88, 35:115] = False
-    assert found.contradicts[inner].all()
+    assert found.contradicts()[inner].all()
     assert (found.shift[inner] == by).mean() > 0.99
-    assert not found.contradicts[outside].any()
+    assert not found.contradicts()[outside].any()
 
 
 @pytest.mark.parametrize("diachronic", [False, True])
@@ -78,6 +80,30 @@ def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
     comparison = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0), diachronic)
     changed = contradicted(LEVEL, shadowed(), comparison, ALL, GROUND).changed
     assert changed.any() != diachronic
+
+
+def test_known_shadows_lower_no_agreement() -> None:
+    """Narrow ones alone are edges everywhere."""
+    left = texture()
+    dark = np.arange(260) // 9 % 2 == 1
+    right = np.round(np.where(dark, 0.2, 1.0) * right_of(left, np.full((160, 260), 4)))
+    window = pair(left, right)
+    shaded = (
+        np.zeros(window.left.pixels.shape, np.bool_),
+        np.zeros(window.right.pixels.shape, np.bool_),
+    )
+    first = window.right.col
+    columns = np.arange(first, first + shaded[1].shape[1])
+    shaded[1][:] = columns // 9 % 2 == 1
+    known = replace(window, shaded=shaded)
+
+    def here(of: PairWindow, by_light: bool) -> np.ndarray:
+        agreement = shifted_agreement(LEVEL, of, (0.0, 0.0), 9, 8, ALL, by_light=by_light)
+        return agreement.here[20:-20, 20:-20]
+
+    assert here(window, True).max() < here(known, True).min()
+    assert here(known, True).min() > 0.8
+    assert np.array_equal(here(known, False), here(window, True))
 
 
 def test_a_change_is_found_under_another_sun() -> None:
@@ -92,7 +118,7 @@ def test_noise_is_no_evidence() -> None:
     """Two images that show nothing but noise contradict no label."""
     rng = np.random.default_rng(3)
     images = (np.round(rng.normal(900.0, 20.0, (160, 260))) for _ in range(2))
-    assert at(pair(*images), 400.0).contradicts.mean() < 0.01
+    assert at(pair(*images), 400.0).contradicts().mean() < 0.01
 
 
 def test_only_what_is_wanted_is_compared() -> None:

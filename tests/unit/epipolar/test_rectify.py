@@ -116,12 +116,15 @@ def test_nodata_spreads_to_whatever_it_touches(tmp_path: Path) -> None:
     assert (left[around & ~near] == 500).all()
 
 
-def test_the_day_of_an_image_is_that_of_its_delivery(tmp_path: Path) -> None:
+def test_day_and_sun_of_an_image_are_those_of_its_delivery(tmp_path: Path) -> None:
     (tmp_path / "source").mkdir()
-    (tmp_path / "source/left.IMD").write_text("firstLineTime = 2020-10-25T23:12:45.000000Z;\n")
+    (tmp_path / "source/left.IMD").write_text(
+        "firstLineTime = 2020-10-25T23:12:45.000000Z;\nmeanSunAz = 151.2;\nmeanSunEl = 44.1;\n"
+    )
     run(tmp_path, constant(), constant())
-    days = [require_complete(tmp_path / f"{v}.zarr").attrs["acquired"] for v in ("left", "right")]
-    assert days == ["2020-10-25", None]
+    left, right = (require_complete(tmp_path / f"{v}.zarr").attrs for v in ("left", "right"))
+    assert (left["acquired"], left["sun"]) == ("2020-10-25", [151.2, 44.1])
+    assert (right["acquired"], right["sun"]) == (None, None)
 
 
 def test_nodata_tag_and_the_lowest_value(tmp_path: Path) -> None:
