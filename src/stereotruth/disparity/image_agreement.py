@@ -84,13 +84,10 @@ CROWN_AGREEMENT = 0.6  # of the images there, at least
 # Of labels that images of two lights leave, the share that has changed, by their agreement as a
 # share of what noise leaves the same ground; and without any. Cities of seeds 1 and 2 of
 # bench/changes.py, of whose buildings and trees a tenth to a quarter has changed.
-UNSEEN = (0.0, 0.1, 0.5, 0.7, 0.9, 1.0), (0.08, 0.02, 0.02, 0.0055, 0.0015, 0.0007)
-UNSEEN_BY_NONE = 0.1
-# Where shadows are predicted
-UNSEEN_LIT = (
-    (0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
-    (0.9, 0.2, 0.1, 0.065, 0.035, 0.016, 0.0035, 0.0007),
-)
+UNSEEN_AT = 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0
+UNSEEN = 0.9, 0.1, 0.06, 0.04, 0.023, 0.01, 0.005, 0.0018, 0.0006
+UNSEEN_BY_NONE = 0.035
+UNSEEN_LIT = 0.9, 0.55, 0.2, 0.1, 0.065, 0.035, 0.016, 0.0035, 0.0007  # with predicted shadows
 UNSEEN_LIT_BY_NONE = 0.05
 DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
@@ -313,7 +310,7 @@ def variance_of_unseen_change(agreement: ShiftedAgreement, by_light: bool) -> Fl
     """
     share = agreement.here / np.maximum(agreement.signal, SIGNAL)
     table, none = (UNSEEN_LIT, UNSEEN_LIT_BY_NONE) if by_light else (UNSEEN, UNSEEN_BY_NONE)
-    return np.where(np.isnan(share), none, np.interp(share, *table)) * SURFACE_PX**2
+    return np.where(np.isnan(share), none, np.interp(share, UNSEEN_AT, table)) * SURFACE_PX**2
 
 
 def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
