@@ -94,19 +94,20 @@ class PixelValues(NamedTuple):
 
 
 @inner
-def _triple(values: Floats, t: Steps | tuple) -> tuple[float, float, float]:
+def triple(values: Floats, t: Steps | tuple) -> tuple[float, float, float]:
+    """Of a triangle's three corners ``t``."""
     return values[t[0]], values[t[1]], values[t[2]]
 
 
 @inner
-def _misses(low: float, high: float, first: int, count: int) -> bool:
+def misses(low: float, high: float, first: int, count: int) -> bool:
     """Whether no centre of the ``count`` rows or columns from the ``first`` one on lies in a range,
     as in those of most triangles."""
     return max(np.ceil(low), first) > min(np.floor(high), first + count - 1)
 
 
 @inner
-def _raster_left(
+def raster_triangle(
     x: tuple,
     y: tuple,
     d: tuple,
@@ -158,12 +159,12 @@ def raster_facets(
     """
     rows = z_buffer.shape[0]
     for t in range(len(corner)):
-        y = _triple(xy[1], corner[t])
-        if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
+        y = triple(xy[1], corner[t])
+        if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
+        x, xr = triple(xy[0], corner[t]), triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-        _raster_left(x, y, d, first, t, z_buffer, index)
+        raster_triangle(x, y, d, first, t, z_buffer, index)
 
 
 @inner
@@ -202,10 +203,10 @@ def hide_by_facets(xy: Floats, corner: Steps, pixels: RightPixels, hidden: Bools
     docs/explanation/surface.md)."""
     rows = (pixels.start.size - 1) // pixels.width
     for t in range(len(corner)):
-        y = _triple(xy[3], corner[t])
-        if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), pixels.first[0], rows):
+        y = triple(xy[3], corner[t])
+        if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), pixels.first[0], rows):
             continue
-        x, xr = _triple(xy[0], corner[t]), _triple(xy[2], corner[t])
+        x, xr = triple(xy[0], corner[t]), triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         _hide_right(xr, y, d, pixels, hidden)
 
@@ -243,7 +244,7 @@ def _faces_seen(x: Floats, y: Floats, d: Floats, faces: Steps) -> int:
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         side = i, j, 3 + i
-        gx, gy = plane_slopes(_triple(x, side), _triple(y, side), _triple(d, side))
+        gx, gy = plane_slopes(triple(x, side), triple(y, side), triple(d, side))
         if d[i] + gx * (x[k] - x[i]) + gy * (y[k] - y[i]) > d[k]:
             faces[n] = side
             faces[n + 1] = j, 3 + i, 3 + j
@@ -261,18 +262,18 @@ def raster_prisms(prisms: Prisms, first: tuple[int, int], z_buffer: Floats) -> N
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 1, y)
         low, high = _range(y)
-        if _misses(low, high, first[0], rows):
+        if misses(low, high, first[0], rows):
             continue
         _at_heights(prisms, t, 0, x)
         low, high = _range(x)
-        if _misses(low, high, first[1], cols):
+        if misses(low, high, first[1], cols):
             continue
         _at_heights(prisms, t, 2, xr)
         for k in range(6):
             d[k] = x[k] - xr[k]
         for face in faces[: _faces_seen(x, y, d, faces)]:
-            corners = _triple(x, face), _triple(y, face), _triple(d, face)
-            _raster_left(*corners, first, t, z_buffer, any_prism)
+            corners = triple(x, face), triple(y, face), triple(d, face)
+            raster_triangle(*corners, first, t, z_buffer, any_prism)
 
 
 @kernel
@@ -286,7 +287,7 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
     for t in range(len(prisms.corner)):
         _at_heights(prisms, t, 3, y)
         low, high = _range(y)
-        if _misses(low, high, first[0], rows):
+        if misses(low, high, first[0], rows):
             continue
         _at_heights(prisms, t, 2, xr)
         low, high = _range(xr)
@@ -296,7 +297,7 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         for k in range(6):
             d[k] = x[k] - xr[k]
         for face in faces[: _faces_seen(xr, y, d, faces)]:
-            _hide_right(_triple(xr, face), _triple(y, face), _triple(d, face), pixels, hidden)
+            _hide_right(triple(xr, face), triple(y, face), triple(d, face), pixels, hidden)
 
 
 @kernel
@@ -316,7 +317,7 @@ def interpolate(
             if t < 0:
                 continue
             v = corner[t]
-            x, y, xr = _triple(xy[0], v), _triple(xy[1], v), _triple(xy[2], v)
+            x, y, xr = triple(xy[0], v), triple(xy[1], v), triple(xy[2], v)
             slope[0, j, i], slope[1, j, i] = plane_slopes(
                 x, y, (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
             )

@@ -127,13 +127,8 @@ def shadows_of(
         slice(grid.start + window.margin, grid.stop - window.margin)
         for grid in (window.rows, window.cols)
     )
-    left, right = (
-        shaded(projected, patch, is_right, view, scene.ground, scene.casters(view, rows, cols))
-        for patch, is_right, view in zip(
-            (window.left, window.right), (False, True), scene.sun_views
-        )
-    )
-    return left, right
+    casters = [scene.casters(view, rows, cols) for view in scene.sun_views]
+    return shaded(projected, (window.left, window.right), scene.sun_views, scene.ground, casters)
 
 
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:

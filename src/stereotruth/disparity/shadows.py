@@ -26,8 +26,7 @@ from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..numerics.degrees import exact_metres_per_degree
 from ..numerics.triangles import plane_slopes
 from ..surface.surface_store import Block, SurfaceStore
-from ..surface.vertices import Vertices
-from .facet_raster import raster_facets
+from .facet_raster import misses, raster_facets, raster_triangle, triple
 from .image_patches import Patch
 from .view_geometry import ViewGeometry
 from .visibility import ProjectedSurface
@@ -37,7 +36,22 @@ Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
+CELLS = 2  # of the ground along the side of a cell of a sun's view: a pixel
 ABOVE_M = 0.5  # what is higher than a pixel by less is the surface itself
+
+
+@kernel
+def _positions(
+    lon_q: Ints,
+    lat_q: Ints,
+    h_q: Ints,
+    cell: tuple[int, int],
+    shift: tuple[float, float],
+    out: Floats,
+) -> None:
+    for k in range(lon_q.size):
+        out[0, k] = lon_q[k] / cell[0] - shift[0] * h_q[k]
+        out[1, k] = lat_q[k] / cell[1] - shift[1] * h_q[k]
 
 
 @dataclass(frozen=True)
@@ -54,44 +68,48 @@ class SunView:
 
     @classmethod
     def of(cls, sun: tuple[float, float], model: ViewGeometry, cell: tuple[int, int]) -> SunView:
-        """Of a ``sun`` (azimuth, elevation, degrees) over the middle of an epipolar grid."""
+        """Of a ``sun`` (azimuth, elevation, degrees) over the middle of an epipolar grid; ``cell``
+        of the ground: (lon, lat), lattice steps."""
         rows, cols = model.shape
         height = float(model.reference_height)
         middle = np.array([cols / 2.0]), np.array([rows / 2.0]), np.array([height])
         _, lat = model.epipolar_to_ground(*middle)
         east, north, up = toward_sun(*sun)
         degrees = np.array([east, north]) / up / exact_metres_per_degree(float(lat[0]), height)
-        cells = degrees * LATTICE_M / LATTICE_DEG / np.array(cell)
-        return cls(cell, tuple(np.round(cells, 15).tolist()))
+        side = cell[0] * CELLS, cell[1] * CELLS
+        cells = degrees * LATTICE_M / LATTICE_DEG / np.array(side)
+        return cls(side, tuple(np.round(cells, 15).tolist()))
 
     def position(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
         """[2, n], cells, of lattice coordinates [n]."""
-        plan = (q / side for q, side in zip((lon_q, lat_q), self.cell))
-        return np.stack([at - shift * h_q for at, shift in zip(plan, self.shift)])
+        out = np.empty((2, lon_q.size))
+        _positions(lon_q, lat_q, h_q, self.cell, self.shift, out)
+        return out
 
-    def _box(self, blocks: Sequence[Block]) -> Floats:
-        """Least and greatest position [2, 2] of blocks."""
-        west, south, east, north = np.array([block.box for block in blocks]).T
+    def _boxes(self, blocks: Sequence[Block]) -> tuple[Floats, Floats]:
+        """Least and greatest position [2, n] of each of n blocks."""
+        west, south, east, north = np.array([block.box for block in blocks]).T.copy()
         corners = [
             self.position(lon, lat, h)
             for lon in (west, east)
             for lat in (south, north)
-            for h in np.array([block.heights for block in blocks]).T
+            for h in np.array([block.heights for block in blocks]).T.copy()
         ]
-        return np.stack([np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2))])
+        return np.min(corners, axis=0), np.max(corners, axis=0)
 
     def casters(self, blocks: Sequence[Block], every: Sequence[Block]) -> tuple[Block, ...]:
         """Of ``every`` block those that may cast a shadow on some ``blocks``."""
         if not blocks:
             return ()
-        low, high = self._box(blocks)
+        low, high = self._boxes(blocks)
         lowest = min(block.heights[0] for block in blocks)
-        out = []
-        for block in every:
-            least, most = self._box([block])
-            if (least <= high).all() and (most >= low).all() and block.heights[1] >= lowest:
-                out.append(block)
-        return tuple(out)
+        least, most = self._boxes(every)
+        meets = (least <= high.max(axis=1)[:, None]) & (most >= low.min(axis=1)[:, None])
+        return tuple(
+            block
+            for block, near in zip(every, meets.all(axis=0))
+            if near and block.heights[1] >= lowest
+        )
 
 
 class _Tops(NamedTuple):
@@ -106,24 +124,44 @@ def _triangles(arrays: dict[str, NDArray]) -> Steps:
     return np.concatenate([arrays["facet"], arrays["whole"], arrays["top"]])
 
 
-def _tops(store: SurfaceStore, blocks: Sequence[Block], view: SunView, positions: Floats) -> _Tops:
-    """Of the surface's ``blocks``, around the ``positions`` [2, n]; one block after another."""
+def _no_tops(positions: Floats) -> _Tops:
+    """Of the part of a sun's view that holds ``positions`` [2, n]."""
     low = np.floor(positions.min(axis=1)).astype(np.int64)
     high = np.ceil(positions.max(axis=1)).astype(np.int64)
     cols, rows = (high - low + 1).tolist()
-    z, first = np.full((rows, cols), -np.inf), (int(low[1]), int(low[0]))
-    unused = np.empty(z.shape, np.int32)
-    for block in blocks:
+    return _Tops(np.full((rows, cols), -np.inf), (int(low[1]), int(low[0])))
+
+
+def _raise_tops(
+    tops: Sequence[_Tops],
+    views: Sequence[SunView],
+    store: SurfaceStore,
+    casters: Sequence[Sequence[Block]],
+) -> None:
+    """By the surface's blocks that cast shadows in each view, one block after another."""
+    of_view = [set(blocks) for blocks in casters]
+    unused = [np.empty(top.z.shape, np.int32) for top in tops]
+    for block in sorted(set().union(*of_view)):
         vertices = store.window([block]).vertices
         corner = _triangles(store.arrays(block, ["facet", "whole", "top"]))
-        raster_facets(_seen_by_sun(vertices, view), corner, first, z, unused)
-    return _Tops(z, first)
+        lattice = vertices.lon_q, vertices.lat_q, vertices.h_q
+        for top, view, blocks, index in zip(tops, views, of_view, unused):
+            if block in blocks:
+                _raster(view.position(*lattice), vertices.h_q, corner, top.first, top.z, index)
 
 
-def _seen_by_sun(vertices: Vertices, view: SunView) -> Floats:
-    """Positions [4, n] whose disparity is the height (m)."""
-    u, v = view.position(vertices.lon_q, vertices.lat_q, vertices.h_q)
-    return np.stack([u, v, u - vertices.h_q * LATTICE_M, v])
+@kernel
+def _raster(
+    position: Floats, h: Ints, corner: Steps, first: tuple[int, int], z: Floats, index: Steps
+) -> None:
+    """Raises ``z`` [rows, cols] (m) by triangles at ``position`` [2, n] (cells) in a sun's view."""
+    for t in range(len(corner)):
+        y = triple(position[1], corner[t])
+        if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], z.shape[0]):
+            continue
+        a, b, c = triple(h, corner[t])
+        d = a * LATTICE_M, b * LATTICE_M, c * LATTICE_M
+        raster_triangle(triple(position[0], corner[t]), y, d, first, t, z, index)
 
 
 @kernel
@@ -170,33 +208,39 @@ def _shaded(
 
 def shaded(
     projected: ProjectedSurface,
-    patch: Patch,
-    is_right: bool,
-    view: SunView,
+    patches: tuple[Patch, Patch],
+    views: tuple[SunView, SunView],
     store: SurfaceStore,
-    casters: Sequence[Block],
-) -> Bools:
-    """Which pixels [h, w] of a ``patch`` of the left or right image lie in shadow.
+    casters: Sequence[Sequence[Block]],
+) -> tuple[Bools, Bools]:
+    """Which pixels [h, w] of each of the ``patches`` of the left and the right image lie in shadow.
 
-    ``projected``: the surface that the images show there; ``view`` of the image's sun; ``casters``:
-    blocks of the ``store`` that may cast a shadow there. Without a surface a pixel counts as lit.
+    ``projected``: the surface that the images show there; ``views`` of the images' suns;
+    ``casters``: of each, blocks of the ``store`` that may cast a shadow there. Without a surface a
+    pixel counts as lit.
     """
-    surface, shape = projected.surface, patch.pixels.shape
-    xy, first = projected.xy, (patch.row, patch.col)
-    if is_right:  # mirrored, so that the greatest disparity is the nearest there, too
-        xy = np.stack([-xy[2], xy[3], -xy[0], xy[1]])
-        first = patch.row, -(patch.col + shape[1] - 1)
+    surface = projected.surface
     corner = np.concatenate(
         [surface.facet, surface.undecided[: surface.whole], surface.tops.corner]
     )
-    out = np.zeros(shape, np.bool_)
-    vertices = surface.vertices
+    left, right = (np.zeros(patch.pixels.shape, np.bool_) for patch in patches)
     if len(corner) == 0:
-        return out
-    index = np.full(shape, -1, np.int32)
-    raster_facets(xy, corner, first, np.full(shape, -np.inf), index)
-    position = view.position(vertices.lon_q, vertices.lat_q, vertices.h_q)
-    shift = view.shift[0] / LATTICE_M, view.shift[1] / LATTICE_M
-    tops = _tops(store, casters, view, position)
-    _shaded(xy, corner, index, first, position, vertices.h_q * LATTICE_M, shift, tops, out)
-    return out[:, ::-1].copy() if is_right else out
+        return left, right
+    vertices = surface.vertices
+    positions = [view.position(vertices.lon_q, vertices.lat_q, vertices.h_q) for view in views]
+    tops = [_no_tops(position) for position in positions]
+    _raise_tops(tops, views, store, casters)
+    # the right image mirrored, so that the greatest disparity is the nearest there, too
+    xy = (
+        projected.xy,
+        np.stack([-projected.xy[2], projected.xy[3], -projected.xy[0], projected.xy[1]]),
+    )
+    first_right = patches[1].row, -(patches[1].col + right.shape[1] - 1)
+    first = (patches[0].row, patches[0].col), first_right
+    for k, out in enumerate((left, right)):
+        index = np.full(out.shape, -1, np.int32)
+        raster_facets(xy[k], corner, first[k], np.full(out.shape, -np.inf), index)
+        shift = views[k].shift[0] / LATTICE_M, views[k].shift[1] / LATTICE_M
+        height = vertices.h_q * LATTICE_M
+        _shaded(xy[k], corner, index, first[k], positions[k], height, shift, tops[k], out)
+    return left, right[:, ::-1].copy()
