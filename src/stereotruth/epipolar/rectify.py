@@ -192,9 +192,9 @@ def rectify_image(
     }
 
 
-def _acquired(source: Source, sensor: SensorModel) -> dict[str, Any]:
-    """The day (ISO, UTC) on which an image was taken, and the ``sun`` (azimuth, elevation in
-    degrees), by its delivery; None: not told."""
+def _of_delivery(source: Source, sensor: SensorModel) -> dict[str, Any]:
+    """When an image was ``acquired`` (ISO day, UTC) and the ``sun`` (azimuth, elevation, degrees)
+    by its delivery; None: not told."""
     place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
     delivery = read_acquisition(source.path, place)
     day = None if delivery.time is None else delivery.time.date().isoformat()
@@ -255,7 +255,7 @@ def rectify(
                 "view": view,
                 "epipolar": model.to_dict(),
                 "provenance": dict(provenance or {}),
-            } | _acquired(source, getattr(model, view))
+            } | _of_delivery(source, getattr(model, view))
             source.check_blocks(workers)
             grid = stack.enter_context(
                 resumable_grid(
