@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inner, kernel
-from ..numerics.triangles import plane_slopes, row_span
+from ..numerics.triangles import corner_shares, plane_slopes, row_span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -321,11 +321,7 @@ def interpolate(
             slope[0, j, i], slope[1, j, i] = plane_slopes(
                 x, y, (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
             )
-            u, w = first[1] + i - x[0], first[0] + j - y[0]
-            bx, by = plane_slopes(x, y, (0.0, 1.0, 0.0))
-            cx, cy = plane_slopes(x, y, (0.0, 0.0, 1.0))
-            b = min(max(bx * u + by * w, 0.0), 1.0)
-            c = min(max(cx * u + cy * w, 0.0), 1.0 - b)
+            b, c = corner_shares(x, y, first[1] + i - x[0], first[0] + j - y[0])
             a = 1.0 - b - c
             variance[j, i] = noise[t] * (
                 a * a / count[v[0]] + b * b / count[v[1]] + c * c / count[v[2]]

@@ -24,7 +24,7 @@ from ..epipolar.sun import toward_sun
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..numerics.degrees import exact_metres_per_degree
-from ..numerics.triangles import plane_slopes
+from ..numerics.triangles import corner_shares
 from ..surface.surface_store import Block, SurfaceStore
 from .facet_raster import misses, raster_facets, raster_triangle, triple
 from .image_patches import Patch
@@ -184,13 +184,9 @@ def _shaded(
             t = index[j, i]
             if t < 0:
                 continue
-            k, m, n = corner[t, 0], corner[t, 1], corner[t, 2]
-            x, y = (xy[0, k], xy[0, m], xy[0, n]), (xy[1, k], xy[1, m], xy[1, n])
-            across, down = first[1] + i - x[0], first[0] + j - y[0]
-            bx, by = plane_slopes(x, y, (0.0, 1.0, 0.0))
-            cx, cy = plane_slopes(x, y, (0.0, 0.0, 1.0))
-            b = min(max(bx * across + by * down, 0.0), 1.0)
-            c = min(max(cx * across + cy * down, 0.0), 1.0 - b)
+            k, m, n = corner[t]
+            x, y = triple(xy[0], corner[t]), triple(xy[1], corner[t])
+            b, c = corner_shares(x, y, first[1] + i - x[0], first[0] + j - y[0])
             ub, vb = position[0, m] - position[0, k], position[1, m] - position[1, k]
             uc, vc = position[0, n] - position[0, k], position[1, n] - position[1, k]
             hb, hc = height[m] - height[k], height[n] - height[k]

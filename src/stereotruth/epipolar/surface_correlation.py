@@ -143,17 +143,22 @@ def _correlation(
 
 @kernel
 def _as_compared(
-    warped: NDArray, disparity: Singles, clear: Bools, values: Singles, known: Singles, out: Singles
+    warped: NDArray,
+    disparity: Singles,
+    clear: Bools,
+    values: Singles,
+    known: Singles,
+    counted: Singles,
 ) -> None:
     """Fills ``values``: those of ``warped``, 0 for none; ``known``: disparity where there is one;
-    ``out``: of these, those that are ``clear``. All arrays [h, w]."""
+    ``counted``: of these, those that are ``clear``. All arrays [h, w]."""
     for y in range(values.shape[0]):
         for x in range(values.shape[1]):
             value, d = np.float32(warped[y, x]), disparity[y, x]
             has_value = np.isfinite(value)
             values[y, x] = value if has_value else np.float32(0.0)
             known[y, x] = d if has_value else np.float32(np.nan)
-            out[y, x] = d if has_value and clear[y, x] else np.float32(np.nan)
+            counted[y, x] = d if has_value and clear[y, x] else np.float32(np.nan)
 
 
 def surface_correlation(

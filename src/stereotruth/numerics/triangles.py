@@ -42,3 +42,16 @@ def plane_slopes(x: Three, y: Three, value: Three) -> tuple[float, float]:
     p, q = value[1] - value[0], value[2] - value[0]
     area = u * t - v * s
     return (p * t - q * v) / area, (q * u - p * s) / area
+
+
+@inner
+def corner_shares(x: Three, y: Three, across: float, down: float) -> tuple[float, float]:
+    """Shares of the second and the third corner at a position that lies so far from the first one:
+    barycentric coordinates, that of the first being what is left to 1.
+
+    Of a position outside of the triangle by roundings, those of its border.
+    """
+    bx, by = plane_slopes(x, y, (0.0, 1.0, 0.0))
+    cx, cy = plane_slopes(x, y, (0.0, 0.0, 1.0))
+    b = min(max(bx * across + by * down, 0.0), 1.0)
+    return b, min(max(cx * across + cy * down, 0.0), 1.0 - b)
