@@ -76,12 +76,10 @@ class _Blocks:
 
     def key(self, content: str, rows: slice, cols: slice) -> str:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
-        touched = self.scene.windows.touched(rows, self.scene.pair.cols(cols))
-        points = sorted(_identity(store.attrs) for store in touched)
         here = self.scene.pair.cols(cols)
-        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
-        for view in self.scene.sun_views or ():
-            surface += [block.sha256 for block in self.scene.casters(view, rows, here)]
+        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
+        blocks = self.scene.surface_blocks(rows, here), *self.scene.casters(rows, here)
+        surface = [block.sha256 for of_view in blocks for block in of_view]
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:

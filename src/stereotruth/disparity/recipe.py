@@ -127,7 +127,7 @@ def shadows_of(
         slice(grid.start + window.margin, grid.stop - window.margin)
         for grid in (window.rows, window.cols)
     )
-    casters = [scene.casters(view, rows, cols) for view in scene.sun_views]
+    casters = scene.casters(rows, cols)
     return shaded(projected, (window.left, window.right), scene.sun_views, scene.ground, casters)
 
 

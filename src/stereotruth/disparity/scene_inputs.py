@@ -229,9 +229,12 @@ class SceneInputs:
         )
         return left, right
 
-    def casters(self, view: SunView, rows: slice, cols: slice) -> tuple[Block, ...]:
-        """Blocks of the surface that may cast a shadow into a window, by a sun's ``view``."""
-        return view.casters(self.surface_blocks(rows, cols), self.ground.every)
+    def casters(self, rows: slice, cols: slice) -> list[tuple[Block, ...]]:
+        """Of the view of each sun, blocks of the surface that may cast a shadow into a window."""
+        if self.sun_views is None:
+            return []
+        around = self.surface_blocks(rows, cols)
+        return [view.casters(around, self.ground.every) for view in self.sun_views]
 
     def surface_blocks(self, rows: slice, cols: slice) -> tuple[Block, ...]:
         """Blocks of the surface that a window shows, or that may hide this."""
