@@ -182,6 +182,25 @@ def _spoil(images: list[Path], seed: int) -> None:
             target.write(changed, 1)
 
 
+def dated_truth(case: Case, folder: Path) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """What is true at the pixels of a case's left grid, and what has changed there; kept beside the
+    images."""
+    made = case.made(folder)
+    model = EpipolarModel.load(made / "epipolar.json")
+    rows, cols = (slice(0, side) for side in model.shape)
+    kept = made.parent / f"{made.name}.npz"
+    if not kept.is_file():
+        y, x = np.mgrid[rows, cols].astype(np.float64)
+        city, (spec,) = case.city, case.city.scenes
+        truth = truth_window(model, city, spec, rows, cols)
+        changes = changes_at(city, spec, *model.epipolar_to_left(x, y))
+        np.savez(kept, **truth, **changes)
+    with np.load(kept) as file:
+        arrays = {name: file[name] for name in file}
+    changes = {n: arrays.pop(n) for n in ("height", "height_other", "height_lidar", "reason")}
+    return arrays, changes
+
+
 @dataclass(frozen=True, eq=False)
 class Labelled:
     """The layers of a case's labels, and what is true there, [y, x] of the left grid."""
@@ -194,18 +213,7 @@ class Labelled:
     def of(cls, case: Case, folder: Path) -> Labelled:
         """Labels made anew; truth kept beside the images."""
         made = case.made(folder)
-        model = EpipolarModel.load(made / "epipolar.json")
-        rows, cols = (slice(0, side) for side in model.shape)
-        kept = made.parent / f"{made.name}.npz"
-        if not kept.is_file():
-            y, x = np.mgrid[rows, cols].astype(np.float64)
-            city, (spec,) = case.city, case.city.scenes
-            truth = truth_window(model, city, spec, rows, cols)
-            changes = changes_at(city, spec, *model.epipolar_to_left(x, y))
-            np.savez(kept, **truth, **changes)
-        with np.load(kept) as file:
-            arrays = {name: file[name] for name in file}
-        changes = {n: arrays.pop(n) for n in ("height", "height_other", "height_lidar", "reason")}
+        arrays, changes = dated_truth(case, folder)
         inputs = SceneInputs.of(
             *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
             settings_of(case), alignment=made / "alignment.json", suns=case.suns,

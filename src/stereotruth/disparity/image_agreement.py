@@ -14,15 +14,15 @@ one surface only:
   threshold. A building that only the LiDAR or only the images have fails as a whole; single
   failures among agreeing pixels, by noise or in shadow, do not;
 - :meth:`Agreement.unusual`: whether pixels together correlate less than is usual around them;
-- :mod:`.shifted_agreement`: whether the images agree better at another disparity. Of images that
-  share no light that alone counts, with predicted shadows left apart. Crowns are compared over
-  fewer pixels, too;
+- :mod:`.shifted_agreement`: whether the images agree better at another disparity. Crowns are
+  compared over fewer pixels, too;
+- :mod:`.change_probability`: of images that share no light, how probable a change is. That alone
+  counts there, and is what is left to doubt of the labels that stay;
 - :meth:`Agreement.outvoted_nearby`: the same as the votes for what is
   smaller, by what is usual around it;
 - :meth:`Agreement.beside`: the rim of such things, which most of its surroundings outvote;
 - crowns, and what is beside young ones, change most: they have labels where the images confirm
-  these;
-- :func:`variance_of_unseen_change`: what is left to doubt where images share no light.
+  these.
 
 All is computed in a fixed order from the pixels around each pixel alone, so that results do not
 depend on blocks.
@@ -39,12 +39,12 @@ from numpy.typing import NDArray
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
 from ..numerics.summed_area import summed_area, window_sums
+from .change_probability import CHANGED, probability_of_change
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .seen_surface import box_max
 from .shifted_agreement import (
     INDEPENDENT_PX2,
-    LEAST,
     SHIFTS_PX,
     SIGNAL,
     ShiftedAgreement,
@@ -62,7 +62,7 @@ DENSE = 2.0  # points in a pixel, that miss nothing of a pixel's size
 NEARBY_PX = 8  # for what is small, pixels up to here vote,
 NEARBY_SHARE = 0.35  # of which so many fail
 DROWNED_FAIL = 0.25  # what a pixel counts for that noise keeps from telling
-TOGETHER_PX, APART_PX = 4, 8  # pixels up to here are averaged, of images of one light and of two
+TOGETHER_PX = 4  # pixels up to here are averaged
 CLOSE_PX = 5  # side of the windows for what is a few pixels wide
 # At the rim of what has changed more than RIM_SHARE of the surface up to NEARBY_PX around has not.
 # There a pixel is held where a window of CLOSE_PX, centred up to HELD_PX off, correlates by more
@@ -73,22 +73,10 @@ HELD_PX, HELD, RIM_SHARE = 1, 0.95, 0.3
 YOUNG_REACH_PX, YOUNG_PIXELS = 3, 12
 CONFIRMED = 0.3  # of what the same crown would agree by, as noise leaves it
 DOUBT = 0.85  # of their mean correlation: with more, no other disparity is compared
-BESIDE_SHARE = 0.15  # of the pixels up to APART_PX around have changed: a pixel is in their rim,
-RIM_AGREEMENT = 0.4  # and has changed, too, if images of two lights agree by less
-# Where shadows are predicted: in place of LEAST and RIM_AGREEMENT
-LEAST_LIT, RIM_AGREEMENT_LIT = 0.5, 0.5
 # Crowns that have been felled: both images see the ground below, over a few pixels
 CROWN_REACH_PX = 2
 CROWN_SHIFTS = tuple(shift for shift in SHIFTS_PX if abs(shift) >= 2.0)
 CROWN_AGREEMENT = 0.6  # of the images there, at least
-# Of labels that images of two lights leave, the share that has changed, by their agreement as a
-# share of what noise leaves the same ground; and without any. Cities of seeds 1 and 2 of
-# bench/changes.py, of whose buildings and trees a tenth to a quarter has changed.
-UNSEEN_AT = 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0
-UNSEEN = 0.9, 0.1, 0.06, 0.04, 0.023, 0.01, 0.005, 0.0018, 0.0006
-UNSEEN_BY_NONE = 0.035
-UNSEEN_LIT = 0.9, 0.55, 0.2, 0.1, 0.065, 0.035, 0.016, 0.0035, 0.0007  # with predicted shadows
-UNSEEN_LIT_BY_NONE = 0.05
 DOUBTS = 2.0  # standard deviations by which noise may lower a correlation that does not fail
 USUAL = 0.8  # of the correlation around: with less, a pixel fails
 
@@ -258,8 +246,11 @@ def contradicted(
     crowns = labelled & np.isin(surface_class, VEGETATION_CLASSES)
     beside = labelled & beside_young_crowns(surface_class)
     if comparison.diachronic:
-        changed, compared = _contradicted_apart(labels, window, comparison, labelled)
-        unseen = variance_of_unseen_change(compared, window.shaded is not None)
+        probability = probability_of_change(
+            labels, window, comparison.window_px, comparison.noise, labelled
+        )
+        changed = labelled & (probability > CHANGED)
+        unseen = probability * SURFACE_PX**2
         by_detail = crowns | beside
     else:
         changed, rim = _contradicted_together(labels, window, comparison, labelled, agreement)
@@ -297,20 +288,6 @@ def _compared_closely(
         closely, labels.disparity, labels.slope, HELD_PX, 1, wanted_runs(beside)
     )
     return changed & ~is_held | beside & ~(together > DOUBT)
-
-
-def variance_of_unseen_change(agreement: ShiftedAgreement, by_light: bool) -> Floats:
-    """Variance (px², [h, w]) of labels of images that share no light, since what these show may
-    have changed though they do not contradict it.
-
-    Its probability follows from their ``agreement``, as a share of what noise leaves the same
-    ground, with what lies in shadow left apart (``by_light``) or not. A label of what has changed
-    counts as off by SURFACE_PX, the least that is another surface (eq. 17 of
-    docs/explanation/surface.md).
-    """
-    share = agreement.here / np.maximum(agreement.signal, SIGNAL)
-    table, none = (UNSEEN_LIT, UNSEEN_LIT_BY_NONE) if by_light else (UNSEEN, UNSEEN_BY_NONE)
-    return np.where(np.isnan(share), none, np.interp(share, UNSEEN_AT, table)) * SURFACE_PX**2
 
 
 def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
@@ -366,35 +343,6 @@ def _contradicted_together(
         goes_on, labels.disparity, labels.slope, NEARBY_PX, 2, wanted_runs(changed)
     )
     return changed, changed & ~shifted.is_shifted & (unchanged > RIM_SHARE)
-
-
-def _contradicted_apart(
-    labels: Labels,
-    window: PairWindow,
-    comparison: Comparison,
-    labelled: Bools,
-) -> tuple[Bools, ShiftedAgreement]:
-    """:func:`contradicted` of images that share no light, and how they agree: at once by the
-    surface up to APART_PX around a pixel; beside such pixels, where that mixes what has changed
-    with what has not, by the surface up to TOGETHER_PX.
-
-    Where the shadows of both images are known, their edges lower no agreement, and more is asked.
-    """
-    limits = (LEAST, RIM_AGREEMENT) if window.shaded is None else (LEAST_LIT, RIM_AGREEMENT_LIT)
-    least, rim_agreement = limits
-
-    def compared(reach: int, wanted: Bools) -> ShiftedAgreement:
-        return shifted_agreement(
-            labels, window, comparison.noise, comparison.window_px, reach, wanted, by_light=True
-        )
-
-    widely = compared(APART_PX, labelled)
-    changed = widely.contradicts(least)
-    side = 2 * APART_PX + 1
-    beside = window_sums(np.pad(changed, APART_PX), side) > BESIDE_SHARE * side**2
-    rim = labelled & beside & ~changed
-    closer = compared(TOGETHER_PX, rim)
-    return changed | (closer.signal > SIGNAL) & (closer.here < rim_agreement), widely
 
 
 def without_changes(

@@ -26,19 +26,20 @@ The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_r
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .change_reasons import with_reasons
-from .crowns import crowns, with_crowns, without_contours
+from .crowns import Crowns, crowns, with_crowns, without_contours
 from .facet_labels import facet_labels
 from .ground_in_view import ground_in_view
 from .image_agreement import Comparison, without_changes
 from .layers import layers_of
 from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
-from .pixel_labels import own_labels
+from .pixel_labels import Pixels, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
 from .shadows import shaded
@@ -66,8 +67,20 @@ def label_window(
     return layers, labels.counts(in_frames, outside)
 
 
-def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
-    """The labels of a window by the surface of the points around it."""
+class LidarLabels(NamedTuple):
+    """What the points say of a window, before its images are compared: ``labels`` of facets, the
+    surfaces that are ``rough``, and each pixel's ``own`` points; ``comparison``: how the images of
+    the ``window`` are compared."""
+
+    labels: WindowLabels
+    rough: Crowns
+    own: Pixels
+    window: PairWindow
+    comparison: Comparison
+
+
+def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> LidarLabels:
+    """Of a window, by the surface of the points around it."""
     settings, scale = scene.settings, scene.scale
     shape, first, projection = window.shape, window.first, points.projection
     comparison = Comparison(
@@ -101,19 +114,23 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     see_through = scale.spacing_px > MAX_COVER_PX / 2.0
     labels = facet_labels(visible, own, window, see_through)
 
-    # shadows of both images
-    window = replace(window, shaded=shadows_of(scene, window, projected))
-
-    # agreement of the images
+    # rough surfaces
     rough = crowns(visible, scale)
     labels = without_contours(labels, rough, visible, scale)
-    labels = without_changes(labels, window, comparison)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
-    is_facet = labels.status != Status.EDGE_IN_PIXEL
-    labels = with_crowns(labels, rough, window, comparison)
 
-    # reasons of changes
-    return with_reasons(labels, ~is_facet, own.pixels, window, comparison, scale.px_per_m)
+    # shadows of both images
+    window = replace(window, shaded=shadows_of(scene, window, projected))
+    return LidarLabels(labels, rough, own.pixels, window, comparison)
+
+
+def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
+    """The labels of a window by the surface of the points around it, as far as images agree."""
+    labels, rough, own, window, comparison = lidar_labels(scene, window, points)
+    is_rough = labels.status == Status.EDGE_IN_PIXEL
+    labels = without_changes(labels, window, comparison)
+    labels = with_crowns(labels, rough, window, comparison)
+    return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)
 
 
 def shadows_of(

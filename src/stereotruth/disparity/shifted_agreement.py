@@ -67,13 +67,13 @@ class ShiftedAgreement:
         limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
         return z_elsewhere - z_here > limit
 
-    def contradicts(self, least: float = LEAST) -> Bools:
+    def contradicts(self) -> Bools:
         """Where the images contradict the labels [h, w].
 
         That is, where they agree significantly better elsewhere; or, with more signal than noise,
-        where the agreement and its advantage over that elsewhere sum up to less than ``least``.
+        where the agreement and its advantage over that elsewhere sum up to less than LEAST.
         """
-        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < least)
+        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < LEAST)
         return is_none | self.is_shifted
 
 

@@ -1,0 +1,150 @@
+"""The weights by which images of two lights tell how probable a change is, and how right they are.
+
+python bench/change_probability.py [--seeds 1 2 3] [--unseen 4 5] [--folder FOLDER]
+
+Fits the logistic regressions of stereotruth.disparity.change_probability to the simulated cities of
+changes.py whose images are a year apart, with and without predicted shadows, and prints the
+weights. Then the share of labels that have changed by the probability that these weights give,
+over the same cities of other seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from changes import CHANGED_M, CONDITIONS, VIEWS, Case, dated_truth, settings_of
+from numpy.typing import NDArray
+
+from stereotruth.disparity.change_probability import (
+    CHANGED,
+    Evidence,
+    Weights,
+    around,
+    by_itself,
+    change_evidence,
+    log_odds,
+    probability_with,
+)
+from stereotruth.disparity.pixel_labels import Labels
+from stereotruth.disparity.recipe import lidar_labels
+from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.disparity.status import VEGETATION_CLASSES, is_labelled
+from stereotruth.disparity.window_points import read_window
+from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.simulate.surfaces import WATER
+
+KINDS = (
+    "nothing", "texture", "built", "demolished", "raised", "felled", "grown", "crops", "mixed",
+)  # fmt: skip
+DENSITY = 4.0  # points/m²
+BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, CHANGED, 0.3, 0.6, 1.0
+FEW = 0.1  # share of the pixels that are fitted to
+
+
+class Sample(NamedTuple):
+    """Pixels of a city whose truth is known: the images' ``evidence`` of its ``labels`` where there
+    are any (``labelled``), what is ``changed`` and what is ``kept``; arrays [h, w]."""
+
+    evidence: Evidence
+    labels: Labels
+    labelled: NDArray[np.bool_]
+    changed: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+
+
+def samples(seeds: list[int], folder: Path, lit: bool) -> Iterator[tuple[str, Sample]]:
+    """Of all kinds of change; ``lit``: shadows are predicted."""
+    for kind in KINDS:
+        for seed in seeds:
+            yield kind, sample(Case(kind, CONDITIONS[1], seed, DENSITY, with_suns=lit), folder)
+
+
+def sample(case: Case, folder: Path) -> Sample:
+    """Of the labels that the LiDAR alone would have, but for crowns."""
+    made = case.made(folder)
+    rows, cols = (slice(0, side) for side in EpipolarModel.load(made / "epipolar.json").shape)
+    inputs = SceneInputs.of(
+        *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
+        settings_of(case), alignment=made / "alignment.json", suns=case.suns,
+    ).with_surface(made, workers=1)  # fmt: skip
+    by_lidar = lidar_labels(inputs, *read_window(inputs, rows, cols))
+    window, comparison, labels = by_lidar.window, by_lidar.comparison, by_lidar.labels
+    labelled = is_labelled(labels.status)
+    evidence = change_evidence(
+        labels.labels, window, comparison.window_px, comparison.noise, labelled
+    )
+    truth, changes = dated_truth(case, folder)
+    z = changes["height"]
+    with np.errstate(invalid="ignore"):
+        off = np.fmax(*(np.abs(z - changes[f"height_{name}"]) for name in ("lidar", "other")))
+        differs, same = off > CHANGED_M, off < 0.01
+    inside = (truth["covered"] == 1) & np.isfinite(z)
+    same &= (truth["surface"] != WATER) & (truth["visible"] == 1) & (truth["changed_right"] == 0)
+    known = inside & (labelled & ~np.isin(labels.surface_class, VEGETATION_CLASSES))[window.inner]
+    changed, kept = np.zeros((2, *labelled.shape), np.bool_)
+    changed[window.inner], kept[window.inner] = known & differs, known & same
+    return Sample(evidence, labels.labels, labelled, changed, kept)
+
+
+def regression(columns: list[NDArray], changed: NDArray[np.bool_]) -> list[float]:
+    """Constant and weights of the ``columns`` [n] by maximum likelihood (Newton's method)."""
+    x = np.column_stack([np.ones(changed.size), *columns])
+    weights = np.zeros(x.shape[1])
+    for _ in range(30):
+        p = 1.0 / (1.0 + np.exp(-x @ weights))
+        step = np.linalg.solve((x.T * (p * (1.0 - p))) @ x, x.T @ (changed - p))
+        weights += step
+    return weights.tolist()
+
+
+def fit(of: list[Sample]) -> Weights:
+    """Weights by a share of the pixels of all samples."""
+    rng = np.random.default_rng(0)
+    tells = [~np.isnan(s.evidence.agreement) & ~s.evidence.is_weak for s in of]
+    either = [s.changed | s.kept for s in of]
+    chosen = [e & t & (rng.random(t.shape) < FEW) for e, t in zip(either, tells)]
+    silent = [e & np.isnan(s.evidence.agreement) for s, e in zip(of, either)]
+    unknown = sum((s.changed & q).sum() for s, q in zip(of, silent)) / sum(map(np.sum, silent))
+
+    def column(values: list[NDArray]) -> NDArray:
+        return np.concatenate([v[c] for v, c in zip(values, chosen)])
+
+    changed = column([s.changed for s in of])
+    evidence = ([getattr(s.evidence, n) for s in of] for n in ("agreement", "advantage"))
+    first = regression([column(values) for values in evidence], changed)
+    weights = Weights(*first, 0.0, 0.0, 0.0, float(unknown))
+    own = [by_itself(s.evidence, weights) for s in of]
+    near = [around(p, s.labels, s.labelled) for p, s in zip(own, of)]
+    second = regression([column([log_odds(p) for p in ps]) for ps in (own, near)], changed)
+    return Weights(*first, *second, float(unknown))
+
+
+def main() -> None:
+    """Print weights and tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--folder", type=Path, default=Path("results/changes"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--unseen", type=int, nargs="+", default=[])
+    given = parser.parse_args()
+    for lit in (False, True):
+        print("predicted shadows" if lit else "no suns known")
+        weights = fit([s for _, s in samples(given.seeds, given.folder, lit)])
+        print("  " + ", ".join(f"{name} {w:.3f}" for name, w in weights._asdict().items()))
+        changed, every = np.zeros((2, len(BINS) - 1), np.int64)
+        for kind, of in samples(given.unseen, given.folder, lit):
+            p = probability_with(weights, of.evidence, of.labels, of.labelled)
+            changed += np.histogram(p[of.changed], BINS)[0]
+            every += np.histogram(p[of.changed | of.kept], BINS)[0]
+            found, lost = ((p[part] > CHANGED).mean() * 100 for part in (of.changed, of.kept))
+            print(f"  {kind}: {found:.1f} % of the changed found, {lost:.2f} % of the others lost")
+        for low, high, n, of_all in zip(BINS, BINS[1:], changed, every):
+            if of_all:
+                print(f"  P {low} to {high}: {100.0 * n / of_all:.2f} % of {of_all} have changed")
+
+
+if __name__ == "__main__":
+    main()

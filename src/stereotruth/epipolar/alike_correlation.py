@@ -1,0 +1,149 @@
+"""Correlation of two images over the pixels that are alike: of one surface, and as bright as the
+centre in either image.
+
+A window that holds a shadow's edge, or a roof of one image beside ground that both show, mixes what
+agrees with what does not. Pixels as bright as the centre in both images lie on one side of such
+edges, so that windows of them reach up to the edge: adaptive support (Yoon and Kweon 2006), with
+the brightness of both images in place of one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import kernel
+from .surface_correlation import (
+    BLOCK,
+    DECIDED,
+    Singles,
+    Steps,
+    columns_inside,
+    surface_of_row,
+    tolerance_px,
+)
+
+ALIKE = 0.1
+LEAST_PIXELS = 12  # fewer correlate by chance
+
+
+def brightness(image: NDArray[np.floating]) -> Singles:
+    """Mean of the pixels up to 1 px around each one of an image [h, w] that have a value, NaN where
+    it has none itself.
+
+    Added in one order, whatever part of an image is given.
+    """
+    rows, cols = image.shape
+    has_value = np.isfinite(image)
+    values = np.pad(np.where(has_value, image, 0.0).astype(np.float32), 1)
+    counted = np.pad(has_value.astype(np.float32), 1)
+    total, count = np.zeros((2, rows, cols), np.float32)
+    for down in range(3):
+        for across in range(3):
+            total += values[down : down + rows, across : across + cols]
+            count += counted[down : down + rows, across : across + cols]
+    return np.where(has_value, total / np.maximum(count, np.float32(1.0)), np.float32(np.nan))
+
+
+@kernel
+def _alike_correlation(
+    left: Singles,
+    warped: Singles,
+    level: Singles,
+    level_warped: Singles,
+    disparity: Singles,
+    slope: Singles,
+    reach: int,
+    noise: tuple[float, float],
+    runs: Steps,
+    out: Singles,
+) -> None:
+    """``level``, ``level_warped``: brightness of both images; the latter is NaN where a pixel does
+    not count. ``runs`` of wanted pixels, outside of which all is NaN."""
+    rows, cols = left.shape
+    out[:] = np.nan
+    surface = np.empty(3 * BLOCK, np.float32)
+    centre = np.empty(6 * BLOCK, np.float32)
+    sums = np.empty(6 * BLOCK, np.float32)
+    one, zero, share = np.float32(1.0), np.float32(0.0), np.float32(ALIKE)
+    for run in runs:
+        y, x0, size = run[0], run[1], run[2] - run[1]
+        surface_of_row(disparity, slope, y, x0, size, surface)
+        for k in range(size):
+            centre[k], centre[BLOCK + k] = left[y, x0 + k], warped[y, x0 + k]
+            centre[2 * BLOCK + k] = level[y, x0 + k]
+            centre[3 * BLOCK + k] = level_warped[y, x0 + k]
+            centre[4 * BLOCK + k] = share * level[y, x0 + k]
+            centre[5 * BLOCK + k] = share * level_warped[y, x0 + k]
+        sums[:] = zero
+        for b in range(max(y - reach, 0), min(y + reach + 1, rows)):
+            down = np.float32(b - y)
+            for step in range(-reach, reach + 1):
+                across, tolerance = np.float32(step), tolerance_px(b - y, step)
+                first, end = columns_inside(x0, size, cols, step)
+                d, uu, vv, ll, ww = (
+                    disparity[b, x0 + step + first : x0 + step + end],
+                    left[b, x0 + step + first : x0 + step + end],
+                    warped[b, x0 + step + first : x0 + step + end],
+                    level[b, x0 + step + first : x0 + step + end],
+                    level_warped[b, x0 + step + first : x0 + step + end],
+                )
+                p, c, s = surface[first:], centre[first:], sums[first:]
+                for k in range(d.size):
+                    plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
+                    same = one if abs(d[k] - plane) <= tolerance else zero
+                    same *= one if abs(ll[k] - c[2 * BLOCK + k]) <= c[4 * BLOCK + k] else zero
+                    same *= one if abs(ww[k] - c[3 * BLOCK + k]) <= c[5 * BLOCK + k] else zero
+                    u = (uu[k] - c[k]) * same
+                    v = (vv[k] - c[BLOCK + k]) * same
+                    s[k] += same
+                    s[BLOCK + k] += u
+                    s[2 * BLOCK + k] += v
+                    s[3 * BLOCK + k] += u * u
+                    s[4 * BLOCK + k] += v * v
+                    s[5 * BLOCK + k] += u * v
+        for k in range(size):
+            n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
+            if n < LEAST_PIXELS:
+                continue
+            suu = sums[3 * BLOCK + k] - su * su / n
+            svv = sums[4 * BLOCK + k] - sv * sv / n
+            suv = sums[5 * BLOCK + k] - su * sv / n
+            here, there = noise[0] * (n - one), noise[1] * (n - one)
+            signal = max(suu - here, zero) * max(svv - there, zero)
+            if signal <= zero:
+                continue
+            expected = np.sqrt(signal / (suu * svv))
+            if expected * np.sqrt(n) >= DECIDED:
+                out[y, x0 + k] = min(suv / np.sqrt(signal), one)
+
+
+def alike_correlation(
+    left: NDArray[np.floating],
+    warped: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    reach: int,
+    noise: tuple[float, float],
+    runs: Steps,
+) -> Singles:
+    """Correlation of two images [h, w] over the pixels up to ``reach`` px around that are alike.
+
+    These lie on the surface of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], and
+    are as bright as it within the share ALIKE in both images. ``left`` is 0 and ``warped`` NaN
+    where an image has no value. The coefficient is as it would be without ``noise`` (variances of
+    both images, DN²), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves so little
+    that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    """
+    level_warped = brightness(warped)
+    known = np.isfinite(level_warped) & np.isfinite(disparity) & (left != 0.0)
+    level_warped[~known] = np.nan
+    single = [
+        np.ascontiguousarray(values, dtype=np.float32)
+        for values in (left, np.where(known, warped, 0.0))
+    ]
+    out = np.empty(left.shape, np.float32)
+    level = brightness(np.where(left != 0.0, left, np.nan))
+    surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
+    _alike_correlation(*single, level, level_warped, *surface, reach, noise, runs, out)
+    return out
