@@ -139,8 +139,13 @@ def main() -> None:
             p = probability_with(weights, of.evidence, of.labels, of.labelled)
             changed += np.histogram(p[of.changed], BINS)[0]
             every += np.histogram(p[of.changed | of.kept], BINS)[0]
-            found, lost = ((p[part] > CHANGED).mean() * 100 for part in (of.changed, of.kept))
-            print(f"  {kind}: {found:.1f} % of the changed found, {lost:.2f} % of the others lost")
+            parts = {"of the changed are found": of.changed, "of the others lost": of.kept}
+            shares = [
+                f"{100.0 * (p[part] > CHANGED).mean():.1f} % {name}"
+                for name, part in parts.items()
+                if part.any()
+            ]
+            print(f"  {kind}: {', '.join(shares)}")
         for low, high, n, of_all in zip(BINS, BINS[1:], changed, every):
             if of_all:
                 print(f"  P {low} to {high}: {100.0 * n / of_all:.2f} % of {of_all} have changed")

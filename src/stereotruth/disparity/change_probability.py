@@ -12,7 +12,7 @@ of two agreements (:class:`Evidence`):
   of new roofs, and no more than 8 px off.
 
 A shifted disparity at which the detail agrees better contradicts it. The probability of a change is
-logistic in both (eq. 16), then in its own value and the mean over the surface around (eq. 17 of
+logistic in both (eq. 18), then in its own value and the mean over the surface around (eq. 19 of
 docs/explanation/surface.md): what has changed is larger than a pixel.
 """
 
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
-AROUND_PX = 8  # pixels up to here are averaged: the detail's agreement, and probabilities
+SURROUNDINGS_PX = 8  # pixels up to here are averaged: the detail's agreement, and probabilities
 ALIKE_PX = 4  # up to here lie the pixels that are alike, and the means of their agreement
 AGREEMENT_LIMITS = -0.5, 0.9  # of an agreement that counts
 WEAK = 0.4  # share of signal, with less of which the absence of agreement tells little
@@ -86,7 +86,9 @@ def change_evidence(
     ``window_px``: side of the windows in which details are correlated; ``noise``: variances of both
     images, DN².
     """
-    detail = shifted_agreement(labels, window, noise, window_px, AROUND_PX, labelled, by_light=True)
+    detail = shifted_agreement(
+        labels, window, noise, window_px, SURROUNDINGS_PX, labelled, by_light=True
+    )
     alike = _alike_agreement(labels, window, noise, labelled)
     agreement = _z(np.fmax(detail.here, alike))
     advantage = np.maximum(_z(detail.elsewhere) - _z(detail.here), 0.0)
@@ -132,7 +134,7 @@ def around(probability: Floats, labels: Labels, labelled: Bools) -> Singles:
     """Mean probability of the ``labelled`` pixels [h, w] of the surface around each of them."""
     values = np.where(labelled, probability, np.nan)
     surface = labels.disparity, labels.slope
-    return surface_mean(values, *surface, AROUND_PX, 2, wanted_runs(labelled))
+    return surface_mean(values, *surface, SURROUNDINGS_PX, 2, wanted_runs(labelled))
 
 
 def probability_of_change(

@@ -46,10 +46,11 @@ class Settings:
 
     diachronic: Flag = False
     """with `surface`: whether both images of a pair were taken under different suns or in different
-    seasons. Their brightness is not compared then, since shadows and leaves change it where no
-    height has changed; their detail is, at the labels' disparity and at others, and a pixel is
-    `changed` where the labels' one is no better. Column `diachronic` of the scenes sheet says it of
-    a scene. Their `uncertainty` has the probability of a change that the images do not show"""
+    seasons. Shadows and leaves change their brightness then where no height has changed. So their
+    detail is compared, at the labels' disparity and at others, and the brightness of pixels that
+    are alike in both; a pixel that has probably changed is `changed`. Column `diachronic` of the
+    scenes sheet says it of a scene. Their `uncertainty` has the probability of a change that the
+    images do not show"""
 
     @property
     def on_surface(self) -> bool:

@@ -3,7 +3,7 @@
 The sun sees the surface from one direction, like a camera that is far away: what it does not see
 lies in shadow. So the surface is rasterised into the view of the sun, where what is highest is
 nearest, and into both images; a pixel lies in shadow where something is higher than it at its
-position in the view of the sun, or where its triangle turns away from the sun (eq. 18 of
+position in the view of the sun, or where its triangle turns away from the sun (eq. 17 of
 docs/explanation/surface.md).
 
 The view of the sun is a lattice over the ground that no window moves, and each block of the surface
