@@ -121,6 +121,6 @@ def surface_mean(
     _voters(values, disparity, known, voters)
     slope = np.ascontiguousarray(slope, dtype=np.float32)
     if runs is None:
-        runs = wanted_runs(np.ones(disparity.shape, np.bool_))
+        runs = wanted_runs(np.isfinite(disparity))
     _surface_mean(known, disparity, voters, slope, reach, every, runs, out)
     return out
