@@ -20,6 +20,8 @@ STARTS = {
     "ingest": {"laspy", "numba", "pyproj"},
     "align": {"cv2", "numba", "pydantic", "rasterio"},
     "refine": {"cv2", "numba", "pydantic", "rasterio", "scipy.special"},
+    "adjust": {"cv2", "numba", "pydantic", "rasterio", "scipy.special"},
+    "adjusted_alignment": {"numba"},
     "rectify": {"dask", "numba", "pydantic", "rasterio", "zarr"},
     "project": {"dask", "numba", "pydantic", "zarr"},
     "project_strip": {"dask", "numba", "pydantic", "zarr"},
