@@ -158,12 +158,15 @@ def raster_facets(
     Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
     number.
     """
-    rows = z_buffer.shape[0]
+    rows, cols = z_buffer.shape
     for t in range(len(corner)):
         y = triple(xy[1], corner[t])
         if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x, xr = triple(xy[0], corner[t]), triple(xy[2], corner[t])
+        x = triple(xy[0], corner[t])
+        if misses(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), first[1], cols):
+            continue
+        xr = triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         raster_triangle(x, y, d, first, t, z_buffer, index)
 

@@ -139,12 +139,9 @@ def _tops_of(
     store: SurfaceStore, block: Block, views: tuple[SunView, SunView]
 ) -> tuple[_Tops, _Tops]:
     """Of a block of the surface, in the view of each sun."""
-    vertices = store.window([block]).vertices
-    corner = _triangles(store.arrays(block, ["facet", "whole", "top"]))
-    left, right = (
-        _rastered(view.position(vertices.lon_q, vertices.lat_q, vertices.h_q), vertices.h_q, corner)
-        for view in views
-    )
+    arrays = store.arrays(block, ["lon", "lat", "height", "facet", "whole", "top"])
+    lattice, corner = store.positions(block, arrays), _triangles(arrays)
+    left, right = (_rastered(view.position(*lattice), lattice[2], corner) for view in views)
     return left, right
 
 
