@@ -9,7 +9,7 @@ if __name__ == "__main__":
     given = snakemake.input
     with (
         job(snakemake.log[0], f"draw refinement {snakemake.wildcards.scene}"),
-        atomic_outputs(given, snakemake.output, snakemake.params),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         draw_refinement(
             Alignment.load(given.alignment),
