@@ -21,7 +21,8 @@ from site_alignment import SEED, SPACING_M, make_site, pairs_of, refined
 from synthetic_pairs import VIEWS, rectify_by
 
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.site_adjustment import ScenePair, adjust_site, pair_alignment
+from stereotruth.alignment.site_adjustment import adjust_site
+from stereotruth.alignment.site_pair import ScenePair, pair_alignment
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings

@@ -28,7 +28,8 @@ from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.gcp_checks import open_view
 from stereotruth.alignment.refine import refine
-from stereotruth.alignment.site_adjustment import ScenePair, adjust_site, pair_alignment
+from stereotruth.alignment.site_adjustment import adjust_site
+from stereotruth.alignment.site_pair import ScenePair, pair_alignment
 from stereotruth.alignment.tie_equations import write_equations
 from stereotruth.epipolar.pair_quality import quality_of
 from stereotruth.epipolar.rpc import SensorModel

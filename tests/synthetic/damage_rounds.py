@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 from stereotruth.alignment.align import align
+from stereotruth.alignment.align_figure import draw_residuals
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.gcp_checks import open_view
 from stereotruth.epipolar.image_reader import Source
@@ -105,8 +106,8 @@ def _aligned(images: tuple[Path, Path], gcps: Path, folder: Path) -> tuple[Any, 
     found = align(*images, gcps, scene="damaged", provenance={})
     ids = {g.id for fit in found.fits for g in fit.gcps}
     if any(not name.isascii() or not name.isalnum() or len(name) > 8 for name in ids):
-        paths = [folder / f"alignment.{kind}" for kind in ("json", "csv", "png")]
-        write_alignment(found, *paths)
+        write_alignment(found, folder / "alignment.json", folder / "alignment.csv")
+        draw_residuals(found, folder / "alignment.png")
     lon, lat = np.meshgrid(
         np.linspace(-0.01, 0.01, 5) + 115.4, np.linspace(-0.006, 0.006, 5) + 30.2
     )

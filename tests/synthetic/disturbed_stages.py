@@ -73,20 +73,14 @@ STAGES = {
         "align",
         "logs/align/{c}/{c}-1.log",
         "{c}/gcps.csv",
-        tuple(
-            f"results/align/{{c}}/{{c}}-1/{n}"
-            for n in ("alignment.json", "residuals.csv", "residuals.png")
-        ),
+        tuple(f"results/align/{{c}}/{{c}}-1/{n}" for n in ("alignment.json", "residuals.csv")),
         _edit_gcps,
     ),
     "refine": Stage(
         "refine",
         "logs/refine/{c}/{c}-1.log",
         "results/align/{c}/{c}-1/alignment.json",
-        tuple(
-            f"results/refine/{{c}}/{{c}}-1/{n}"
-            for n in ("alignment.json", "observations.csv", "refinement.png")
-        ),
+        tuple(f"results/refine/{{c}}/{{c}}-1/{n}" for n in ("alignment.json", "observations.csv")),
     ),
     "rectify": Stage(
         "rectify",

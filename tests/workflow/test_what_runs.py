@@ -21,22 +21,24 @@ OF_IMAGES = {"predict_scene", "dsm", "score_dsm"}
 PROJECT = {"project", *STRIPS["project"], "export", *OF_TILES}
 RECTIFY = {"rectify", "rectify_strip", *OF_IMAGES, *PROJECT}
 GRID_TRUTH = {"grid_truth", *OF_TRUTH}
+REFINE = {"refine", "draw_refinement"}
+ALIGN = {"align", "draw_residuals", *REFINE}
 METHOD = {"match", "score", "submission", "benchmark_tables", *OF_IMAGES}
 FILES: list[tuple[str, set[str]]] = [
-    ("in/gcps.csv", {"align", "refine", *RECTIFY}),
-    ("in/left.tif", {"surface", "align", "refine", *RECTIFY}),
-    ("in/left.tif.msk", {"surface", "align", "refine", *RECTIFY}),  # a new one
-    ("in/lidar/1.laz", {"ingest", "surface", "refine", *RECTIFY}),
-    ("in/lidar/3.laz", {"ingest", "surface", "refine", *RECTIFY}),  # a new one
-    ("geoid.tif", {"ingest", "surface", "refine", *RECTIFY}),
+    ("in/gcps.csv", {*ALIGN, *RECTIFY}),
+    ("in/left.tif", {"surface", *ALIGN, *RECTIFY}),
+    ("in/left.tif.msk", {"surface", *ALIGN, *RECTIFY}),  # a new one
+    ("in/lidar/1.laz", {"ingest", "surface", *REFINE, *RECTIFY}),
+    ("in/lidar/3.laz", {"ingest", "surface", *REFINE, *RECTIFY}),  # a new one
+    ("geoid.tif", {"ingest", "surface", *REFINE, *RECTIFY}),
     ("mine.py", METHOD),
     ("helper.py", METHOD),  # which mine.py imports
 ]
 KEYS: list[tuple[str, Any, set[str]]] = [
-    ("ingest.drop_classes", [7], {"ingest", "surface", "refine", *RECTIFY, *GRID_TRUTH}),
-    ("alignment.model", "shift", {"align", "refine", *RECTIFY, *GRID_TRUTH}),
+    ("ingest.drop_classes", [7], {"ingest", "surface", *REFINE, *RECTIFY, *GRID_TRUTH}),
+    ("alignment.model", "shift", {*ALIGN, *RECTIFY, *GRID_TRUTH}),
     ("alignment.refine", False, {*RECTIFY, *GRID_TRUTH}),
-    ("rectify.panchromatic", 1, {"refine", *RECTIFY, *GRID_TRUTH}),
+    ("rectify.panchromatic", 1, {*REFINE, *RECTIFY, *GRID_TRUTH}),
     ("project.edge_margin_px", 1, {*PROJECT, *OF_TRUTH}),
     (
         "tiles.size",
@@ -45,7 +47,7 @@ KEYS: list[tuple[str, Any, set[str]]] = [
     ),
     ("quality.max_gcp_rms_px", 2, {"export", *OF_TILES, *OF_TRUTH}),
     ("evaluation.building_share", 0.03, {"export", *OF_TILES, *OF_TRUTH}),
-    ("strict", True, {"align", "refine", *RECTIFY, *GRID_TRUTH}),
+    ("strict", True, {*ALIGN, *RECTIFY, *GRID_TRUTH}),
     ("dataset.catalogs", ["croissant"], OF_TILES - {"evaluate_images", "report_city", "originals"}),
     ("report.sliders", 5, {"report_city"}),
     ("benchmark.bootstrap", 20, {"score", "submission", "benchmark_tables"}),

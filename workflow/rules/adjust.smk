@@ -51,7 +51,7 @@ rule adjusted_alignment:
     params:
         script=content_of("../scripts/adjusted_alignment.py"),
         images=lambda w: ADJUSTED[w.scene],
-        code=source_digest("alignment.site_adjustment"),
+        code=source_digest("alignment.site_pair"),
     message:
         "Alignment of scene {wildcards.scene} by its adjusted images"
     script:

@@ -11,12 +11,6 @@ rule align:
             category="Alignment",
             labels={"scene": "{scene}", "kind": "table"},
         ),
-        figure=report(
-            "results/align/{city}/{scene}/residuals.png",
-            caption="../report/residuals.rst",
-            category="Alignment",
-            labels={"scene": "{scene}", "kind": "figure"},
-        ),
     log:
         "logs/align/{city}/{scene}.log",
     benchmark:
@@ -38,3 +32,32 @@ rule align:
         "Aligning scene {wildcards.scene} to its ground control points"
     script:
         "../scripts/align.py"
+
+
+rule draw_residuals:
+    input:
+        alignment=rules.align.output.alignment,
+    output:
+        figure=report(
+            "results/align/{city}/{scene}/residuals.png",
+            caption="../report/residuals.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "figure"},
+        ),
+    log:
+        "logs/draw_residuals/{city}/{scene}.log",
+    benchmark:
+        "logs/draw_residuals/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        script=content_of("../scripts/draw_residuals.py"),
+        code=source_digest("alignment.align_figure"),
+    message:
+        "Drawing the residuals of scene {wildcards.scene}"
+    script:
+        "../scripts/draw_residuals.py"

@@ -62,6 +62,14 @@ def refinement_figures(wildcards):
     ]
 
 
+def residual_figures(wildcards):
+    """The figures of the residuals of a city's scenes by their control points."""
+    return [
+        f"results/align/{scene.city}/{scene.scene}/residuals.png"
+        for scene in scenes_of(wildcards.city)
+    ]
+
+
 def adjusted_pairs(city):
     """The scenes of a city whose images are adjusted together, by name."""
     return sorted(scene for scene in ADJUSTED if SCENES[scene].city == city)

@@ -14,12 +14,6 @@ rule refine:
             category="Alignment",
             labels={"scene": "{scene}", "kind": "tie points of the refinement"},
         ),
-        figure=report(
-            "results/refine/{city}/{scene}/refinement.png",
-            caption="../report/refinement.rst",
-            category="Alignment",
-            labels={"scene": "{scene}", "kind": "figure of the refinement"},
-        ),
         equations="results/refine/{city}/{scene}/equations.json",
     log:
         "logs/refine/{city}/{scene}.log",
@@ -41,3 +35,34 @@ rule refine:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:
         "../scripts/refine.py"
+
+
+rule draw_refinement:
+    input:
+        left=left_image,
+        alignment=rules.refine.output.alignment,
+        observations=rules.refine.output.observations,
+    output:
+        figure=report(
+            "results/refine/{city}/{scene}/refinement.png",
+            caption="../report/refinement.rst",
+            category="Alignment",
+            labels={"scene": "{scene}", "kind": "figure of the refinement"},
+        ),
+    log:
+        "logs/draw_refinement/{city}/{scene}.log",
+    benchmark:
+        "logs/draw_refinement/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        script=content_of("../scripts/draw_refinement.py"),
+        code=source_digest("alignment.refine_figure"),
+    message:
+        "Drawing the tie points of scene {wildcards.scene}"
+    script:
+        "../scripts/draw_refinement.py"

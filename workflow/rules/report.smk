@@ -7,6 +7,7 @@ rule report_city:
             f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
         ],
         refinements=refinements,
+        residual_figures=residual_figures,
         refinement_figures=refinement_figures,
         table4=rules.evaluate_images.output.table4,
         sift=rules.evaluate_images.output.sift,

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from stereotruth.alignment.site_adjustment import ScenePair, adjust_site, write_site
+from stereotruth.alignment.site_adjustment import adjust_site
+from stereotruth.alignment.site_pair import ScenePair, write_site
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import checksums, describe, file_sha256

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.alignment.site_adjustment import (
+from stereotruth.alignment.site_pair import (
     ScenePair,
     pair_alignment,
     read_site,

@@ -42,9 +42,4 @@ if __name__ == "__main__":
                 logging.getLogger("stereotruth").info("by the RPCs alone: %s", error)
         if alignment is None:
             alignment = from_rpcs(*images, model=model, scene=scene, provenance=provenance)
-        write_alignment(
-            alignment,
-            snakemake.output.alignment,
-            snakemake.output.residuals,
-            snakemake.output.figure,
-        )
+        write_alignment(alignment, snakemake.output.alignment, snakemake.output.residuals)

@@ -37,8 +37,6 @@ if __name__ == "__main__":
             observations,
             snakemake.output.alignment,
             snakemake.output.observations,
-            snakemake.output.figure,
-            given.left[0],
         )
         write_equations(
             snakemake.output.equations,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,8 @@ from ..epipolar.model import EpipolarModel
 from ..epipolar.rpc import SensorModel
 from ..numerics.robust import TUKEY, robust_sigma, tukey_weights
 from .align import RPC_TILT
-from .aligned_pair import Alignment, ViewFit
+from .aligned_pair import Alignment, ViewFit, over_the_image
+from .equations import Equations, PairEquations
 from .tie_points import Geometry, TiePoints
 
 Bools = NDArray[np.bool_]
@@ -45,48 +46,6 @@ class Observations:
     after: Floats
     used: Bools
     of_images: PairEquations
-
-
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """Observations [n] of what the corrections change: observed = design · parameters + errors.
-
-    ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
-    matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
-    and biased where the surface is not what the points say). Observations of one ``site`` int[n]
-    share errors. ``at`` [n, 2] px: place in the left image.
-    """
-
-    design: Floats
-    observed: Floats
-    own: Floats
-    site: NDArray[np.int64]
-    at: Floats
-
-    def part(self, chosen: Bools) -> Equations:
-        """Those that are ``chosen`` [n]."""
-        return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
-
-    def about(self, parameters: Floats) -> Equations:
-        """The same of parameters that are counted from given ones [12]."""
-        return replace(self, observed=self.observed - self.design @ parameters)
-
-
-@dataclass(frozen=True, eq=False)
-class PairEquations:
-    """What the tie points of a pair say of its images, whatever alignment they were found with.
-
-    ``equations``: of the parameters [12] of :func:`parameters_of` of both images, left first.
-    ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
-    with which the tie points were matched. ``places``: where the images were compared, with and
-    without a match. ``common_px``: see :func:`estimate`.
-    """
-
-    equations: Equations
-    start: Floats
-    linearised_at: Floats
-    places: int
-    common_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,15 +311,6 @@ def linearised_at(
         fit.design(at[:, 0], at[:, 1]) for fit, at in zip(alignment.fits, (ties.left, ties.right))
     )
     return np.concatenate([-slopes @ ties.carry @ left, slopes @ right], axis=-1), slopes
-
-
-def over_the_image(fit: ViewFit) -> ViewFit:
-    """The fit with parameters that are those of the image alone: from its middle, by half a side.
-
-    Its covariance is left as it was, in the parameters that the fit had.
-    """
-    cols, rows = fit.size
-    return replace(fit, origin=((cols - 1) / 2, (rows - 1) / 2), scale=max(cols, rows) / 2)
 
 
 def parameters_of(fit: ViewFit) -> Floats:

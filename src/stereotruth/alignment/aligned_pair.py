@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,15 @@ class ViewFit:
         linear = change[:, :2] / self.scale
         shift = change[:, 2] - linear @ np.array(self.origin)
         return self.affine + np.column_stack([linear, shift])
+
+
+def over_the_image(fit: ViewFit) -> ViewFit:
+    """The fit with parameters that are those of the image alone: from its middle, by half a side.
+
+    Its covariance is left as it was, in the parameters that the fit had.
+    """
+    cols, rows = fit.size
+    return replace(fit, origin=((cols - 1) / 2, (rows - 1) / 2), scale=max(cols, rows) / 2)
 
 
 @dataclass(frozen=True, eq=False)

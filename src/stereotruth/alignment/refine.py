@@ -31,10 +31,9 @@ from ..epipolar.image_reader import Source, open_pair
 from ..epipolar.settings import Settings as Bands
 from ..errors import InputError
 from ..lidar.point_store import PointStore, open_stores
-from ..numerics.robust import median_and_nmad, robust_sigma
+from ..numerics.robust import robust_sigma
 from .adjustment import (
     LEAST_SIGMA,
-    Equations,
     Estimate,
     Observations,
     agreement_of_halves,
@@ -47,6 +46,7 @@ from .adjustment import (
     with_corrections,
 )
 from .aligned_pair import Alignment, ViewFit
+from .equations import Equations, spread_of
 from .lidar_checks import (
     HeightOffset,
     control_points_of,
@@ -75,26 +75,6 @@ LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell 
 MIN_USED = 0.5
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
-
-
-def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
-    """Figures of one component [n] in px; the trend is that of a plane over the left image.
-
-    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
-    """
-    median, nmad = median_and_nmad(values)
-    middle, half = np.array(size) / 2, max(size) / 2
-    design = np.column_stack([(at - middle) / half, np.ones(len(values))])
-    plane = np.linalg.lstsq(design, values, rcond=None)[0]
-    figures = {
-        "median": median,
-        "nmad": nmad,
-        "rms": float(np.sqrt(np.mean(values**2))),
-        "trend_rms": float(np.sqrt(np.mean((design @ plane) ** 2))),
-        "trend_over_half_the_image_col": float(plane[0]),
-        "trend_over_half_the_image_row": float(plane[1]),
-    }
-    return {name: round(value, 4) for name, value in figures.items()}
 
 
 def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:

@@ -1,25 +1,21 @@
-"""The adjustment of a site's images as files: figures by image and pair, and pairs' alignments."""
+"""The adjustment of a site's images: figures by image and pair."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.rpc import RPC, SensorModel
+from ..epipolar.rpc import RPC
 from ..errors import InputError
-from ..products.files import atomic_file, read_record, sealed
-from .adjustment import over_the_image
 from .align import LARGE_SHIFT
-from .aligned_pair import Alignment, GcpResidual, ViewFit
+from .aligned_pair import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
 from .image_doubts import HEAVY, image_doubts
-from .refine import spread_of
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -31,6 +27,7 @@ from .site_fit import (
     fit_site,
     residual_figures,
 )
+from .site_pair import ScenePair, read_site, rpc_alone
 from .tie_equations import read_equations
 
 log = logging.getLogger("stereotruth")
@@ -52,27 +49,6 @@ UNITS = {
     "weight": "0 to 1, of a pair in the adjustment",
     "covariance": "px^2 of all parameters, images in ascending order of their names",
 }
-
-
-@dataclass(frozen=True)
-class ScenePair:
-    """A scene and the names of its images, its refined alignment, equations and control points."""
-
-    scene: str
-    left: str
-    right: str
-    alignment: Path
-    equations: Path
-    gcps: Path | None = None
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Of both images."""
-        return self.left, self.right
-
-
-def _rpc_alone(fit: ViewFit) -> ViewFit:
-    return over_the_image(replace(fit, affine=np.eye(2, 3), gcps=()))
 
 
 def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int]) -> PointsOfImage:
@@ -98,7 +74,7 @@ def _images(
     for pair in pairs:
         alignment = alignments[pair.scene]
         for name, fit, sensor in zip(pair.names, alignment.fits, (alignment.left, alignment.right)):
-            starts.setdefault(name, (_rpc_alone(fit), sensor.rpc))
+            starts.setdefault(name, (rpc_alone(fit), sensor.rpc))
             rows.setdefault(name, {})
         if pair.gcps is None:
             continue
@@ -146,15 +122,6 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
         covariance[start:end, start:end] = block
         start = end
     return FixedImages(parameters, covariance)
-
-
-def read_site(path: str | Path) -> dict[str, Any]:
-    """What :func:`write_site` wrote. Raises InputError if it is damaged or something else."""
-
-    def checked(values: dict[str, Any]) -> dict[str, Any]:
-        return values | {name: values[name] for name in ("images", "pairs", "covariance")}
-
-    return read_record(path, checked, what="adjusted images", stage="adjust")
 
 
 def adjust_site(
@@ -209,12 +176,6 @@ def adjust_site(
         "covariance": {"images": list(fit.names), "values": fit.covariance.tolist()},
         "provenance": dict(provenance or {}),
     }
-
-
-def write_site(values: Mapping[str, Any], path: str | Path) -> None:
-    """Write what :func:`adjust_site` found, as JSON."""
-    with atomic_file(path) as scratch:
-        scratch.write_text(sealed(values), encoding="utf-8")
 
 
 def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
@@ -295,56 +256,6 @@ def _image_figures(
     }
 
 
-def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """alignment.json of a pair by its images' adjusted corrections, JSON-ready.
-
-    ``site``: what :func:`adjust_site` found, or an earlier one that has both images.
-    Of a pair whose image is refused it has the sentence ``refused`` alone, which
-    :meth:`.Alignment.load` raises.
-    """
-    figures = [site["images"][name] for name in scene.names]
-    for name, image in zip(scene.names, figures):
-        if image["refused"]:
-            return {"refused": f"scene {scene.scene}: image {name}: {image['refused']}"}
-    base = Alignment.load(scene.alignment)
-    order = site["covariance"]["images"]
-    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in scene.names])
-    covariance = np.array(site["covariance"]["values"])[np.ix_(index, index)]
-    fits, sensors, warnings = [], [], list(base.warnings)
-    for k, (name, image, fit, sensor) in enumerate(
-        zip(scene.names, figures, base.fits, (base.left, base.right))
-    ):
-        own = slice(6 * k, 6 * k + 6)
-        start = _rpc_alone(fit)
-        affine = start.moved(np.array(image["parameters"]))
-        gcps = tuple(
-            GcpResidual(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
-            for row in image["gcps"]["points"]
-        )
-        fits.append(
-            replace(
-                start,
-                affine=affine,
-                gcps=gcps,
-                sigma0=site["gcp_sigma_px"] if gcps else np.nan,
-                redundancy=2 * sum(g.used for g in gcps),
-                covariance=covariance[own, own],
-            )
-        )
-        sensors.append(SensorModel(sensor.rpc, affine))
-        warnings += [f"image {name}: {text}" for text in image["doubts"]]
-    return replace(
-        base,
-        left=sensors[0],
-        right=sensors[1],
-        left_fit=fits[0],
-        right_fit=fits[1],
-        cross_covariance=covariance[:6, 6:],
-        warnings=tuple(warnings),
-        refinement=_refinement(site, scene),
-    ).to_dict()
-
-
 def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any]]:
     """The control points of an image with their residuals, px, JSON-ready."""
     rows = zip(fit.residuals[name], fit.leave_one_out[name], fit.used[name])
@@ -364,31 +275,3 @@ def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any
         }
         for k, (after, one_out, used) in enumerate(rows)
     ]
-
-
-def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """The record of the refinement: the pair's tie points before and after the adjustment."""
-    record = {"applied": True, "reason": ""}
-    ties, reason = read_equations(scene.equations)
-    if ties is None:
-        return record | {"tie_points": 0, "without_own_tie_points": reason}
-    equations = ties.equations
-    used = site["pairs"].get(scene.scene, {}).get("used")  # none of a pair that came later
-    images = [np.array(site["images"][name]["parameters"]) for name in scene.names]
-    size = tuple(site["images"][scene.left]["size"])
-    spreads = {}
-    for word, parameters in (("before", ties.start), ("after", np.concatenate(images))):
-        values = equations.observed - equations.design @ parameters
-        spreads[word] = {
-            name: spread_of(values[:, k], equations.at, size)
-            for k, name in enumerate(("disparity", "y_parallax"))
-        }
-    return record | {
-        "tie_points": len(equations.own),
-        "used": used,
-        "sites": int(np.unique(equations.site).size),
-        **spreads,
-        "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
-        "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
-        "of all images of the site",
-    }

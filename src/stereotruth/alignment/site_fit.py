@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.robust import huber_weights, robust_sigma, tukey_weights
-from .adjustment import Equations, Estimate, PairEquations, Sums, estimate
+from .adjustment import Estimate, Sums, estimate
 from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
 from .aligned_pair import ViewFit
+from .equations import Equations, PairEquations
 from .robust_fit import BLUNDER_FLOOR
 
 Bools = NDArray[np.bool_]
@@ -101,7 +102,7 @@ class SiteFit:
     """Corrections of all images. ``names`` in ascending order.
 
     ``parameters`` by name [6], of the affine against none in the image's own coordinates
-    (:func:`.adjustment.over_the_image`); ``covariance`` [6 n, 6 n] px² in the order of ``names``.
+    (:func:`.aligned_pair.over_the_image`); ``covariance`` [6 n, 6 n] px² in the order of ``names``.
     ``residuals``, ``leave_one_out`` by name [n, 2] px and ``used`` bool[n] of the control points,
     ``point_sigma`` px of one. ``pairs`` by scene, of those that have tie points. ``scatter``: of
     the pairs against each other, in the standard deviations that each states, at least 1.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..products.files import atomic_file, read_record, sealed
-from .adjustment import Equations, PairEquations
+from .equations import Equations, PairEquations
 
 MEANING = (
     "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "

@@ -22,6 +22,7 @@ Bools = NDArray[np.bool_]
 
 # What lies in front of a surface by less is the surface itself.
 OCCLUSION_TOLERANCE_PX = 0.25
+ROUNDING_PX = 1e-6  # of where an edge meets a row
 
 
 class RightPixels(NamedTuple):
@@ -157,14 +158,37 @@ def raster_facets(
     Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
     number.
     """
-    rows = z_buffer.shape[0]
+    rows, cols = z_buffer.shape
     for t in range(len(corner)):
         y = triple(xy[1], corner[t])
         if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x, xr = triple(xy[0], corner[t]), triple(xy[2], corner[t])
+        x = triple(xy[0], corner[t])
+        if misses(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), first[1], cols):
+            continue
+        xr = triple(xy[2], corner[t])
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         raster_triangle(x, y, d, first, t, z_buffer, index)
+
+
+@inner
+def _exceeds_any(
+    left: float, right: float, top: int, bottom: int, highest: float, pixels: RightPixels
+) -> bool:
+    """Whether a disparity of ``highest`` exceeds the ``limit`` of any pixel in rows ``top`` to
+    ``bottom`` whose column in the right image lies between ``left`` and ``right``; most surfaces
+    hide nothing."""
+    first, width, start, limit = pixels.first, pixels.width, pixels.start, pixels.limit
+    begin = max(int(np.floor(left - ROUNDING_PX)) - first[1], 0)
+    end = min(int(np.floor(right + ROUNDING_PX)) - first[1], width - 1) + 1
+    if begin >= end:
+        return False
+    for row in range(top, bottom + 1):
+        base = (row - first[0]) * width
+        for k in range(start[base + begin], start[base + end]):
+            if limit[k] < highest:
+                return True
+    return False
 
 
 @inner
@@ -177,10 +201,13 @@ def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools
     bottom = min(int(np.floor(max(y[0], y[1], y[2]))), first[0] + rows - 1)
     if top > bottom:
         return
+    lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
+    low, high = min(x[0], x[1], x[2]), max(x[0], x[1], x[2])
+    if not _exceeds_any(low, high, top, bottom, highest, pixels):
+        return
     gx, gy = plane_slopes(x, y, d)
     if not np.isfinite(gx + gy):
         return
-    lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
     for row in range(top, bottom + 1):
         low, high = row_span(x, y, float(row))
         if not low <= high:
@@ -289,6 +316,8 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         low, high = _range(y)
         if misses(low, high, first[0], rows):
             continue
+        top = max(int(np.ceil(low)), first[0])
+        bottom = min(int(np.floor(high)), first[0] + rows - 1)
         _at_heights(prisms, t, 2, xr)
         low, high = _range(xr)
         if np.floor(high) < first[1] or np.floor(low) >= first[1] + width:
@@ -296,6 +325,8 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         _at_heights(prisms, t, 0, x)
         for k in range(6):
             d[k] = x[k] - xr[k]
+        if not _exceeds_any(low, high, top, bottom, _range(d)[1], pixels):
+            continue
         for face in faces[: _faces_seen(xr, y, d, faces)]:
             _hide_right(triple(xr, face), triple(y, face), triple(d, face), pixels, hidden)
 

@@ -116,6 +116,73 @@ def _possible(across: int, down: int) -> int:
     return octants
 
 
+@inner
+def _may_be_surrounded(
+    top: Steps,
+    limit: int,
+    row: int,
+    col: int,
+    n: int,
+    shape: tuple[int, int],
+    surrounded: NDArray[np.bool_],
+) -> bool:
+    """Whether pixels up to ``n`` px off whose ``top`` lies above a ``limit`` leave no gap.
+
+    Beside a wall, what is higher lies to one side: no need to look closer.
+    """
+    rows, cols = shape
+    octants = 0
+    for b in range(max(row - n, 0), min(row + n + 1, rows)):
+        for a in range(max(col - n, 0), min(col + n + 1, cols)):
+            if top[b * cols + a] > limit:
+                octants |= _possible(a - col, b - row)
+                if surrounded[octants]:
+                    return True
+    return False
+
+
+@inner
+def _is_surrounded(
+    window: _Window,
+    k: int,
+    p: int,
+    n: int,
+    far: float,
+    top: Steps,
+    tops: Steps,
+    known: NDArray[np.bool_],
+    surrounded: NDArray[np.bool_],
+) -> bool:
+    """Whether parts of higher disparity lie on all sides of point ``k`` of pixel ``p``.
+
+    Of pixels up to ``n`` px off, up to the squared distance ``far`` (steps²). ``top``: greatest
+    disparity of each pixel; ``tops`` of its parts, written where they are not ``known``.
+    """
+    points, start, (rows, cols) = window.points, window.start, window.shape
+    row, col = p // cols, p % cols
+    limit = points[k].disparity + _SURFACE
+    octants = 0
+    for b in range(max(row - n, 0), min(row + n + 1, rows)):
+        for a in range(max(col - n, 0), min(col + n + 1, cols)):
+            q = b * cols + a
+            if top[q] <= limit:
+                continue
+            if not known[q]:
+                known[q] = True
+                _fine_tops(points, start, q, tops)
+            du = (a - col) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].u
+            dv = (b - row) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].v
+            for part in range(_FINE * _FINE):
+                if tops[q * _FINE * _FINE + part] > limit:
+                    s = du + part % _FINE * _FINE_STEPS
+                    t = dv + part // _FINE * _FINE_STEPS
+                    if s * s + t * t <= far:
+                        octants |= 1 << _octant(s, t)
+            if surrounded[octants]:
+                return True
+    return False
+
+
 @kernel
 def _mark_covered(
     window: _Window, near: Steps, ceilings: Steps, surrounded: NDArray[np.bool_], ranges: _Ranges
@@ -129,7 +196,7 @@ def _mark_covered(
     low, top, ceilings = ranges.low, ceilings[0], ceilings[1:]
     tops = np.empty(top.size * _FINE * _FINE, np.int32)  # only what is needed is written
     known = np.zeros(top.size, np.bool_)
-    rows, cols = shape
+    cols = shape[1]
     for p in range(top.size):
         if ceilings[-1, p] <= low[p] + _SURFACE:
             continue
@@ -138,42 +205,19 @@ def _mark_covered(
         n = int(reach + 0.875)  # the parts' centres reach to 3 / 8 px, places to 1 / 2 px
         far = (reach * PX) ** 2
         row, col = p // cols, p % cols
-        first_row, end_row = max(row - n, 0), min(row + n + 1, rows)
-        first_col, end_col = max(col - n, 0), min(col + n + 1, cols)
+        # no point of the pixel is lower
+        if not _may_be_surrounded(top, low[p] + _SURFACE, row, col, n, shape, surrounded):
+            continue
         covered = False
         for k in range(start[p], start[p + 1]):
             limit = points[k].disparity + _SURFACE
             if ceilings[n - 1, p] <= limit:
                 continue
-            # Beside a wall, what is higher lies to one side: no need to look closer.
-            octants = 0
-            for b in range(first_row, end_row):
-                for a in range(first_col, end_col):
-                    if top[b * cols + a] > limit:
-                        octants |= _possible(a - col, b - row)
-            if not surrounded[octants]:
+            if not _may_be_surrounded(top, limit, row, col, n, shape, surrounded):
                 continue
-            octants = 0
-            for b in range(first_row, end_row):
-                for a in range(first_col, end_col):
-                    q = b * cols + a
-                    if top[q] <= limit:
-                        continue
-                    if not known[q]:
-                        known[q] = True
-                        _fine_tops(points, start, q, tops)
-                    du = (a - col) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].u
-                    dv = (b - row) * PX - PX // 2 + _FINE_STEPS // 2 - points[k].v
-                    for part in range(_FINE * _FINE):
-                        if tops[q * _FINE * _FINE + part] > limit:
-                            s = du + part % _FINE * _FINE_STEPS
-                            t = dv + part // _FINE * _FINE_STEPS
-                            if s * s + t * t <= far:
-                                octants |= 1 << _octant(s, t)
-                if surrounded[octants]:
-                    flags[k] = 0
-                    covered = True
-                    break
+            if _is_surrounded(window, k, p, n, far, top, tops, known, surrounded):
+                flags[k] = 0
+                covered = True
         if covered:
             _update_range(window, p, ranges)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ Bools = NDArray[np.bool_]
 
 CELLS = 2  # of the ground along the side of a cell of a sun's view: a pixel
 ABOVE_M = 0.5  # what is higher than a pixel by less is the surface itself
+KEPT = 512  # blocks whose tops are kept for the next windows, some 0.3 MB each
 
 
 @kernel
@@ -132,22 +134,50 @@ def _no_tops(positions: Floats) -> _Tops:
     return _Tops(np.full((rows, cols), -np.inf), (int(low[1]), int(low[0])))
 
 
+@lru_cache(maxsize=KEPT)
+def _tops_of(
+    store: SurfaceStore, block: Block, views: tuple[SunView, SunView]
+) -> tuple[_Tops, _Tops]:
+    """Of a block of the surface, in the view of each sun."""
+    arrays = store.arrays(block, ["lon", "lat", "height", "facet", "whole", "top"])
+    lattice, corner = store.positions(block, arrays), _triangles(arrays)
+    left, right = (_rastered(view.position(*lattice), lattice[2], corner) for view in views)
+    return left, right
+
+
+def _rastered(position: Floats, h: Ints, corner: Steps) -> _Tops:
+    """Of triangles at ``position`` [2, n] (cells) in a sun's view."""
+    tops = _no_tops(position)
+    _raster(position, h, corner, tops.first, tops.z, np.empty(tops.z.shape, np.int32))
+    return tops
+
+
 def _raise_tops(
     tops: Sequence[_Tops],
-    views: Sequence[SunView],
+    views: tuple[SunView, SunView],
     store: SurfaceStore,
     casters: Sequence[Sequence[Block]],
 ) -> None:
-    """By the surface's blocks that cast shadows in each view, one block after another."""
+    """By the surface's blocks that cast shadows in each view."""
     of_view = [set(blocks) for blocks in casters]
-    unused = [np.empty(top.z.shape, np.int32) for top in tops]
     for block in sorted(set().union(*of_view)):
-        vertices = store.window([block]).vertices
-        corner = _triangles(store.arrays(block, ["facet", "whole", "top"]))
-        lattice = vertices.lon_q, vertices.lat_q, vertices.h_q
-        for top, view, blocks, index in zip(tops, views, of_view, unused):
+        for top, of_block, blocks in zip(tops, _tops_of(store, block, views), of_view):
             if block in blocks:
-                _raster(view.position(*lattice), vertices.h_q, corner, top.first, top.z, index)
+                _raise(top, of_block)
+
+
+def _raise(tops: _Tops, others: _Tops) -> None:
+    """To those of ``others`` that are higher, where both views overlap."""
+    here, there = [], []
+    for axis in range(2):
+        start = max(tops.first[axis], others.first[axis])
+        stop = min(one.first[axis] + one.z.shape[axis] for one in (tops, others))
+        if start >= stop:
+            return
+        here.append(slice(start - tops.first[axis], stop - tops.first[axis]))
+        there.append(slice(start - others.first[axis], stop - others.first[axis]))
+    part = tops.z[tuple(here)]
+    np.maximum(part, others.z[tuple(there)], out=part)
 
 
 @kernel

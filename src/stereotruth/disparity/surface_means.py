@@ -36,15 +36,19 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
     return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
 
 
+@kernel
 def apart_from_steps(disparity: Floats) -> Bools:
-    """Pixels [h, w] whose neighbours all have a disparity within SURFACE_PX of theirs."""
+    """Pixels [h, w] whose eight neighbours all have a disparity within SURFACE_PX of theirs."""
     rows, cols = disparity.shape
-    around = np.pad(disparity, 1, constant_values=np.nan)
-    out = np.ones(disparity.shape, np.bool_)
-    for down in range(3):
-        for across in range(3):
-            near = around[down : down + rows, across : across + cols]
-            out &= np.abs(near - disparity) <= SURFACE_PX  # also false for NaN
+    out = np.zeros(disparity.shape, np.bool_)
+    for j in range(1, rows - 1):
+        for i in range(1, cols - 1):
+            apart = True
+            for b in range(j - 1, j + 2):
+                for a in range(i - 1, i + 2):
+                    # also false for NaN
+                    apart &= abs(disparity[b, a] - disparity[j, i]) <= SURFACE_PX
+            out[j, i] = apart
     return out
 
 
@@ -121,6 +125,6 @@ def surface_mean(
     _voters(values, disparity, known, voters)
     slope = np.ascontiguousarray(slope, dtype=np.float32)
     if runs is None:
-        runs = wanted_runs(np.ones(disparity.shape, np.bool_))
+        runs = wanted_runs(np.isfinite(disparity))
     _surface_mean(known, disparity, voters, slope, reach, every, runs, out)
     return out

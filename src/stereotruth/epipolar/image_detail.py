@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels import kernel
 from ..numerics.summed_area import window_sums
 
 Ints = NDArray[np.int64]
@@ -50,7 +51,8 @@ def detail(
     has_values = window_sums(whole == 0, AROUND_PX) == 0
     inner = np.s_[half:-half, half:-half]
     if shaded is None:
-        out[inner] = np.where(has_values, _deviation(whole[inner], count, total, squares, noise), 0)
+        counts = np.full(total.shape, count)
+        _fill_deviations(whole[inner], has_values, counts, total, squares, noise, out[inner])
     else:
         out[inner] = _of_one_light(whole, shaded, has_values, noise)
     variance = squares / count**2
@@ -61,26 +63,40 @@ def detail(
     return out, signal
 
 
-def _deviation(values: Ints, count: Ints | int, total: Ints, squares: Ints, noise: float) -> Floats:
+@kernel
+def _fill_deviations(
+    values: Ints,
+    here: Bools,
+    count: Ints,
+    total: Ints,
+    squares: Ints,
+    noise: float,
+    out: NDArray[np.floating],
+) -> None:
     """Of ``values`` [h, w] from the mean of ``count`` pixels of the sum ``total``, whose variance
-    is ``squares`` / count²; with MEAN."""
-    deviation = (count * values - total) / count
-    deviation /= np.sqrt(squares / np.square(count) + NOISE_SHARE * noise + LEAST_DN2)
-    return np.clip(deviation, -GREATEST, GREATEST) + MEAN
+    is ``squares`` / count²; with MEAN. To ``out``, at the pixels ``here``."""
+    for j in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            if here[j, i]:
+                n = count[j, i]
+                deviation = (n * values[j, i] - total[j, i]) / n
+                deviation /= np.sqrt(squares[j, i] / (n * n) + NOISE_SHARE * noise + LEAST_DN2)
+                out[j, i] = min(max(deviation, -GREATEST), GREATEST) + MEAN
 
 
-def _of_one_light(whole: Ints, shaded: Bools, has_values: Bools, noise: float) -> Floats:
+def _of_one_light(
+    whole: Ints, shaded: Bools, has_values: Bools, noise: float
+) -> NDArray[np.float32]:
     """The detail of the inner pixels of an image, by the pixels around of their own light."""
     half = AROUND_PX // 2
     inner = np.s_[half:-half, half:-half]
     in_shadow = window_sums(np.pad(shaded, 1, mode="edge"), 3)
-    out = np.zeros(has_values.shape)
+    out = np.zeros(has_values.shape, np.float32)
     for pixels in (0, 9):  # of 3 x 3, in shadow
         use = in_shadow == pixels
         count, of_these = window_sums(use, AROUND_PX), np.where(use, whole, 0)
         total = window_sums(of_these, AROUND_PX)
         squares = count * window_sums(of_these * of_these, AROUND_PX) - total * total
         here = use[inner] & has_values & (count >= LEAST_PIXELS)
-        several = np.maximum(count, 1)
-        out[here] = _deviation(whole[inner], several, total, squares, noise)[here]
+        _fill_deviations(whole[inner], here, count, total, squares, noise, out)
     return out

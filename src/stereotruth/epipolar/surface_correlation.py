@@ -200,10 +200,11 @@ def correlation_and_expected(
     window in the image that varies more: the attenuation of a correlation by errors of measurement
     (Spearman 1904). NaN also where noise leaves so little of it that chance may do as well.
     """
-    every = np.ones(left.shape, np.bool_)
+    if clear is None:
+        clear = np.ones(left.shape, np.bool_)
     values, known, counted, out, expected = np.empty((5, *left.shape), np.float32)
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    _as_compared(warped, disparity, every if clear is None else clear, values, known, counted)
+    _as_compared(warped, disparity, clear, values, known, counted)
     _correlation(
         np.ascontiguousarray(left, dtype=np.float32),
         values,
@@ -212,7 +213,7 @@ def correlation_and_expected(
         np.ascontiguousarray(slope, dtype=np.float32),
         window // 2,
         noise,
-        wanted_runs(every) if runs is None else runs,
+        wanted_runs(np.isfinite(known)) if runs is None else runs,
         out,
         expected,
     )

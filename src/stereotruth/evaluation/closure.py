@@ -35,8 +35,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..alignment.adjustment import PairEquations, estimate, over_the_image, parameters_of
-from ..alignment.aligned_pair import Alignment
+from ..alignment.adjustment import estimate, parameters_of
+from ..alignment.aligned_pair import Alignment, over_the_image
+from ..alignment.equations import PairEquations
 from ..alignment.site_fit import rpc_prior
 from ..alignment.tie_equations import read_equations
 from ..epipolar.model import EpipolarModel

@@ -148,10 +148,10 @@ class WindowSurface:
             ("top", ("top_residual", "is_gentle")),
         ):
             corner = arrays[name] + np.int32(start)
-            touching = region.touching(self.vertices, corner)
-            out[name] = corner[touching]
+            touching = np.flatnonzero(region.touching(self.vertices, corner))
+            out[name] = corner.take(touching, axis=0)  # a fourth of the time of a mask's
             for values in beside:
-                out[values] = arrays[values][touching]
+                out[values] = arrays[values].take(touching, axis=0)
         return out
 
 
@@ -241,6 +241,13 @@ class SurfaceStore:
                 remedy=f"delete {self.path} and run the workflow again",
             ) from error
 
+    def positions(self, block: Block, arrays: dict[str, NDArray]) -> tuple[NDArray[np.int64], ...]:
+        """Longitude, latitude and height (lattice steps) of a block's vertices, by its arrays."""
+        col, row = (number * self.side for number in (block.col, block.row))
+        lon = arrays["lon"] + np.int64(col * self.scale.cell[0])
+        lat = arrays["lat"] + np.int64(row * self.scale.cell[1])
+        return lon, lat, arrays["height"].astype(np.int64)
+
     def window(self, blocks: Sequence[Block]) -> WindowSurface:
         """Of some blocks, one at least."""
         cell = self.scale.cell
@@ -249,11 +256,9 @@ class SurfaceStore:
         parts = []
         for block in blocks:
             a = self.arrays(block, list(ARRAYS)[:6])
-            lon = a["lon"] + np.int64(block.col * self.side * cell[0])
-            lat = a["lat"] + np.int64(block.row * self.side * cell[1])
+            lon, lat, h = self.positions(block, a)
             x = (lon - first[0] * cell[0]) * PART // cell[0]
             y = (lat - first[1] * cell[1]) * PART // cell[1]
-            h = a["height"].astype(np.int64)
             count = a["count"].astype(np.int32)
             day = np.broadcast_to(a["day"], lon.shape)
             parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count, day))

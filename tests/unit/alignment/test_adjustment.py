@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.alignment.adjustment import Equations, estimate
+from stereotruth.alignment.adjustment import estimate
+from stereotruth.alignment.equations import Equations
 
 # ------------------------------------------------------------------------------- the estimate
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stereotruth.alignment.align import RPC_SHIFT, align, from_rpcs
+from stereotruth.alignment.align_figure import draw_residuals
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.epipolar.rpc import SensorModel
@@ -254,7 +255,8 @@ def test_without_gcps_the_rpcs_stand_with_their_uncertainty(images, tmp_path):
     assert np.sqrt(np.diag(middle)) == pytest.approx([RPC_SHIFT] * 2, rel=1e-3)
     assert "no ground control points" in alignment.warnings[0]
     files = [tmp_path / name for name in ("a.json", "r.csv", "f.png")]
-    write_alignment(alignment, *files)
+    write_alignment(alignment, *files[:2])
+    draw_residuals(alignment, files[2])
     again = Alignment.load(files[0])
     assert again.to_dict() == alignment.to_dict()
     assert np.isnan(again.left_fit.sigma0) and np.isnan(again.left_fit.rms("after"))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stereotruth.alignment.align_figure import draw_residuals
 from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.aligned_pair import Alignment
 
@@ -21,8 +22,9 @@ def test_json_keeps_everything(images, tmp_path):
     rows[3]["right_col"] = rows[3]["right_row"] = ""
     result = run(images, tmp_path, rows)
     paths = [tmp_path / f"residuals.{ext}" for ext in ("json", "csv", "png")]
-    write_alignment(result, *paths)
+    write_alignment(result, *paths[:2])
     again = Alignment.load(paths[0])
+    draw_residuals(again, paths[2])
     assert again.to_dict() == result.to_dict()
     assert np.array_equal(again.left.packed(), result.left.packed())
     heights = [row["height"] for row in rows]  # each is used in one view at least

@@ -10,9 +10,10 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.alignment.adjustment import Equations, Estimate, estimate
+from stereotruth.alignment.adjustment import Estimate, estimate
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import GcpResidual
+from stereotruth.alignment.equations import Equations
 from stereotruth.alignment.lidar_checks import (
     LIDAR_SIGMA_M,
     doubt_at_gcps,

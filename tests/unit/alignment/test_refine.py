@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from stereotruth.alignment.aligned_pair import Alignment, GcpResidual
 from stereotruth.alignment.label_uncertainty import label_sigma
 from stereotruth.alignment.refine import refine
+from stereotruth.alignment.refine_figure import draw_refinement
 from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rpc import SensorModel
@@ -268,7 +269,8 @@ def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
 def test_json_keeps_the_refinement(found, images, tmp_path):
     refined, observations = found
     files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]
-    write_refinement(refined, observations, *files, images[0])
+    write_refinement(refined, observations, *files[:2])
+    draw_refinement(refined, *files[1:], images[0])
     again = Alignment.load(files[0])
     assert again.to_dict() == refined.to_dict()
     assert (again.covariance == refined.covariance).all()
@@ -284,8 +286,8 @@ def test_json_keeps_the_refinement(found, images, tmp_path):
     assert share_of(upper, "C0") > 1e-3  # arrows of the sites
     assert colours_in(over_image) > 2e-3  # tie points over the image
     assert colours_in(lower) > 2e-3  # and histograms below
-    write_refinement(
-        replace(refined, refinement={"applied": False, "reason": "x"}), None, *files, images[0]
-    )
+    unrefined = replace(refined, refinement={"applied": False, "reason": "x"})
+    write_refinement(unrefined, None, *files[:2])
+    draw_refinement(unrefined, *files[1:], images[0])
     assert len(files[1].read_text().splitlines()) == 1
     assert colours_in(read_picture(files[2])) == 0  # nothing but its title

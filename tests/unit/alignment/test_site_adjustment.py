@@ -10,21 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.alignment.adjustment import (
-    Equations,
-    PairEquations,
-    over_the_image,
-    parameters_of,
-)
-from stereotruth.alignment.aligned_pair import Alignment, ViewFit
+from stereotruth.alignment.adjustment import parameters_of
+from stereotruth.alignment.aligned_pair import Alignment, ViewFit, over_the_image
 from stereotruth.alignment.control_points import LONG
-from stereotruth.alignment.site_adjustment import (
-    ScenePair,
-    adjust_site,
-    pair_alignment,
-    read_site,
-    write_site,
-)
+from stereotruth.alignment.equations import Equations, PairEquations
+from stereotruth.alignment.site_adjustment import adjust_site
+from stereotruth.alignment.site_pair import ScenePair, pair_alignment, read_site, write_site
 from stereotruth.alignment.tie_equations import read_equations, write_equations
 from stereotruth.errors import InputError
 from stereotruth.products.files import write_table

@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stereotruth.alignment.adjustment import Equations, PairEquations
 from stereotruth.alignment.aligned_pair import ViewFit
+from stereotruth.alignment.equations import Equations, PairEquations
 from stereotruth.alignment.site_fit import (
     FixedImages,
     ImageToFit,

@@ -1,0 +1,13 @@
+"""One scene's residuals of the ground control points, drawn."""
+
+from stereotruth.alignment.align_figure import draw_residuals
+from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.job import job
+from stereotruth.products.atomic_outputs import atomic_outputs
+
+if __name__ == "__main__":
+    with (
+        job(snakemake.log[0], f"draw residuals {snakemake.wildcards.scene}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        draw_residuals(Alignment.load(snakemake.input.alignment), snakemake.output.figure)
