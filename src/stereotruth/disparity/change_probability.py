@@ -27,7 +27,7 @@ from ..epipolar.alike_correlation import alike_correlation
 from ..epipolar.surface_correlation import wanted_runs
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .shifted_agreement import ShiftedAgreement, shifted_agreement
+from .shifted_agreement import SHIFTS_PX, ShiftedAgreement, shifted_agreement
 from .surface_means import surface_mean, warp_to_left
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ Bools = NDArray[np.bool_]
 
 SURROUNDINGS_PX = 8  # pixels up to here are averaged: the detail's agreement, and probabilities
 ALIKE_PX = 4  # up to here lie the pixels that are alike, and the means of their agreement
-AGREEMENT_LIMITS = -0.5, 0.9  # of an agreement that counts
+LEAST_AGREEMENT, FULL_AGREEMENT = -0.5, 0.8  # beyond these an agreement counts as these
 WEAK = 0.4  # share of signal, with less of which the absence of agreement tells little
 SURE = 1e-4  # no probability counts as nearer to 0 or to 1
 CHANGED = 0.15  # more probable, a label is left out
@@ -57,8 +57,8 @@ class Weights(NamedTuple):
 
 
 # bench/change_probability.py, seeds 1 to 3: without and with predicted shadows
-WEIGHTS = Weights(0.80, -5.14, 8.00, 0.74, 0.23, 1.13, 0.08)
-WEIGHTS_LIT = Weights(1.83, -5.75, 8.43, 0.59, 0.33, 0.94, 0.09)
+WEIGHTS = Weights(1.11, -6.44, 9.70, 0.79, 0.19, 1.16, 0.08)
+WEIGHTS_LIT = Weights(2.30, -7.50, 10.89, 0.70, 0.28, 1.00, 0.09)
 
 
 class Evidence(NamedTuple):
@@ -86,21 +86,24 @@ def change_evidence(
     ``window_px``: side of the windows in which details are correlated; ``noise``: variances of both
     images, DN².
     """
-    detail = shifted_agreement(
-        labels, window, noise, window_px, SURROUNDINGS_PX, labelled, by_light=True
-    )
+
+    def compared(wanted: Bools, shifts: tuple[float, ...]) -> ShiftedAgreement:
+        return shifted_agreement(
+            labels, window, noise, window_px, SURROUNDINGS_PX, wanted, shifts, by_light=True
+        )
+
+    detail = compared(labelled, ())
+    # nothing has an advantage over full agreement
+    shifted = compared(labelled & (detail.here < FULL_AGREEMENT), SHIFTS_PX)
     alike = _alike_agreement(labels, window, noise, labelled)
     agreement = _z(np.fmax(detail.here, alike))
-    advantage = np.maximum(_z(detail.elsewhere) - _z(detail.here), 0.0)
-    return Evidence(agreement, np.nan_to_num(advantage), _is_weak(detail))
+    advantage = np.maximum(_z(shifted.elsewhere) - _z(detail.here), 0.0)
+    is_weak = ~(detail.signal >= WEAK) & ~shifted.is_shifted
+    return Evidence(agreement, np.nan_to_num(advantage), is_weak)
 
 
 def _z(agreement: Singles) -> Floats:
-    return np.arctanh(np.clip(agreement.astype(np.float64), *AGREEMENT_LIMITS))
-
-
-def _is_weak(detail: ShiftedAgreement) -> Bools:
-    return ~(detail.signal >= WEAK) & ~detail.is_shifted
+    return np.arctanh(np.clip(agreement.astype(np.float64), LEAST_AGREEMENT, FULL_AGREEMENT))
 
 
 def _alike_agreement(
