@@ -1,11 +1,11 @@
 """The weights by which images of two lights tell how probable a change is, and how right they are.
 
-python bench/change_probability.py [--seeds 1 2 3] [--unseen 4 5] [--folder FOLDER]
+python bench/change_probability.py [--fit 1 2 3] [--seeds 41 42] [--folder FOLDER]
 
-Fits the logistic regressions of stereotruth.disparity.change_probability to the simulated cities of
-changes.py whose images are a year apart, with and without predicted shadows, and prints the
-weights. Then the share of labels that have changed by the probability that these weights give,
-over the same cities of other seeds.
+Of the simulated cities of changes.py whose images are a year apart, with and without predicted
+shadows: the share of labels that have changed by the probability that
+stereotruth.disparity.change_probability tells. With --fit the weights of its logistic regressions,
+as they follow from the cities of these seeds.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from stereotruth.disparity.change_probability import (
     CHANGED,
+    WEIGHTS,
+    WEIGHTS_LIT,
     Evidence,
     Weights,
     around,
@@ -127,15 +129,16 @@ def main() -> None:
     """Print weights and tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--folder", type=Path, default=Path("results/changes"))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--unseen", type=int, nargs="+", default=[])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[41, 42])
+    parser.add_argument("--fit", type=int, nargs="+", default=[], help="seeds to fit weights to")
     given = parser.parse_args()
-    for lit in (False, True):
-        print("predicted shadows" if lit else "no suns known")
-        weights = fit([s for _, s in samples(given.seeds, given.folder, lit)])
-        print("  " + ", ".join(f"{name} {w:.3f}" for name, w in weights._asdict().items()))
+    for lit, weights in ((False, WEIGHTS), (True, WEIGHTS_LIT)):
+        print("predicted shadows" if lit else "no suns known", flush=True)
+        if given.fit:
+            fitted = fit([s for _, s in samples(given.fit, given.folder, lit)])
+            print("  " + ", ".join(f"{name} {w:.3f}" for name, w in fitted._asdict().items()))
         changed, every = np.zeros((2, len(BINS) - 1), np.int64)
-        for kind, of in samples(given.unseen, given.folder, lit):
+        for kind, of in samples(given.seeds, given.folder, lit):
             p = probability_with(weights, of.evidence, of.labels, of.labelled)
             changed += np.histogram(p[of.changed], BINS)[0]
             every += np.histogram(p[of.changed | of.kept], BINS)[0]
@@ -145,7 +148,7 @@ def main() -> None:
                 for name, part in parts.items()
                 if part.any()
             ]
-            print(f"  {kind}: {', '.join(shares)}")
+            print(f"  {kind}: {', '.join(shares)}", flush=True)
         for low, high, n, of_all in zip(BINS, BINS[1:], changed, every):
             if of_all:
                 print(f"  P {low} to {high}: {100.0 * n / of_all:.2f} % of {of_all} have changed")
