@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from changes import CHANGED_M, CONDITIONS, VIEWS, Case, dated_truth, settings_of
+from changes import CONDITIONS, Case, changed_and_kept, dated_truth, inputs_of
 from numpy.typing import NDArray
 
 from stereotruth.disparity.change_probability import (
@@ -33,11 +33,8 @@ from stereotruth.disparity.change_probability import (
 )
 from stereotruth.disparity.pixel_labels import Labels
 from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.status import VEGETATION_CLASSES, is_labelled
 from stereotruth.disparity.window_points import read_window
-from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.simulate.surfaces import WATER
 
 KINDS = (
     "nothing", "texture", "built", "demolished", "raised", "felled", "grown", "crops", "mixed",
@@ -67,28 +64,18 @@ def samples(seeds: list[int], folder: Path, lit: bool) -> Iterator[tuple[str, Sa
 
 def sample(case: Case, folder: Path) -> Sample:
     """Of the labels that the LiDAR alone would have, but for crowns."""
-    made = case.made(folder)
-    rows, cols = (slice(0, side) for side in EpipolarModel.load(made / "epipolar.json").shape)
-    inputs = SceneInputs.of(
-        *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
-        settings_of(case), alignment=made / "alignment.json", suns=case.suns,
-    ).with_surface(made, workers=1)  # fmt: skip
+    inputs = inputs_of(case, folder)
+    rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
     by_lidar = lidar_labels(inputs, *read_window(inputs, rows, cols))
     window, comparison, labels = by_lidar.window, by_lidar.comparison, by_lidar.labels
     labelled = is_labelled(labels.status)
     evidence = change_evidence(
         labels.labels, window, comparison.window_px, comparison.noise, labelled
     )
-    truth, changes = dated_truth(case, folder)
-    z = changes["height"]
-    with np.errstate(invalid="ignore"):
-        off = np.fmax(*(np.abs(z - changes[f"height_{name}"]) for name in ("lidar", "other")))
-        differs, same = off > CHANGED_M, off < 0.01
-    inside = (truth["covered"] == 1) & np.isfinite(z)
-    same &= (truth["surface"] != WATER) & (truth["visible"] == 1) & (truth["changed_right"] == 0)
-    known = inside & (labelled & ~np.isin(labels.surface_class, VEGETATION_CLASSES))[window.inner]
     changed, kept = np.zeros((2, *labelled.shape), np.bool_)
-    changed[window.inner], kept[window.inner] = known & differs, known & same
+    changed[window.inner], kept[window.inner] = changed_and_kept(*dated_truth(case, folder))
+    known = labelled & ~np.isin(labels.surface_class, VEGETATION_CLASSES)
+    changed, kept = changed & known, kept & known
     return Sample(evidence, labels.labels, labelled, changed, kept)
 
 

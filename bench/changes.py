@@ -201,6 +201,30 @@ def dated_truth(case: Case, folder: Path) -> tuple[dict[str, NDArray], dict[str,
     return arrays, changes
 
 
+def changed_and_kept(
+    truth: dict[str, NDArray], changes: dict[str, NDArray]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels of :func:`dated_truth` that differ by more than CHANGED_M between the worlds; and
+    those that are the same in all of them, seen by both images, and no water."""
+    z = changes["height"]
+    with np.errstate(invalid="ignore"):
+        off = np.fmax(*(np.abs(z - changes[f"height_{name}"]) for name in ("lidar", "other")))
+        differs, same = off > CHANGED_M, off < 0.01
+    inside = (truth["covered"] == 1) & np.isfinite(z)
+    dry = truth["surface"] != WATER
+    seen = (truth["visible"] == 1) & (truth["changed_right"] == 0)
+    return inside & differs, inside & same & dry & seen
+
+
+def inputs_of(case: Case, folder: Path) -> SceneInputs:
+    """What the labels of a case follow from."""
+    made = case.made(folder)
+    return SceneInputs.of(
+        *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
+        settings_of(case), alignment=made / "alignment.json", suns=case.suns,
+    ).with_surface(made, workers=2)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Labelled:
     """The layers of a case's labels, and what is true there, [y, x] of the left grid."""
@@ -214,13 +238,8 @@ class Labelled:
         """Labels made anew; truth kept beside the images."""
         made = case.made(folder)
         arrays, changes = dated_truth(case, folder)
-        inputs = SceneInputs.of(
-            *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
-            settings_of(case), alignment=made / "alignment.json", suns=case.suns,
-        )  # fmt: skip
         out = made.parent / f"{made.name}.zarr"
-        inputs = inputs.with_surface(made, workers=2)
-        project_scene(inputs, out, code="bench", workers=2)
+        project_scene(inputs_of(case, folder), out, code="bench", workers=2)
         grid = require_complete(out)
         return cls({name: grid[name][:] for name in grid.array_keys()}, arrays, changes)
 
@@ -251,19 +270,13 @@ class Row:
     def add(self, case: Case, of: Labelled) -> None:
         """Count the pixels of a case."""
         status, truth, changes = of.layers["status"], of.truth, of.changes
-        z, rise = changes["height"], np.abs(changes["height"] - changes["height_lidar"])
-        with np.errstate(invalid="ignore"):
-            differs = np.fmax(rise, np.abs(z - changes["height_other"])) > CHANGED_M
-            same = np.fmax(rise, np.abs(z - changes["height_other"])) < 0.01
-        inside = (truth["covered"] == 1) & (status != Status.OUT_OF_FRAME) & np.isfinite(z)
-        dry = truth["surface"] != WATER
+        inside = status != Status.OUT_OF_FRAME
+        changed, seen = (inside & pixels for pixels in changed_and_kept(truth, changes))
         known = is_labelled(status)
-        changed = inside & differs
         if case.kind == "leaves":
             changed &= truth["surface"] == TREE
         self.changed += int(changed.sum())
         self.unlabelled += int((changed & ~known).sum())
-        seen = inside & same & dry & (truth["visible"] == 1) & (truth["changed_right"] == 0)
         if case.kind == "texture":
             seen &= changes["reason"] == REASONS.split().index("texture")
         self.kept += int(seen.sum())

@@ -5,7 +5,7 @@ what a window holds besides the unchanged surface disagrees. So a label is confi
 of two agreements (:class:`Evidence`):
 
 - of the *detail* of both images over the surface around a pixel, at its disparity
-  (:mod:`.shifted_agreement`), predicted shadows left apart. It is certain, and takes in what lies
+  (:mod:`.shifted_agreement`), predicted shadows left apart. Many pixels make it sure, but some lie
   up to 12 px off;
 - of the *brightness* over the pixels that are alike
   (:mod:`stereotruth.epipolar.alike_correlation`). These lie on one side of the edges of shadows and
@@ -28,7 +28,7 @@ from ..epipolar.surface_correlation import wanted_runs
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .shifted_agreement import SHIFTS_PX, ShiftedAgreement, shifted_agreement
-from .surface_means import surface_mean, warp_to_left
+from .surface_means import left_and_warped, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -43,14 +43,17 @@ CHANGED = 0.15  # more probable, a label is left out
 
 
 class Weights(NamedTuple):
-    """Of a logistic regression: of a pixel by itself a ``constant``, of the ``agreement`` and the
-    ``advantage`` of another disparity; with what is around it ``both``, a constant, of its ``own``
-    log odds and of those ``around``. ``unknown``: the probability where nothing tells."""
+    """Of two logistic regressions, and the probability ``unknown`` where nothing tells.
+
+    The first is of a pixel by itself: a ``constant``, the weights of its ``agreement`` and of the
+    ``advantage`` of another disparity. The second has a ``constant_around``, the weights of the
+    pixel's ``own`` log odds by the first and of those of the mean ``around``.
+    """
 
     constant: float
     agreement: float
     advantage: float
-    both: float
+    constant_around: float
     own: float
     around: float
     unknown: float
@@ -111,17 +114,14 @@ def _alike_agreement(
 ) -> Singles:
     """Mean over the surface up to ALIKE_PX around each pixel [h, w] of the correlation of both
     images over the pixels that are alike."""
-    rows, cols = labelled.shape
-    warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
-    top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
-    left = window.left.pixels[top : top + rows, side : side + cols]
+    left, warped = left_and_warped(window, labels.disparity)
     surface, runs = (labels.disparity, labels.slope), wanted_runs(labelled)
     alike = alike_correlation(left, warped, *surface, ALIKE_PX, noise, runs)
     return surface_mean(alike, *surface, ALIKE_PX, 1, runs)
 
 
 def by_itself(evidence: Evidence, weights: Weights) -> Floats:
-    """Probability [h, w] that a pixel has changed, by what is around it not yet."""
+    """Probability [h, w] that a pixel has changed, by its own evidence alone."""
     odds = weights.constant + weights.agreement * evidence.agreement
     probability = _logistic(odds + weights.advantage * evidence.advantage)
     return _bounded(probability, evidence, weights)
@@ -161,13 +161,14 @@ def probability_with(
 ) -> Floats:
     """:func:`probability_of_change` by its ``weights`` and the ``evidence`` of both images."""
     own = by_itself(evidence, weights)
-    odds = weights.both + weights.own * log_odds(own)
+    odds = weights.constant_around + weights.own * log_odds(own)
     odds += weights.around * log_odds(around(own, labels, labelled))
     return _bounded(_logistic(odds), evidence, weights)
 
 
 def _bounded(probability: Floats, evidence: Evidence, weights: Weights) -> Floats:
-    """Without evidence that of no knowledge, and with weak evidence no more than that."""
+    """The ``probability`` [h, w] with weak evidence no more than the unknown one, which it is
+    without any."""
     limited = np.where(evidence.is_weak, np.minimum(probability, weights.unknown), probability)
     return np.where(np.isnan(evidence.agreement), weights.unknown, limited)
 

@@ -51,7 +51,7 @@ from .shifted_agreement import (
     shifted_agreement,
 )
 from .status import VEGETATION_CLASSES, WATER_CLASS, Status, is_labelled
-from .surface_means import apart_from_steps, surface_mean, warp_to_left
+from .surface_means import apart_from_steps, left_and_warped, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -185,10 +185,7 @@ def window_agreement(
 ) -> tuple[Agreement, Singles]:
     """Of both images of a window, over the surfaces of its ``labels``: free of noise, and their
     correlation [h, w] as it is. Of the ``wanted`` [h, w] pixels alone where these are given."""
-    rows, cols = labels.disparity.shape
-    warped = warp_to_left(window.right, window.rows, window.cols, labels.disparity)
-    top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
-    left = window.left.pixels[top : top + rows, side : side + cols]
+    left, warped = left_and_warped(window, labels.disparity)
     surface = labels.disparity, labels.slope
     runs = None if wanted is None else wanted_runs(wanted)
     clear = apart_from_steps(labels.disparity)

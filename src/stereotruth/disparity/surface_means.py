@@ -16,6 +16,7 @@ from ..epipolar.surface_correlation import (
 from ..epipolar.warping import warp_rows
 from ..kernels import kernel
 from .image_patches import Patch
+from .pair_window import PairWindow
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -34,6 +35,14 @@ def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> F
     top = rows.start - right.row
     image = right.pixels[top : top + len(disparity), : right.usable.shape[1]]
     return warp_rows(image, np.arange(cols.start, cols.stop) - disparity - right.col)
+
+
+def left_and_warped(window: PairWindow, disparity: Floats) -> tuple[Singles, Floats]:
+    """Left image of a window, and the right one brought to it by the ``disparity`` (px) [h, w]."""
+    rows, cols = disparity.shape
+    top, side = window.rows.start - window.left.row, window.cols.start - window.left.col
+    left = window.left.pixels[top : top + rows, side : side + cols]
+    return left, warp_to_left(window.right, window.rows, window.cols, disparity)
 
 
 @kernel

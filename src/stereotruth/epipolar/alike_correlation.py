@@ -18,12 +18,13 @@ from .surface_correlation import (
     DECIDED,
     Singles,
     Steps,
+    about_means,
     columns_inside,
     surface_of_row,
     tolerance_px,
 )
 
-ALIKE = 0.1
+ALIKE = 0.1  # share of the centre's brightness by which that of a pixel may differ
 LEAST_PIXELS = 12  # fewer correlate by chance
 
 
@@ -103,12 +104,10 @@ def _alike_correlation(
                     s[4 * BLOCK + k] += v * v
                     s[5 * BLOCK + k] += u * v
         for k in range(size):
-            n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
+            n = sums[k]
             if n < LEAST_PIXELS:
                 continue
-            suu = sums[3 * BLOCK + k] - su * su / n
-            svv = sums[4 * BLOCK + k] - sv * sv / n
-            suv = sums[5 * BLOCK + k] - su * sv / n
+            suu, svv, suv = about_means(sums, k)
             here, there = noise[0] * (n - one), noise[1] * (n - one)
             signal = max(suu - here, zero) * max(svv - there, zero)
             if signal <= zero:

@@ -72,6 +72,16 @@ def tolerance_px(down: int, across: int) -> float:
     return np.float32(SURFACE_PX + BEND * max(abs(down), abs(across)))
 
 
+@inner
+def about_means(sums: Singles, k: int) -> tuple[float, float, float]:
+    """Sums of u², v² and u v about the means of u and v, from the ``sums`` [6 * BLOCK] of 1, u, v,
+    u², v² and u v of pixel ``k`` of a block."""
+    n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
+    suu = sums[3 * BLOCK + k] - su * su / n
+    svv = sums[4 * BLOCK + k] - sv * sv / n
+    return suu, svv, sums[5 * BLOCK + k] - su * sv / n
+
+
 @kernel
 def _correlation(
     left: Singles,
@@ -122,15 +132,13 @@ def _correlation(
                     s[4 * BLOCK + k] += v * v
                     s[5 * BLOCK + k] += u * v
         for k in range(size):
-            n, su, sv = sums[k], sums[BLOCK + k], sums[2 * BLOCK + k]
+            n = sums[k]
             # A few pixels correlate by chance: they neither agree nor disagree.
             expected[y, x0 + k] = np.nan
             if n < 2 * half + 1:
                 out[y, x0 + k] = np.nan
                 continue
-            suu = sums[3 * BLOCK + k] - su * su / n
-            svv = sums[4 * BLOCK + k] - sv * sv / n
-            suv = sums[5 * BLOCK + k] - su * sv / n
+            suu, svv, suv = about_means(sums, k)
             out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
             here, there = noise[0] * (n - 1), noise[1] * (n - 1)
             signal = max(suu * there, svv * here) - here * there  # of that with more texture
