@@ -203,9 +203,10 @@ def dated_truth(case: Case, folder: Path) -> tuple[dict[str, NDArray], dict[str,
 
 def changed_and_kept(
     truth: dict[str, NDArray], changes: dict[str, NDArray]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels of :func:`dated_truth` that differ by more than CHANGED_M between the worlds; and
-    those that are the same in all of them, seen by both images, and no water."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels of :func:`dated_truth` that differ by more than CHANGED_M between the worlds; those
+    that are the same in all of them, seen by both images, and no water; and those that are hidden
+    from the right image instead."""
     z = changes["height"]
     with np.errstate(invalid="ignore"):
         off = np.fmax(*(np.abs(z - changes[f"height_{name}"]) for name in ("lidar", "other")))
@@ -213,7 +214,7 @@ def changed_and_kept(
     inside = (truth["covered"] == 1) & np.isfinite(z)
     dry = truth["surface"] != WATER
     seen = (truth["visible"] == 1) & (truth["changed_right"] == 0)
-    return inside & differs, inside & same & dry & seen
+    return inside & differs, inside & same & dry & seen, inside & same & dry & ~seen
 
 
 def inputs_of(case: Case, folder: Path) -> SceneInputs:
@@ -271,7 +272,7 @@ class Row:
         """Count the pixels of a case."""
         status, truth, changes = of.layers["status"], of.truth, of.changes
         inside = status != Status.OUT_OF_FRAME
-        changed, seen = (inside & pixels for pixels in changed_and_kept(truth, changes))
+        changed, seen, _ = (inside & pixels for pixels in changed_and_kept(truth, changes))
         known = is_labelled(status)
         if case.kind == "leaves":
             changed &= truth["surface"] == TREE

@@ -1,23 +1,19 @@
 """How probable is it that what a label shows has changed? For images that share no light.
 
 Such images agree less than those of one light where nothing has changed: shadows have moved, and
-what a window holds besides the unchanged surface disagrees. So a label is confirmed by the better
-of two agreements (:class:`Evidence`):
-
-- of the *detail* of both images over the surface around a pixel, at its disparity
-  (:mod:`.shifted_agreement`), predicted shadows left apart. Many pixels make it sure, but some lie
-  up to 12 px off;
-- of the *brightness* over the pixels that are alike
-  (:mod:`stereotruth.epipolar.alike_correlation`). These lie on one side of the edges of shadows and
-  of new roofs, and no more than 8 px off.
-
-A shifted disparity at which the detail agrees better contradicts it. The probability of a change is
-logistic in both (eq. 18), then in its own value and the mean over the surface around (eq. 19 of
-docs/explanation/surface.md): what has changed is larger than a pixel.
+what a window holds besides the unchanged surface disagrees. Where the detail of both images agrees
+over the surface around a pixel, all the same, hardly anything has changed. Elsewhere several things
+together tell (:class:`Evidence`): agreements over windows of two kinds, one at another disparity,
+how much each image has to tell, and where the pixel lies. What they tell is learned from simulated
+cities of which all changes are known: decision trees, whose values sum up to the log odds of a
+change (eq. 18 of docs/explanation/surface.md, bench/change_probability.py). What has changed is
+larger than a pixel, so that other trees ask the probabilities of the surface around, too (eq. 19).
 """
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,56 +21,59 @@ from numpy.typing import NDArray
 
 from ..epipolar.alike_correlation import alike_correlation
 from ..epipolar.surface_correlation import wanted_runs
+from ..numerics.decision_trees import DecisionTrees
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .shifted_agreement import SHIFTS_PX, ShiftedAgreement, shifted_agreement
-from .surface_means import left_and_warped, surface_mean
+from .seen_surface import box_max
+from .shifted_agreement import SHIFTS_PX, shifted_agreement
+from .surface_means import apart_from_steps, left_and_warped, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
-SURROUNDINGS_PX = 8  # pixels up to here are averaged: the detail's agreement, and probabilities
-ALIKE_PX = 4  # up to here lie the pixels that are alike, and the means of their agreement
-LEAST_AGREEMENT, FULL_AGREEMENT = -0.5, 0.8  # beyond these an agreement counts as these
-WEAK = 0.4  # share of signal, with less of which the absence of agreement tells little
-SURE = 1e-4  # no probability counts as nearer to 0 or to 1
-CHANGED = 0.15  # more probable, a label is left out
-
-
-class Weights(NamedTuple):
-    """Of two logistic regressions, and the probability ``unknown`` where nothing tells.
-
-    The first is of a pixel by itself: a ``constant``, the weights of its ``agreement`` and of the
-    ``advantage`` of another disparity. The second has a ``constant_around``, the weights of the
-    pixel's ``own`` log odds by the first and of those of the mean ``around``.
-    """
-
-    constant: float
-    agreement: float
-    advantage: float
-    constant_around: float
-    own: float
-    around: float
-    unknown: float
-
-
-# bench/change_probability.py, seeds 1 to 3: without and with predicted shadows
-WEIGHTS = Weights(1.11, -6.44, 9.70, 0.79, 0.19, 1.16, 0.08)
-WEIGHTS_LIT = Weights(2.30, -7.50, 10.89, 0.70, 0.28, 1.00, 0.09)
+SURROUNDINGS_PX = 8  # pixels of the surface up to here: for the detail's agreement
+ALIKE_PX = 4  # for pixels that are alike, for contrast and gain,
+GAIN_PX = 16  # which is held against that up to here
+STEP_PX = 8  # steps farther off do not count
+AROUND = (4, 1), (8, 2), (12, 3)  # px up to which, one of so many, probabilities are averaged
+FULL_AGREEMENT = 0.8  # of the detail, with which hardly anything has changed:
+SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
+AGREED = 0.0007  # share that has, of all cities that the trees are fitted to
+LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
+ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
+CHANGED = 0.4  # more probable, a label is left out
+TREES = Path(__file__).with_suffix(".tsv")
 
 
 class Evidence(NamedTuple):
-    """What both images tell of a window's labels; arrays [h, w], NaN where nothing tells.
+    """What both images tell of pixels [n], float32, NaN where nothing tells.
 
-    ``agreement``: Fisher's z of the better of both; ``advantage``: by how much the detail's at
-    another disparity is greater than at the labels', as z, 0 at least. ``is_weak``: whether noise
-    or lack of texture may be why nothing agrees.
+    ``agreement``: mean correlation of the images' detail over the surface up to SURROUNDINGS_PX
+    around a pixel, at its disparity, what lies in predicted shadows left apart; ``elsewhere``: the
+    greatest at a shifted disparity, by ``shift`` px up or down; ``signal``: what the same ground
+    would agree by, as noise leaves it. ``alike``: correlation of the brightness over the pixels
+    that are alike (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the
+    edges of shadows and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX.
+    ``contrast_left`` and
+    ``contrast_right``: standard deviation of the surface up to ALIKE_PX in each image, in that of
+    its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
+    GAIN_PX, as a logarithm. ``from_step``: px to the next step of the surface, STEP_PX at most;
+    ``slope`` of the disparity. ``is_lit``: whether shadows are predicted.
     """
 
-    agreement: Floats
-    advantage: Floats
-    is_weak: Bools
+    agreement: Singles
+    elsewhere: Singles
+    shift: Singles
+    signal: Singles
+    alike: Singles
+    alike_around: Singles
+    contrast_left: Singles
+    contrast_right: Singles
+    gain: Singles
+    from_step: Singles
+    slope: Singles
+    is_lit: Singles
 
 
 def change_evidence(
@@ -83,61 +82,88 @@ def change_evidence(
     window_px: int,
     noise: tuple[float, float],
     labelled: Bools,
-) -> Evidence:
-    """Of the ``labelled`` pixels [h, w] of a window.
+) -> tuple[Bools, Evidence]:
+    """Which of the ``labelled`` pixels [h, w] of a window do not agree fully, and the evidence of
+    these.
 
     ``window_px``: side of the windows in which details are correlated; ``noise``: variances of both
     images, DN².
     """
-
-    def compared(wanted: Bools, shifts: tuple[float, ...]) -> ShiftedAgreement:
-        return shifted_agreement(
-            labels, window, noise, window_px, SURROUNDINGS_PX, wanted, shifts, by_light=True
-        )
-
-    detail = compared(labelled, ())
-    # nothing has an advantage over full agreement
-    shifted = compared(labelled & (detail.here < FULL_AGREEMENT), SHIFTS_PX)
-    alike = _alike_agreement(labels, window, noise, labelled)
-    agreement = _z(np.fmax(detail.here, alike))
-    advantage = np.maximum(_z(shifted.elsewhere) - _z(detail.here), 0.0)
-    is_weak = ~(detail.signal >= WEAK) & ~shifted.is_shifted
-    return Evidence(agreement, np.nan_to_num(advantage), is_weak)
-
-
-def _z(agreement: Singles) -> Floats:
-    return np.arctanh(np.clip(agreement.astype(np.float64), LEAST_AGREEMENT, FULL_AGREEMENT))
-
-
-def _alike_agreement(
-    labels: Labels, window: PairWindow, noise: tuple[float, float], labelled: Bools
-) -> Singles:
-    """Mean over the surface up to ALIKE_PX around each pixel [h, w] of the correlation of both
-    images over the pixels that are alike."""
+    compared = labels, window, noise, window_px, SURROUNDINGS_PX
+    detail = shifted_agreement(*compared, labelled, (), by_light=True)
+    doubtful = labelled & ~(detail.here >= FULL_AGREEMENT)
+    shifted = shifted_agreement(*compared, doubtful, SHIFTS_PX, by_light=True)
     left, warped = left_and_warped(window, labels.disparity)
-    surface, runs = (labels.disparity, labels.slope), wanted_runs(labelled)
-    alike = alike_correlation(left, warped, *surface, ALIKE_PX, noise, runs)
-    return surface_mean(alike, *surface, ALIKE_PX, 1, runs)
+    surface, runs = (labels.disparity, labels.slope), wanted_runs(doubtful)
+
+    def mean(values: NDArray[np.floating], reach: int, every: int = 1) -> Singles:
+        return surface_mean(values, *surface, reach, every, runs)
+
+    nearby = wanted_runs(box_max(doubtful, ALIKE_PX))
+    alike = alike_correlation(left, warped, *surface, ALIKE_PX, noise, nearby)
+    both = (left != 0.0) & (warped > 0.0)
+    logarithms = [np.log(np.where(both, image, np.nan) / LEVEL) for image in (left, warped)]
+    levels = [mean(image, ALIKE_PX) for image in logarithms]
+    contrasts = []
+    for image, level, variance in zip(logarithms, levels, noise):
+        spread = np.maximum(mean(image**2, ALIKE_PX) - level**2, 0.0)
+        contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
+    wide = mean(logarithms[0] - logarithms[1], GAIN_PX, GAIN_PX // 4)
+    gain = np.abs(levels[0] - levels[1] - wide)
+    arrays = Evidence(
+        detail.here,
+        shifted.elsewhere,
+        np.abs(shifted.shift),
+        shifted.signal,
+        alike,
+        mean(alike, ALIKE_PX),
+        *contrasts,
+        gain,
+        _from_step(labels.disparity),
+        np.abs(labels.slope).sum(axis=0),
+        np.full(doubtful.shape, window.shaded is not None),
+    )
+    return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
 
 
-def by_itself(evidence: Evidence, weights: Weights) -> Floats:
-    """Probability [h, w] that a pixel has changed, by its own evidence alone."""
-    odds = weights.constant + weights.agreement * evidence.agreement
-    probability = _logistic(odds + weights.advantage * evidence.advantage)
-    return _bounded(probability, evidence, weights)
+def _from_step(disparity: Floats) -> Singles:
+    """Pixels [h, w] to the next that lies beside a step, in a square, STEP_PX at most."""
+    beside = ~apart_from_steps(disparity)
+    out = np.full(disparity.shape, STEP_PX, np.float32)
+    for px in range(STEP_PX - 1, -1, -1):
+        out[box_max(beside, px)] = px
+    return out
 
 
-def log_odds(probability: NDArray[np.floating]) -> Floats:
-    """Of probabilities, no nearer to 0 and 1 than SURE."""
+def with_surroundings(
+    own: Floats, doubtful: Bools, labels: Labels, labelled: Bools
+) -> list[Singles]:
+    """Log odds [n] of the ``doubtful`` pixels' ``own`` probability [h, w], and of its means over
+    the ``labelled`` surface around them, see AROUND."""
+    surface, runs = (labels.disparity, labels.slope), wanted_runs(doubtful)
+    known = np.where(labelled, own, np.nan)
+    means = (surface_mean(known, *surface, reach, every, runs) for reach, every in AROUND)
+    return [_log_odds(values[doubtful]) for values in (own, *means)]
+
+
+def _log_odds(probability: NDArray[np.floating]) -> Singles:
     bounded = np.clip(probability.astype(np.float64), SURE, 1.0 - SURE)
-    return np.log(bounded / (1.0 - bounded))
+    return np.log(bounded / (1.0 - bounded)).astype(np.float32)
 
 
-def around(probability: Floats, labels: Labels, labelled: Bools) -> Singles:
-    """Mean probability of the ``labelled`` pixels [h, w] of the surface around each of them."""
-    values = np.where(labelled, probability, np.nan)
-    surface = labels.disparity, labels.slope
-    return surface_mean(values, *surface, SURROUNDINGS_PX, 2, wanted_runs(labelled))
+@cache
+def trees() -> list[DecisionTrees]:
+    """Those of the log odds by a pixel's own evidence, and those that ask its surroundings, too."""
+    return DecisionTrees.load(TREES)
+
+
+def by_itself(evidence: Evidence, doubtful: Bools) -> Floats:
+    """Probability [h, w] that a pixel has changed, by its own evidence alone; AGREED where it is
+    not ``doubtful``."""
+    own, _ = trees()
+    out = np.full(doubtful.shape, AGREED)
+    out[doubtful] = _logistic(own.sum_at(np.stack(evidence)))
+    return out
 
 
 def probability_of_change(
@@ -151,27 +177,13 @@ def probability_of_change(
 
     Arguments: see :func:`change_evidence`.
     """
-    weights = WEIGHTS if window.shaded is None else WEIGHTS_LIT
-    evidence = change_evidence(labels, window, window_px, noise, labelled)
-    return probability_with(weights, evidence, labels, labelled)
+    doubtful, evidence = change_evidence(labels, window, window_px, noise, labelled)
+    _, with_others = trees()
+    out = by_itself(evidence, doubtful)
+    others = with_surroundings(out, doubtful, labels, labelled)
+    out[doubtful] = _logistic(with_others.sum_at(np.stack([*evidence, *others])))
+    return out
 
 
-def probability_with(
-    weights: Weights, evidence: Evidence, labels: Labels, labelled: Bools
-) -> Floats:
-    """:func:`probability_of_change` by its ``weights`` and the ``evidence`` of both images."""
-    own = by_itself(evidence, weights)
-    odds = weights.constant_around + weights.own * log_odds(own)
-    odds += weights.around * log_odds(around(own, labels, labelled))
-    return _bounded(_logistic(odds), evidence, weights)
-
-
-def _bounded(probability: Floats, evidence: Evidence, weights: Weights) -> Floats:
-    """The ``probability`` [h, w] with weak evidence no more than the unknown one, which it is
-    without any."""
-    limited = np.where(evidence.is_weak, np.minimum(probability, weights.unknown), probability)
-    return np.where(np.isnan(evidence.agreement), weights.unknown, limited)
-
-
-def _logistic(odds: Floats) -> Floats:
-    return 1.0 / (1.0 + np.exp(-odds))
+def _logistic(odds: Singles) -> Floats:
+    return 1.0 / (1.0 + np.exp(-odds.astype(np.float64)))

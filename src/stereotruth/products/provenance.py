@@ -125,13 +125,19 @@ class _Sources:
         file = _module_file(module)
         if file is None:
             raise ModuleNotFoundError(f"stereotruth.{module}")
-        state = file.stat()
-        stamp = [state.st_mtime_ns, state.st_size]
+        states = [part.stat() for part in _with_table(file)]
+        stamp = [[state.st_mtime_ns, state.st_size] for state in states]
         found = self.known.get(module)
         if found is None or found[0] != stamp:
             found = self.known[module] = [stamp, *_parsed(module, file)]
             self.fresh = True
         return found[1], found[2]
+
+
+def _with_table(file: Path) -> list[Path]:
+    """The source of a module, and the table of the same name beside it that it reads, if any."""
+    table = file.with_suffix(".tsv")
+    return [file, table] if table.is_file() else [file]
 
 
 def _parsed(module: str, file: Path) -> tuple[str, list[str]]:
@@ -140,8 +146,10 @@ def _parsed(module: str, file: Path) -> tuple[str, list[str]]:
     imports = _imported_modules(tree, package)
     parts = module.split(".")
     imports |= {".".join(parts[:n]) for n in range(1, len(parts))}  # parents run on import
-    code = ast.dump(_without_docstrings(tree))
-    return hashlib.sha256(code.encode()).hexdigest(), sorted(imports)
+    code = hashlib.sha256(ast.dump(_without_docstrings(tree)).encode())
+    for table in _with_table(file)[1:]:
+        code.update(table.read_bytes())
+    return code.hexdigest(), sorted(imports)
 
 
 _CACHE = f"sources-{sys.implementation.cache_tag}.json"  # Pythons differ in their trees
@@ -167,7 +175,8 @@ def source_modules(*modules: str) -> list[str]:
 def source_digest(*modules: str) -> str:
     """Digest of the parsed source of the modules and of all that they import from this package.
 
-    Comments, docstrings and layout do not enter, so that only a change of what runs changes it.
+    Comments, docstrings and layout do not enter, so that only a change of what runs changes it. A
+    table of a module's name beside it (``.tsv``) does.
     """
     digest = hashlib.sha256()
     for module in source_modules(*modules):

@@ -7,10 +7,9 @@ import pytest
 
 from stereotruth.disparity.change_probability import (
     CHANGED,
-    WEIGHTS,
-    WEIGHTS_LIT,
+    STEP_PX,
     Evidence,
-    by_itself,
+    change_evidence,
     probability_of_change,
 )
 from stereotruth.disparity.image_agreement import Comparison, contradicted
@@ -71,26 +70,47 @@ def test_images_of_noise_alone_tell_nothing() -> None:
     images = (np.round(rng.normal(900.0, 20.0, (160, 260))) for _ in range(2))
     found = probability_of_change(LEVEL, pair(*images), 9, (400.0, 400.0), ALL)
     assert (found[INNER] > CHANGED).mean() < 0.05
-    blank = np.full((160, 260), 700.0)
-    nothing = probability_of_change(LEVEL, pair(blank, blank), 9, (4.0, 4.0), ALL)
-    assert (nothing[INNER] > 0.02).all() and (nothing[INNER] <= WEIGHTS.unknown).all()
 
 
-@pytest.mark.parametrize("weights", [WEIGHTS, WEIGHTS_LIT])
-def test_it_falls_with_agreement_and_grows_with_the_advantage_of_another_disparity(weights):
-    agreement, advantage = np.meshgrid(np.linspace(-0.5, 1.4, 20), np.linspace(0.0, 1.0, 20))
-    found = by_itself(Evidence(agreement, advantage, np.zeros((20, 20), np.bool_)), weights)
-    assert (np.diff(found, axis=1) < 0.0).all()
-    assert (np.diff(found, axis=0) > 0.0).all()
-    assert found.min() > 0.0 and found.max() < 1.0
+def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
+    doubtful, evidence = change_evidence(LEVEL, built(), 9, NO_NOISE, ALL)
+    assert doubtful[FIELD].mean() > 0.95
+    assert not doubtful[20:25, 20:120].any()
+    assert all(values.shape == (doubtful.sum(),) for values in evidence)
+    inside = np.zeros(SHAPE, np.bool_)
+    inside[48:72, 58:92] = True  # no window reaches beyond the roof
+    of_roof = Evidence(*(values[inside[doubtful]] for values in evidence))
+    assert np.abs(of_roof.agreement).max() < 0.2
+    assert (of_roof.from_step == STEP_PX).all() and (of_roof.slope == 0.0).all()
+    # uniform of half a width of 50 DN, in units of the rounding; three times as bright
+    expected = 50.0 / np.sqrt(3.0) * np.sqrt(12.0)
+    assert np.median(of_roof.contrast_left) == pytest.approx(expected, rel=0.1)
+    assert np.median(of_roof.contrast_right) == pytest.approx(3.0 * expected, rel=0.1)
 
 
-def test_weak_evidence_tells_no_more_than_none() -> None:
-    agreement = np.array([[-0.5, 1.4]])
-    weak = Evidence(agreement, np.zeros((1, 2)), np.ones((1, 2), np.bool_))
-    low, high = by_itself(weak, WEIGHTS)[0]
-    assert low == WEIGHTS.unknown
-    assert high < 0.01
+def test_gain_is_what_brightness_differs_by_from_that_around() -> None:
+    left = ground(0)
+    right = right_of(left, np.full((160, 260), 4))
+    plain = change_evidence(LEVEL, pair(left, 2.0 * right), 9, NO_NOISE, ALL)
+    assert not plain[0][INNER].any()
+    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][56:64, 71:79] *= 2.0 * ground(1)[:8, :8] / 500
+    doubtful, evidence = change_evidence(LEVEL, pair(left, right), 9, NO_NOISE, ALL)
+    at = np.full(SHAPE, np.nan)
+    at[doubtful] = evidence.gain
+    share = 64 / 81  # of the means of 9 x 9 px, and of those up to 16 px off one in 81 every 4 px
+    assert at[59, 74] == pytest.approx(np.log(2.0) * (share - 4 / 81), abs=0.05)
+
+
+def test_steps_of_the_surface_are_told_by_their_distance() -> None:
+    level = np.full(SHAPE, 4.0)
+    level[:, 80:] = 9.0
+    images = pair(texture(0), texture(1))
+    labels = Labels(level, np.zeros((2, *SHAPE)), np.zeros(SHAPE))
+    doubtful, evidence = change_evidence(labels, images, 9, NO_NOISE, ALL)
+    at = np.full(SHAPE, np.nan)
+    at[doubtful] = evidence.from_step
+    found = [at[60, x] for x in (80, 81, 84, 88, 95)]
+    assert found == [0, 1, 4, 8, 8]
 
 
 def test_no_window_changes_it() -> None:

@@ -54,6 +54,17 @@ def test_digests_are_remembered_but_never_in_place_of_an_edit(package):
     assert provenance.source_digest("products.grids") == first
 
 
+def test_a_table_that_a_module_reads_changes_the_digest(package):
+    first = provenance.source_digest("products.grids"), provenance.source_digest("sheets")
+    table = package / "products" / "grids.tsv"
+    table.write_text("of one kind\n")
+    second = provenance.source_digest("products.grids")
+    table.write_text("of another\n")
+    third = provenance.source_digest("products.grids"), provenance.source_digest("sheets")
+    assert len({first[0], second, third[0]}) == 3
+    assert first[1] == third[1]
+
+
 def test_comments_and_docstrings_do_not_change_the_digest(package):
     before = provenance.source_digest("errors")
     edit(package / "errors.py", '"""The one exception', '# a remark\n"""Another wording: the one')
