@@ -153,7 +153,7 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     labelled &= ~_hidden_in_right(visible, rough, xy, labelled, disparity)
 
     values = PixelValues.none(shape)
-    none = np.zeros(len(corner))
+    none = np.zeros(len(corner), np.float32)
     of_vertices = tops.h_q, tops.surface_class, tops.day, tops.count
     facets = FacetValues(xy, corner, *of_vertices, none, none)
     interpolate(facets, index, first, values)

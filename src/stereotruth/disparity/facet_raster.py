@@ -71,8 +71,8 @@ class FacetValues(NamedTuple):
     surface_class: NDArray[np.uint8]
     day: NDArray[np.uint16]
     count: Steps
-    variance: Floats
-    bulge: Floats
+    variance: NDArray[np.floating]
+    bulge: NDArray[np.floating]
 
 
 class PixelValues(NamedTuple):
