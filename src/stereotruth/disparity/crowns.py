@@ -140,7 +140,7 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     raster_facets(xy, steep, first, before, unused, LEFT, 0)
     tops_buffer = z_buffer.copy()
     raster_facets(xy, steep, first, tops_buffer, unused, LEFT, 0)
-    visible.projected.raster_prisms(surface.strips, before)
+    before = np.maximum(before, visible.strips)
     all_around = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
     is_open = np.isin(visible.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
     # what facets show has labels already, as far as it is certain

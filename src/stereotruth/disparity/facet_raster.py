@@ -179,12 +179,18 @@ def raster_facets(
 
 
 @inner
-def _exceeds_any(
-    left: float, right: float, top: int, bottom: int, highest: float, pixels: RightPixels
+def _may_hide(
+    left: float,
+    right: float,
+    top: int,
+    bottom: int,
+    highest: float,
+    pixels: RightPixels,
+    hidden: Bools,
 ) -> bool:
-    """Whether a disparity of ``highest`` exceeds the ``limit`` of any pixel in rows ``top`` to
-    ``bottom`` whose column in the right image lies between ``left`` and ``right``; most surfaces
-    hide nothing."""
+    """Whether a disparity of ``highest`` exceeds the ``limit`` of any pixel that is not ``hidden``
+    yet, in rows ``top`` to ``bottom`` whose column in the right image lies between ``left`` and
+    ``right``; most surfaces hide nothing, or what others hide."""
     first, width, start, limit = pixels.first, pixels.width, pixels.start, pixels.limit
     begin = max(int(np.floor(left - ROUNDING_PX)) - first[1], 0)
     end = min(int(np.floor(right + ROUNDING_PX)) - first[1], width - 1) + 1
@@ -193,7 +199,7 @@ def _exceeds_any(
     for row in range(top, bottom + 1):
         base = (row - first[0]) * width
         for k in range(start[base + begin], start[base + end]):
-            if limit[k] < highest:
+            if limit[k] < highest and not hidden[k]:
                 return True
     return False
 
@@ -210,7 +216,7 @@ def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools
         return
     lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
     low, high = min(x[0], x[1], x[2]), max(x[0], x[1], x[2])
-    if not _exceeds_any(low, high, top, bottom, highest, pixels):
+    if not _may_hide(low, high, top, bottom, highest, pixels, hidden):
         return
     gx, gy = plane_slopes(x, y, d)
     if not np.isfinite(gx + gy):
@@ -332,7 +338,7 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         _at_heights(prisms, t, 0, x)
         for k in range(6):
             d[k] = x[k] - xr[k]
-        if not _exceeds_any(low, high, top, bottom, _range(d)[1], pixels):
+        if not _may_hide(low, high, top, bottom, _range(d)[1], pixels, hidden):
             continue
         for face in faces[: _faces_seen(xr, y, d, faces)]:
             _hide_right(triple(xr, face), triple(y, face), triple(d, face), pixels, hidden)
