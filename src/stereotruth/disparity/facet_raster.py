@@ -20,6 +20,7 @@ Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
+LEFT, RIGHT = 0, 2  # a view, by where its x and y stand in positions
 # What lies in front of a surface by less is the surface itself.
 OCCLUSION_TOLERANCE_PX = 0.25
 ROUNDING_PX = 1e-6  # of where an edge meets a row
@@ -70,8 +71,8 @@ class FacetValues(NamedTuple):
     surface_class: NDArray[np.uint8]
     day: NDArray[np.uint16]
     count: Steps
-    variance: Floats
-    bulge: Floats
+    variance: NDArray[np.floating]
+    bulge: NDArray[np.floating]
 
 
 class PixelValues(NamedTuple):
@@ -150,34 +151,46 @@ def raster_triangle(
 
 @kernel
 def raster_facets(
-    xy: Floats, corner: Steps, first: tuple[int, int], z_buffer: Floats, index: Steps
+    xy: Floats,
+    corner: Steps,
+    first: tuple[int, int],
+    z_buffer: Floats,
+    index: Steps,
+    view: int,
+    number: int,
 ) -> None:
-    """The triangle of the greatest disparity at each pixel's centre, and that disparity (eq. 7 of
-    docs/explanation/surface.md).
+    """The triangle of the greatest disparity at each pixel's centre of a ``view``, and that
+    disparity (eq. 7 of docs/explanation/surface.md).
 
-    Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
-    number.
+    Raises ``z_buffer`` [rows, cols] and sets ``index``; the first triangle has the ``number``. Of
+    equals, the triangle of the lower number.
     """
     rows, cols = z_buffer.shape
     for t in range(len(corner)):
-        y = triple(xy[1], corner[t])
+        y = triple(xy[view + 1], corner[t])
         if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x = triple(xy[0], corner[t])
+        x = triple(xy[view], corner[t])
         if misses(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), first[1], cols):
             continue
-        xr = triple(xy[2], corner[t])
-        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
-        raster_triangle(x, y, d, first, t, z_buffer, index)
+        xl, xr = triple(xy[LEFT], corner[t]), triple(xy[RIGHT], corner[t])
+        d = (xl[0] - xr[0], xl[1] - xr[1], xl[2] - xr[2])
+        raster_triangle(x, y, d, first, number + t, z_buffer, index)
 
 
 @inner
-def _exceeds_any(
-    left: float, right: float, top: int, bottom: int, highest: float, pixels: RightPixels
+def _may_hide(
+    left: float,
+    right: float,
+    top: int,
+    bottom: int,
+    highest: float,
+    pixels: RightPixels,
+    hidden: Bools,
 ) -> bool:
-    """Whether a disparity of ``highest`` exceeds the ``limit`` of any pixel in rows ``top`` to
-    ``bottom`` whose column in the right image lies between ``left`` and ``right``; most surfaces
-    hide nothing."""
+    """Whether a disparity of ``highest`` exceeds the ``limit`` of any pixel that is not ``hidden``
+    yet, in rows ``top`` to ``bottom`` whose column in the right image lies between ``left`` and
+    ``right``; most surfaces hide nothing, or what others hide."""
     first, width, start, limit = pixels.first, pixels.width, pixels.start, pixels.limit
     begin = max(int(np.floor(left - ROUNDING_PX)) - first[1], 0)
     end = min(int(np.floor(right + ROUNDING_PX)) - first[1], width - 1) + 1
@@ -186,7 +199,7 @@ def _exceeds_any(
     for row in range(top, bottom + 1):
         base = (row - first[0]) * width
         for k in range(start[base + begin], start[base + end]):
-            if limit[k] < highest:
+            if limit[k] < highest and not hidden[k]:
                 return True
     return False
 
@@ -203,7 +216,7 @@ def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools
         return
     lowest, highest = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
     low, high = min(x[0], x[1], x[2]), max(x[0], x[1], x[2])
-    if not _exceeds_any(low, high, top, bottom, highest, pixels):
+    if not _may_hide(low, high, top, bottom, highest, pixels, hidden):
         return
     gx, gy = plane_slopes(x, y, d)
     if not np.isfinite(gx + gy):
@@ -325,7 +338,7 @@ def hide_by_prisms(prisms: Prisms, pixels: RightPixels, hidden: Bools) -> None:
         _at_heights(prisms, t, 0, x)
         for k in range(6):
             d[k] = x[k] - xr[k]
-        if not _exceeds_any(low, high, top, bottom, _range(d)[1], pixels):
+        if not _may_hide(low, high, top, bottom, _range(d)[1], pixels, hidden):
             continue
         for face in faces[: _faces_seen(xr, y, d, faces)]:
             _hide_right(triple(xr, face), triple(y, face), triple(d, face), pixels, hidden)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,6 +67,12 @@ class PairWindow:
         inner = slice(self.margin, -self.margin)
         return inner, inner
 
+    def grown(self, px: int) -> tuple[slice, slice]:
+        """The window without its margin, and as much of this as lies up to ``px`` off."""
+        cut = max(self.margin - px, 0)
+        rows, cols = self.shape
+        return slice(cut, rows - cut), slice(cut, cols - cut)
+
     def usable(self, row: Ints, col: Ints, disparity: Floats) -> tuple[Bools, Bools]:
         """Which pixels [n] (from the window's first) of a disparity lie in both frames, and of
         which a mask hides either place."""
@@ -119,6 +125,12 @@ class WindowLabels:
             correlation=self.correlation[part],
             change=self.change[part],
         )
+
+    def around(self, part: tuple[slice, slice]) -> WindowLabels:
+        """Those of a ``part`` of the window; other pixels have none."""
+        status = np.full_like(self.status, Status.NO_POINTS)
+        status[part] = self.status[part]
+        return replace(self, status=status)
 
     def counts(self, in_frames: NDArray[np.int32], outside: NDArray[np.int32]) -> Ints:
         """Points of a window: all, in both frames, used; from those of its pixels."""

@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.sun import toward_sun
-from ..kernels import kernel
+from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..numerics.degrees import exact_metres_per_degree
 from ..numerics.triangles import corner_shares
 from ..surface.surface_store import Block, SurfaceStore
-from .facet_raster import misses, raster_facets, raster_triangle, triple
+from .facet_raster import LEFT, RIGHT, misses, raster_facets, raster_triangle, triple
 from .image_patches import Patch
 from .view_geometry import ViewGeometry
 from .visibility import ProjectedSurface
@@ -42,18 +42,45 @@ ABOVE_M = 0.5  # what is higher than a pixel by less is the surface itself
 KEPT = 512  # blocks whose tops are kept for the next windows, some 0.3 MB each
 
 
+class _Lattice(NamedTuple):
+    """Lattice coordinates [n]."""
+
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+
+
+class _Axes(NamedTuple):
+    """See :class:`SunView`."""
+
+    cell: tuple[int, int]
+    shift: tuple[float, float]
+
+
+@inner
+def _position(lattice: _Lattice, k: int, axes: _Axes) -> tuple[float, float]:
+    """Of the ``k``-th, cells."""
+    h = lattice.h_q[k]
+    return (
+        lattice.lon_q[k] / axes.cell[0] - axes.shift[0] * h,
+        lattice.lat_q[k] / axes.cell[1] - axes.shift[1] * h,
+    )
+
+
 @kernel
-def _positions(
-    lon_q: Ints,
-    lat_q: Ints,
-    h_q: Ints,
-    cell: tuple[int, int],
-    shift: tuple[float, float],
-    out: Floats,
-) -> None:
-    for k in range(lon_q.size):
-        out[0, k] = lon_q[k] / cell[0] - shift[0] * h_q[k]
-        out[1, k] = lat_q[k] / cell[1] - shift[1] * h_q[k]
+def _positions(lattice: _Lattice, axes: _Axes, out: Floats) -> None:
+    for k in range(lattice.h_q.size):
+        out[0, k], out[1, k] = _position(lattice, k, axes)
+
+
+@kernel
+def _extent(lattice: _Lattice, axes: _Axes, out: Floats) -> None:
+    """Least and greatest position, ``out`` [2, 2], (lon, lat) each."""
+    out[0], out[1] = np.inf, -np.inf
+    for k in range(lattice.h_q.size):
+        x, y = _position(lattice, k, axes)
+        out[0, 0], out[0, 1] = min(out[0, 0], x), min(out[0, 1], y)
+        out[1, 0], out[1, 1] = max(out[1, 0], x), max(out[1, 1], y)
 
 
 @dataclass(frozen=True)
@@ -82,11 +109,24 @@ class SunView:
         cells = degrees * LATTICE_M / LATTICE_DEG / np.array(side)
         return cls(side, tuple(np.round(cells, 15).tolist()))
 
+    @property
+    def axes(self) -> _Axes:
+        """For kernels."""
+        return _Axes(self.cell, self.shift)
+
     def position(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
         """[2, n], cells, of lattice coordinates [n]."""
         out = np.empty((2, lon_q.size))
-        _positions(lon_q, lat_q, h_q, self.cell, self.shift, out)
+        _positions(_Lattice(lon_q, lat_q, h_q), self.axes, out)
         return out
+
+    def no_tops(self, lattice: _Lattice) -> _Tops:
+        """Of the part of the view that holds some places, one at least."""
+        extent = np.empty((2, 2))
+        _extent(lattice, self.axes, extent)
+        low, high = np.floor(extent[0]).astype(np.int64), np.ceil(extent[1]).astype(np.int64)
+        cols, rows = (high - low + 1).tolist()
+        return _Tops(np.full((rows, cols), -np.inf), (int(low[1]), int(low[0])))
 
     def _boxes(self, blocks: Sequence[Block]) -> tuple[Floats, Floats]:
         """Least and greatest position [2, n] of each of n blocks."""
@@ -122,16 +162,12 @@ class _Tops(NamedTuple):
     first: tuple[int, int]
 
 
-def _triangles(arrays: dict[str, NDArray]) -> Steps:
-    return np.concatenate([arrays["facet"], arrays["whole"], arrays["top"]])
+class _Triangles(NamedTuple):
+    """What casts shadows and lies in them: corners [n, 3] among the vertices."""
 
-
-def _no_tops(positions: Floats) -> _Tops:
-    """Of the part of a sun's view that holds ``positions`` [2, n]."""
-    low = np.floor(positions.min(axis=1)).astype(np.int64)
-    high = np.ceil(positions.max(axis=1)).astype(np.int64)
-    cols, rows = (high - low + 1).tolist()
-    return _Tops(np.full((rows, cols), -np.inf), (int(low[1]), int(low[0])))
+    facet: Steps
+    whole: Steps
+    top: Steps
 
 
 @lru_cache(maxsize=KEPT)
@@ -140,15 +176,17 @@ def _tops_of(
 ) -> tuple[_Tops, _Tops]:
     """Of a block of the surface, in the view of each sun."""
     arrays = store.arrays(block, ["lon", "lat", "height", "facet", "whole", "top"])
-    lattice, corner = store.positions(block, arrays), _triangles(arrays)
-    left, right = (_rastered(view.position(*lattice), lattice[2], corner) for view in views)
+    lattice = _Lattice(*store.positions(block, arrays))
+    triangles = _Triangles(arrays["facet"], arrays["whole"], arrays["top"])
+    left, right = (_rastered(view, lattice, triangles) for view in views)
     return left, right
 
 
-def _rastered(position: Floats, h: Ints, corner: Steps) -> _Tops:
-    """Of triangles at ``position`` [2, n] (cells) in a sun's view."""
-    tops = _no_tops(position)
-    _raster(position, h, corner, tops.first, tops.z, np.empty(tops.z.shape, np.int32))
+def _rastered(view: SunView, lattice: _Lattice, triangles: _Triangles) -> _Tops:
+    """Of triangles in a sun's view."""
+    tops, position = view.no_tops(lattice), view.position(*lattice)
+    for corner in triangles:
+        _raster(position, lattice.h_q, corner, tops.first, tops.z)
     return tops
 
 
@@ -181,10 +219,9 @@ def _raise(tops: _Tops, others: _Tops) -> None:
 
 
 @kernel
-def _raster(
-    position: Floats, h: Ints, corner: Steps, first: tuple[int, int], z: Floats, index: Steps
-) -> None:
+def _raster(position: Floats, h: Ints, corner: Steps, first: tuple[int, int], z: Floats) -> None:
     """Raises ``z`` [rows, cols] (m) by triangles at ``position`` [2, n] (cells) in a sun's view."""
+    index = np.empty(z.shape, np.int32)
     for t in range(len(corner)):
         y = triple(position[1], corner[t])
         if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], z.shape[0]):
@@ -194,42 +231,69 @@ def _raster(
         raster_triangle(triple(position[0], corner[t]), y, d, first, t, z, index)
 
 
+@inner
+def _corner(triangles: _Triangles, t: int) -> Steps:
+    """Of the ``t``-th of all."""
+    facets, whole = len(triangles.facet), len(triangles.whole)
+    if t < facets:
+        return triangles.facet[t]
+    if t < facets + whole:
+        return triangles.whole[t - facets]
+    return triangles.top[t - facets - whole]
+
+
 @kernel
 def _shaded(
     xy: Floats,
-    corner: Steps,
+    view: int,
+    triangles: _Triangles,
     index: Steps,
     first: tuple[int, int],
-    position: Floats,
-    height: Floats,
-    shift: tuple[float, float],
+    lattice: _Lattice,
+    axes: _Axes,
     tops: _Tops,
     out: Bools,
 ) -> None:
-    """``xy`` [4, n]: positions of vertices in an image; ``position`` [2, n] (cells): in the view of
-    the sun; ``height`` [n], m; ``shift`` of a position, cells per m."""
+    """``xy`` [4, n]: positions of vertices in both images; ``index`` of the triangle that each
+    pixel of the ``view`` shows, -1 for none; ``axes`` and ``tops`` of its sun."""
     rows, cols = index.shape
+    across, up = axes.shift[0] / LATTICE_M, axes.shift[1] / LATTICE_M  # cells per m
     for j in range(rows):
         for i in range(cols):
-            t = index[j, i]
-            if t < 0:
+            if index[j, i] < 0:
                 continue
-            k, m, n = corner[t]
-            x, y = triple(xy[0], corner[t]), triple(xy[1], corner[t])
+            corner = _corner(triangles, index[j, i])
+            k, m, n = corner
+            x, y = triple(xy[view], corner), triple(xy[view + 1], corner)
             b, c = corner_shares(x, y, first[1] + i - x[0], first[0] + j - y[0])
-            ub, vb = position[0, m] - position[0, k], position[1, m] - position[1, k]
-            uc, vc = position[0, n] - position[0, k], position[1, n] - position[1, k]
-            hb, hc = height[m] - height[k], height[n] - height[k]
+            u, v = _position(lattice, k, axes)
+            um, vm = _position(lattice, m, axes)
+            un, vn = _position(lattice, n, axes)
+            ub, vb, uc, vc = um - u, vm - v, un - u, vn - v
+            height = lattice.h_q[k] * LATTICE_M
+            hb, hc = lattice.h_q[m] * LATTICE_M - height, lattice.h_q[n] * LATTICE_M - height
             seen = ub * vc - vb * uc
-            above = (ub + shift[0] * hb) * (vc + shift[1] * hc)
-            above -= (vb + shift[1] * hb) * (uc + shift[0] * hc)
+            above = (ub + across * hb) * (vc + up * hc)
+            above -= (vb + up * hb) * (uc + across * hc)
             if seen * above <= 0.0:  # it turns its lower side to the sun
                 out[j, i] = True
                 continue
-            col = int(np.floor(position[0, k] + b * ub + c * uc + 0.5)) - tops.first[1]
-            row = int(np.floor(position[1, k] + b * vb + c * vc + 0.5)) - tops.first[0]
+            col = int(np.floor(u + b * ub + c * uc + 0.5)) - tops.first[1]
+            row = int(np.floor(v + b * vb + c * vc + 0.5)) - tops.first[0]
             if 0 <= row < tops.z.shape[0] and 0 <= col < tops.z.shape[1]:
-                out[j, i] = tops.z[row, col] > height[k] + b * hb + c * hc + ABOVE_M
+                out[j, i] = tops.z[row, col] > height + b * hb + c * hc + ABOVE_M
+
+
+def _nearest_triangles(
+    xy: Floats, view: int, triangles: _Triangles, first: tuple[int, int], shape: tuple[int, ...]
+) -> Steps:
+    """Which of all triangles each pixel of a part of a view shows, -1 for none."""
+    index, nearest = np.full(shape, -1, np.int32), np.full(shape, -np.inf)
+    number = 0
+    for corner in triangles:
+        raster_facets(xy, corner, first, nearest, index, view, number)
+        number += len(corner)
+    return index
 
 
 def shaded(
@@ -245,28 +309,18 @@ def shaded(
     ``casters``: of each, blocks of the ``store`` that may cast a shadow there. Without a surface a
     pixel counts as lit.
     """
-    surface = projected.surface
-    corner = np.concatenate(
-        [surface.facet, surface.undecided[: surface.whole], surface.tops.corner]
-    )
+    surface, xy = projected.surface, projected.xy
+    whole = surface.undecided[: surface.whole]
+    triangles = _Triangles(surface.facet, whole, surface.tops.corner)
     left, right = (np.zeros(patch.pixels.shape, np.bool_) for patch in patches)
-    if len(corner) == 0:
+    if not any(map(len, triangles)):
         return left, right
     vertices = surface.vertices
-    positions = [view.position(vertices.lon_q, vertices.lat_q, vertices.h_q) for view in views]
-    tops = [_no_tops(position) for position in positions]
+    lattice = _Lattice(vertices.lon_q, vertices.lat_q, vertices.h_q)
+    tops = [view.no_tops(lattice) for view in views]
     _raise_tops(tops, views, store, casters)
-    # the right image mirrored, so that the greatest disparity is the nearest there, too
-    xy = (
-        projected.xy,
-        np.stack([-projected.xy[2], projected.xy[3], -projected.xy[0], projected.xy[1]]),
-    )
-    first_right = patches[1].row, -(patches[1].col + right.shape[1] - 1)
-    first = (patches[0].row, patches[0].col), first_right
-    for k, out in enumerate((left, right)):
-        index = np.full(out.shape, -1, np.int32)
-        raster_facets(xy[k], corner, first[k], np.full(out.shape, -np.inf), index)
-        shift = views[k].shift[0] / LATTICE_M, views[k].shift[1] / LATTICE_M
-        height = vertices.h_q * LATTICE_M
-        _shaded(xy[k], corner, index, first[k], positions[k], height, shift, tops[k], out)
-    return left, right[:, ::-1].copy()
+    for out, image, patch, sun, top in zip((left, right), (LEFT, RIGHT), patches, views, tops):
+        first = patch.row, patch.col
+        index = _nearest_triangles(xy, image, triangles, first, out.shape)
+        _shaded(xy, image, triangles, index, first, lattice, sun.axes, top, out)
+    return left, right

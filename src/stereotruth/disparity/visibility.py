@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..lidar.lattice import LATTICE_M
 from ..surface.surface import GroundSurface
 from .facet_raster import (
+    LEFT,
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
@@ -104,7 +105,8 @@ class VisibleSurface:
     it from there). ``disparity`` px, its ``slope`` [2, h, w] and ``variance`` px² (of the points
     alone), ``height`` m, ``surface_class`` (ASPRS) and ``day`` (both of the nearest vertex) of the
     nearest facet, NaN (0) where there is none. ``bulging``: whether the surface bulges out of its
-    facet. ``projected``: all of it in both images.
+    facet. ``strips``: greatest disparity of the strips between known surfaces, −∞ where there is
+    none. ``projected``: all of it in both images.
     """
 
     visibility: NDArray[np.uint8]
@@ -115,6 +117,7 @@ class VisibleSurface:
     surface_class: NDArray[np.uint8]
     day: NDArray[np.uint16]
     bulging: Bools
+    strips: Floats
     projected: ProjectedSurface
 
 
@@ -126,9 +129,11 @@ def visible_surface(
     surface, first = projected.surface, projected.first
     every = slice(0, len(surface.undecided))
     z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(projected.xy, surface.facet, first, z_buffer, index)
-    prisms = np.full(shape, -np.inf)
-    projected.raster_prisms(every, prisms)
+    raster_facets(projected.xy, surface.facet, first, z_buffer, index, LEFT, 0)
+    strips = np.full(shape, -np.inf)
+    projected.raster_prisms(surface.strips, strips)
+    prisms = strips.copy()
+    projected.raster_prisms(slice(0, surface.whole), prisms)
     visibility = np.where(index >= 0, np.uint8(VISIBLE), np.uint8(NO_FACET))
     visibility[prisms > z_buffer + OCCLUSION_TOLERANCE_PX] = PRISM_IN_LEFT
 
@@ -157,5 +162,6 @@ def visible_surface(
         surface_class=values.surface_class,
         day=values.day,
         bulging=values.rise > 0.0,
+        strips=strips,
         projected=projected,
     )

@@ -70,8 +70,8 @@ class GroundSurface:
 
     vertices: Vertices
     facet: Steps
-    variance: Floats
-    bulge: Floats
+    variance: NDArray[np.floating]
+    bulge: NDArray[np.floating]
     undecided: Steps
     height_range: Ints
     whole: int

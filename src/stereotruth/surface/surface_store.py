@@ -120,21 +120,14 @@ class WindowSurface:
     first: tuple[int, int]
 
     def surface(self, region: Region) -> GroundSurface:
-        """The triangles that touch a ``region``, and their vertices."""
-        parts, used, start = [], np.zeros(self.vertices.x.size, np.bool_), 0
+        """The triangles that touch a ``region``, with all vertices."""
+        parts, start = [], 0
         for block in self.blocks:
             arrays = self.store.arrays(block, list(ARRAYS)[6:])
-            size = self.store.sizes[block.name]
-            part = self._touching(arrays, start, region)
-            for name in ("facet", "whole", "strip", "top"):
-                used[part[name].reshape(-1)] = True
-            parts.append(part)
-            start += size
-        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+            parts.append(self._touching(arrays, start, region))
+            start += self.store.sizes[block.name]
         every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        for name in ("facet", "whole", "strip", "top"):
-            every[name] = number[every[name]]
-        return _surface(self.vertices.taken(used), every)
+        return _surface(self.vertices, every)
 
     def _touching(
         self, arrays: dict[str, NDArray], start: int, region: Region
@@ -174,8 +167,8 @@ def _surface(vertices: Vertices, arrays: dict[str, NDArray]) -> GroundSurface:
     return GroundSurface(
         vertices=vertices,
         facet=arrays["facet"],
-        variance=arrays["variance"].astype(np.float64),
-        bulge=arrays["bulge"].astype(np.float64),
+        variance=arrays["variance"],
+        bulge=arrays["bulge"],
         undecided=undecided,
         height_range=np.concatenate([whole_range, arrays["strip_range"].astype(np.int64)]),
         whole=len(whole),

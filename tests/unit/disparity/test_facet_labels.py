@@ -27,6 +27,7 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
         surface_class=zeros.astype(np.uint8),
         day=zeros.astype(np.uint16),
         bulging=np.arange(8) + zeros == 5,
+        strips=np.full(shape, -np.inf),
         projected=None,
     )
     points, nothing = np.full(shape, np.nan), np.zeros(shape, np.uint8)
