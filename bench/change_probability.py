@@ -23,7 +23,10 @@ from numpy.typing import NDArray
 from stereotruth.disparity.change_probability import (
     AGREED,
     CHANGED,
+    LEAST_SIGNAL,
     TREES,
+    UNKNOWN,
+    Evidence,
     by_itself,
     change_evidence,
     trees,
@@ -37,7 +40,7 @@ from stereotruth.simulate.changes import TEXTURE
 
 KINDS = (
     "nothing", "texture", "built", "demolished", "raised", "felled", "grown", "crops", "mixed",
-    "noise", "sun", "leaves",
+    "noise", "mixed in noise", "sun", "leaves",
 )  # fmt: skip
 DENSITY = 4.0  # points/m²
 BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, CHANGED, 0.3, 0.6, 1.0
@@ -58,6 +61,11 @@ class Sample(NamedTuple):
     changed: NDArray[np.bool_]
     texture: NDArray[np.bool_]
     agreed: tuple[int, int]
+
+    @property
+    def is_silent(self) -> NDArray[np.bool_]:
+        """Whether noise leaves nothing to tell by [n]."""
+        return ~(self.evidence[Evidence._fields.index("signal")] >= LEAST_SIGNAL)
 
 
 def samples(
@@ -102,7 +110,7 @@ def fit(of: list[Sample]) -> DecisionTrees:
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     rng = np.random.default_rng(0)
-    chosen = [rng.random(s.changed.size) < FEW for s in of]
+    chosen = [(rng.random(s.changed.size) < FEW) & ~s.is_silent for s in of]
     features = np.concatenate([s.evidence[:, c].T for s, c in zip(of, chosen)])
     changed = np.concatenate([s.changed[c] for s, c in zip(of, chosen)])
     texture = np.concatenate([s.texture[c] for s, c in zip(of, chosen)])
@@ -135,6 +143,8 @@ def main() -> None:
         of = [s for part in each for _, s in part]
         changed, kept = np.sum([s.agreed for s in of], axis=0)
         print(f"of pixels that agree fully {changed / (changed + kept):.6f} have changed")
+        silent = np.sum([[(s.is_silent & s.changed).sum(), s.is_silent.sum()] for s in of], axis=0)
+        print(f"of those that noise keeps from telling {silent[0] / max(silent[1], 1):.4f} have")
         return fit(of)
 
     if given.fit:
@@ -156,7 +166,7 @@ def report(seeds: list[int], folder: Path, lit: bool) -> None:
     of_kind: dict[str, NDArray[np.int64]] = {}
     for kind, of in samples(seeds, folder, lit, around=True):
         odds, changed = trees()[1].sum_at(of.evidence).astype(np.float64), of.changed
-        p = 1.0 / (1.0 + np.exp(-odds))
+        p = np.where(of.is_silent, UNKNOWN, 1.0 / (1.0 + np.exp(-odds)))
         counts += [np.histogram(p[part], BINS)[0] for part in (changed, ~changed)]
         counts[:, np.searchsorted(BINS, AGREED) - 1] += of.agreed
         left = p > CHANGED

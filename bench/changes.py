@@ -78,6 +78,8 @@ SHARES = {
         "built": 0.15, "demolished": 0.15, "raised": 0.1, "felled": 0.2, "grown": 0.2, "crops": 0.3,
     },
 }  # fmt: skip
+SHARES["mixed in noise"] = SHARES["mixed"]
+SPOILT = "noise", "mixed in noise"  # images of little contrast and much noise
 CONDITIONS = ("one day", "a year apart")
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
@@ -118,9 +120,9 @@ class Case:
             drawn.character, relief_m=8.0, valley=0.3, wavelength_m=700.0, max_slope_deg=15.0,
             river_m=70.0 if water else 0.0, lakes=0.0, zone_m=200.0, towers_m=(20.0, 45.0),
             zones={"fields": 4.0, "village": 1.0, "park": 0.5} if is_open else TOWN,
-            vehicles=8.0 if self.kind in ("moved", "mixed") else 0.0,
+            vehicles=8.0 if self.kind in ("moved", "mixed", "mixed in noise") else 0.0,
             canopy=Canopy(ground_m2=150.0) if self.kind == "leaves" else None,
-            ground_look=(1.0, 0.3) if self.kind == "noise" else (1.0, 1.0),
+            ground_look=(1.0, 0.3) if self.kind in SPOILT else (1.0, 1.0),
         )  # fmt: skip
         dates = Dates(3 * YEAR, (4 if self.apart else 3) * YEAR, 0.0, **SHARES[self.kind])
         sun = None
@@ -141,7 +143,7 @@ class Case:
         images = [folder / f"{view}.tif" for view in VIEWS]
         for view, image in zip(VIEWS, images):
             simulate_image(city, spec, view, image, seed=self.seed)
-        if self.kind == "noise":
+        if self.kind in SPOILT:
             _spoil(images, self.seed)
         tables = [folder / f"{name}.csv" for name in ("measured", "exact", "checkpoints")]
         simulate_points(city, spec, *tables, seed=self.seed)
@@ -156,8 +158,8 @@ class Case:
 
     def made(self, folder: Path) -> Path:
         """The folder of :meth:`make`, made once."""
-        parts = self.kind, self.condition.replace(" ", "_"), str(self.seed), str(self.density)
-        name = "-".join(parts if self.classed else (*parts, "unclassed"))
+        parts = self.kind, self.condition, str(self.seed), str(self.density)
+        name = "-".join(parts if self.classed else (*parts, "unclassed")).replace(" ", "_")
         path = folder / name
         if not path.is_dir():
             with atomic_folder(path) as scratch:

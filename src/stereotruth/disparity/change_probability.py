@@ -26,7 +26,7 @@ from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .seen_surface import box_max
 from .shifted_agreement import SHIFTS_PX, shifted_agreement
-from .surface_means import apart_from_steps, left_and_warped, surface_mean
+from .surface_means import VOTE_PX, apart_from_steps, left_and_warped, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -36,9 +36,12 @@ SURROUNDINGS_PX = 8  # pixels of the surface up to here: for the detail's agreem
 ALIKE_PX = 4  # for pixels that are alike, for contrast and gain,
 GAIN_PX = 16  # which is held against that up to here
 STEP_PX = 8  # steps farther off do not count
-AROUND = (4, 1), (8, 2), (12, 3)  # px up to which, one of so many, probabilities are averaged
+# px up to which, one of so many, probabilities are averaged; labels are compared up to VOTE_PX off
+AROUND = (4, 1), (8, 2), (VOTE_PX, 3)
 FULL_AGREEMENT = 0.8  # of the detail, with which hardly anything has changed:
 SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
+LEAST_SIGNAL = 0.2  # share, with less of which images tell nothing, and the probability is
+UNKNOWN = 0.02  # the share that has changed there
 AGREED = 0.0007  # share that has, of all cities that the trees are fitted to
 LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
@@ -162,7 +165,7 @@ def by_itself(evidence: Evidence, doubtful: Bools) -> Floats:
     not ``doubtful``."""
     own, _ = trees()
     out = np.full(doubtful.shape, AGREED)
-    out[doubtful] = _logistic(own.sum_at(np.stack(evidence)))
+    out[doubtful] = _probability(own, np.stack(evidence), evidence.signal)
     return out
 
 
@@ -181,9 +184,11 @@ def probability_of_change(
     _, with_others = trees()
     out = by_itself(evidence, doubtful)
     others = with_surroundings(out, doubtful, labels, labelled)
-    out[doubtful] = _logistic(with_others.sum_at(np.stack([*evidence, *others])))
+    out[doubtful] = _probability(with_others, np.stack([*evidence, *others]), evidence.signal)
     return out
 
 
-def _logistic(odds: Singles) -> Floats:
-    return 1.0 / (1.0 + np.exp(-odds.astype(np.float64)))
+def _probability(of: DecisionTrees, features: Singles, signal: Singles) -> Floats:
+    """By trees that sum up to log odds; UNKNOWN where noise leaves nothing to tell by."""
+    probability = 1.0 / (1.0 + np.exp(-of.sum_at(features).astype(np.float64)))
+    return np.where(signal >= LEAST_SIGNAL, probability, UNKNOWN)

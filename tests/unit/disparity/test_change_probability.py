@@ -8,6 +8,7 @@ import pytest
 from stereotruth.disparity.change_probability import (
     CHANGED,
     STEP_PX,
+    UNKNOWN,
     Evidence,
     change_evidence,
     probability_of_change,
@@ -70,6 +71,7 @@ def test_images_of_noise_alone_tell_nothing() -> None:
     images = (np.round(rng.normal(900.0, 20.0, (160, 260))) for _ in range(2))
     found = probability_of_change(LEVEL, pair(*images), 9, (400.0, 400.0), ALL)
     assert (found[INNER] > CHANGED).mean() < 0.05
+    assert np.median(found[INNER]) == UNKNOWN
 
 
 def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
