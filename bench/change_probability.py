@@ -2,10 +2,10 @@
 
 python bench/change_probability.py [--fit 1 2 3 4] [--seeds 61 62] [--folder FOLDER]
 
-Of the simulated cities of changes.py whose images are a year apart, with and without predicted
-shadows: the share of labels that have changed by the probability that
-stereotruth.disparity.change_probability tells. With --fit the trees are first fitted anew to the
-cities of these seeds, and written beside that module (pip install scikit-learn).
+Of the simulated cities of changes.py whose images are a year apart: the share of labels that have
+changed by the probability that stereotruth.disparity.change_probability tells. With --fit the trees
+are first fitted anew to the cities of these seeds, and written beside that module (pip install
+scikit-learn).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ KINDS = (
     "noise", "mixed in noise", "sun", "leaves",
 )  # fmt: skip
 DENSITY = 4.0  # points/m²
-BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, CHANGED, 0.3, 0.6, 1.0
+BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.15, CHANGED, 0.7, 1.0
 # Share of the pixels that are fitted to, weight of those of new texture alone, which are few
 FEW, OF_TEXTURE = 0.3, 5.0
 NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 200  # of the trees
@@ -68,14 +68,11 @@ class Sample(NamedTuple):
         return ~(self.evidence[Evidence._fields.index("signal")] >= LEAST_SIGNAL)
 
 
-def samples(
-    seeds: list[int], folder: Path, lit: bool, around: bool
-) -> Iterator[tuple[str, Sample]]:
-    """Of all kinds of change; ``lit``: shadows are predicted; ``around``: the evidence holds the
-    probabilities of the surroundings, too."""
+def samples(seeds: list[int], folder: Path, around: bool) -> Iterator[tuple[str, Sample]]:
+    """Of all kinds of change; ``around``: the evidence holds the probabilities of the surroundings,
+    too."""
     for kind, seed in product(KINDS, seeds):
-        case = Case(kind, CONDITIONS[1], seed, DENSITY, with_suns=lit)
-        yield kind, sample(case, folder, around)
+        yield kind, sample(Case(kind, CONDITIONS[1], seed, DENSITY), folder, around)
 
 
 def sample(case: Case, folder: Path, around: bool) -> Sample:
@@ -139,8 +136,7 @@ def main() -> None:
     given = parser.parse_args()
 
     def fitted(seeds: list[int], around: bool) -> DecisionTrees:
-        each = (samples(seeds, given.folder, lit, around) for lit in (False, True))
-        of = [s for part in each for _, s in part]
+        of = [s for _, s in samples(seeds, given.folder, around)]
         changed, kept = np.sum([s.agreed for s in of], axis=0)
         print(f"of pixels that agree fully {changed / (changed + kept):.6f} have changed")
         silent = np.sum([[(s.is_silent & s.changed).sum(), s.is_silent.sum()] for s in of], axis=0)
@@ -155,16 +151,14 @@ def main() -> None:
         trees.cache_clear()
         DecisionTrees.save(TREES, [own, fitted(given.fit[middle:], around=True)])
         trees.cache_clear()
-    for lit in (False, True):
-        print("predicted shadows" if lit else "no suns known", flush=True)
-        report(given.seeds, given.folder, lit)
+    report(given.seeds, given.folder)
 
 
-def report(seeds: list[int], folder: Path, lit: bool) -> None:
+def report(seeds: list[int], folder: Path) -> None:
     """Print what is found and lost of each kind, and what has changed of labels by probability."""
     counts = np.zeros((2, len(BINS) - 1), np.int64)
     of_kind: dict[str, NDArray[np.int64]] = {}
-    for kind, of in samples(seeds, folder, lit, around=True):
+    for kind, of in samples(seeds, folder, around=True):
         odds, changed = trees()[1].sum_at(of.evidence).astype(np.float64), of.changed
         p = np.where(of.is_silent, UNKNOWN, 1.0 / (1.0 + np.exp(-odds)))
         counts += [np.histogram(p[part], BINS)[0] for part in (changed, ~changed)]
@@ -178,14 +172,14 @@ def report(seeds: list[int], folder: Path, lit: bool) -> None:
         of_kind[kind] = of_kind.get(kind, 0) + np.array(shares)
     for kind, (found, changed, lost, kept, blank, texture) in of_kind.items():
         print(
-            f"  {kind}: {100 * found / max(changed, 1):.1f} % of the changed are found, "
+            f"{kind}: {100 * found / max(changed, 1):.1f} % of the changed are found, "
             f"{100 * lost / max(kept, 1):.2f} % of the others lost, "
             f"{100 * blank / max(texture, 1):.1f} % of new texture that does not agree fully"
         )
     for low, high, n, others in zip(BINS, BINS[1:], *counts):
         if n + others:
             share = 100.0 * n / (n + others)
-            print(f"  P {low} to {high}: {share:.2f} % of {n + others} have changed")
+            print(f"P {low} to {high}: {share:.2f} % of {n + others} have changed")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What changed between LiDAR and images: who notices, what is lost, which reason is told.
 
 python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
-                        [--without-classes] [--without-suns] [--figure docs/changes.png]
+                        [--without-classes] [--figure docs/changes.png]
 
 Cities are drawn by seed, one for each kind of change and one with many (mixed), and each of them is
 made under two conditions: both images of one day three years after the LiDAR; or the right image a
@@ -88,21 +88,13 @@ LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun 
 @dataclass(frozen=True)
 class Case:
     """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²,
-    whose points have classes or none; of images whose suns are known or not."""
+    whose points have classes or none."""
 
     kind: str
     condition: str
     seed: int
     density: float
     classed: bool = True
-    with_suns: bool = True
-
-    @property
-    def suns(self) -> list[tuple[float, float] | None]:
-        """Of both images, azimuth and elevation in degrees."""
-        city = self.city
-        own = city.sun_azimuth_deg, city.sun_elevation_deg
-        return [(getattr(city, v).sun_deg or own) if self.with_suns else None for v in VIEWS]
 
     @property
     def apart(self) -> bool:
@@ -224,7 +216,7 @@ def inputs_of(case: Case, folder: Path) -> SceneInputs:
     made = case.made(folder)
     return SceneInputs.of(
         *(made / f"{view}.zarr" for view in VIEWS), sorted(made.glob("*.points")),
-        settings_of(case), alignment=made / "alignment.json", suns=case.suns,
+        settings_of(case), alignment=made / "alignment.json",
     ).with_surface(made, workers=2)  # fmt: skip
 
 
@@ -391,7 +383,6 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(SHARES), choices=list(SHARES))
     parser.add_argument("--density", type=float, default=4.0)
     parser.add_argument("--without-classes", action="store_true", help="of the LiDAR's points")
-    parser.add_argument("--without-suns", action="store_true", help="no shadow is predicted")
     parser.add_argument("--figure", type=Path, help="draw a block of the city mixed, no table")
     given = parser.parse_args()
     if given.figure:
@@ -405,8 +396,7 @@ def main() -> None:
                 continue
             row = Row()
             for seed in given.seeds:
-                known = not given.without_classes, not given.without_suns
-                case = Case(kind, condition, seed, given.density, *known)
+                case = Case(kind, condition, seed, given.density, not given.without_classes)
                 row.add(case, Labelled.of(case, given.folder))
             print("| " + " | ".join([kind, condition, *row.cells()]) + " |", flush=True)
 

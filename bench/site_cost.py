@@ -1,8 +1,8 @@
 """What one more pair of a site costs, and the first one beside the decoding of its LiDAR.
 
 Draws a site, runs the workflow as a user does up to the labels of its first pair in a project of
-that pair alone, then of all pairs in another, and adds up the processor time, memory and disk that
-the jobs' own records tell. See README.md beside this.
+that pair alone, then of all pairs in another, and adds up the processor time and memory that the
+jobs tell at their end, and the disk. See README.md beside this.
 """
 
 from __future__ import annotations
@@ -28,17 +28,28 @@ from stereotruth.simulate.sites import drawn_site
 BEFORE = ("ingest", "surface", "align", "refine", "adjust", "adjusted_alignment", "rectify")
 RULES = (*BEFORE, "project")
 ONCE = ("ingest", "surface")
-# For all processes of a run: rule, script and file where a script of a rule opens LiDAR.
+# For all processes of a run: rule, script and file where a script of a rule opens LiDAR; at its end
+# the processor time that it took, of which Snakemake's records hold a sample of up to 30 s before.
 TRACE = """
-import os, sys
+import atexit, os, resource, sys
+def job():
+    folder, script = os.path.split(getattr(sys, "argv", [""])[0])
+    if folder.endswith("scripts") and script.endswith(".py"):
+        number, rule, _ = script.split(".")
+        return rule, number
+def note(file, *values):
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a") as log:
+        print(*values, sep="\\t", file=log)
 def opened(event, arguments):
-    if event == "open" and str(arguments[0]).endswith((".las", ".laz")):
-        folder, script = os.path.split(getattr(sys, "argv", [""])[0])
-        if folder.endswith("scripts") and script.endswith(".py"):
-            job, rule, _ = script.split(".")
-            with os.fdopen(os.open({file!r}, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a") as log:
-                print(rule, job, os.path.basename(arguments[0]), sep="\\t", file=log)
+    if event == "open" and str(arguments[0]).endswith((".las", ".laz")) and job():
+        note({opened!r}, *job(), os.path.basename(arguments[0]))
+def spent():
+    if job():
+        used = [resource.getrusage(of) for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        seconds = sum(of.ru_utime + of.ru_stime for of in used)
+        note({spent!r}, *job(), seconds, max(of.ru_maxrss for of in used) / 1024.0)
 sys.addaudithook(opened)
+atexit.register(spent)
 """
 
 
@@ -85,10 +96,12 @@ def alone(folder: Path) -> Path:
 
 
 def label(folder: Path, city: str, scenes: Sequence[str]) -> None:
-    """Label pairs, with a record of the jobs that open LiDAR files (:data:`TRACE`)."""
+    """Label pairs, with a record of the jobs that open LiDAR files, and of what each takes
+    (:data:`TRACE`)."""
     trace = folder / "trace"
     trace.mkdir(exist_ok=True)
-    (trace / "sitecustomize.py").write_text(TRACE.format(file=str(trace / "opened.txt")), "utf-8")
+    files = {name: str(trace / f"{name}.txt") for name in ("opened", "spent")}
+    (trace / "sitecustomize.py").write_text(TRACE.format(**files), "utf-8")
     paths = filter(None, [str(trace), os.environ.get("PYTHONPATH")])
     grids = (f"results/project/{city}/{scene}.zarr" for scene in scenes)
     stereotruth(
@@ -117,16 +130,15 @@ class Spent(NamedTuple):
 
 
 def spent(folder: Path) -> dict[str, Spent]:
-    """By rule, from the records that the jobs leave."""
-    out = {}
-    for rule in RULES:
-        jobs = []
-        for file in (folder / "logs" / rule).rglob("*.tsv"):
-            with file.open(encoding="utf-8") as stream:
-                jobs += list(csv.DictReader(stream, delimiter="\t"))
-        seconds, memory = ([float(job[name]) for job in jobs] for name in ("cpu_time", "max_rss"))
-        out[rule] = Spent(len(jobs), sum(seconds), max(memory, default=0.0))
-    return out
+    """By rule, as the jobs told at their end."""
+    lines = (folder / "trace" / "spent.txt").read_text(encoding="utf-8").splitlines()
+    jobs: dict[str, list[tuple[float, float]]] = {rule: [] for rule in RULES}
+    for rule, _, seconds, memory in (line.split("\t") for line in lines):
+        jobs.setdefault(rule, []).append((float(seconds), float(memory)))
+    return {
+        rule: Spent(len(of), sum(s for s, _ in of), max((m for _, m in of), default=0.0))
+        for rule, of in jobs.items()
+    }
 
 
 def megabytes(folder: Path) -> float:

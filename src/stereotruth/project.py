@@ -260,24 +260,6 @@ def days_of_pair(names: tuple[str, str], images: Mapping[str, sheets.Image]) -> 
     return left.isoformat() if left else "", right.isoformat() if right else ""
 
 
-def suns_of_pair(
-    names: tuple[str, str], images: Mapping[str, sheets.Image]
-) -> list[list[float] | str | None]:
-    """What the images sheet says of the suns of a pair's left and right image: azimuth and
-    elevation (degrees); else the time when it was taken (ISO); else None; ``names``: see
-    :func:`names_in_pair`."""
-    suns: list[list[float] | str | None] = []
-    for name in names:
-        image = images[name] if name else None
-        if image is None:
-            suns.append(None)
-        elif image.sun_azimuth is not None and image.sun_elevation is not None:
-            suns.append([float(image.sun_azimuth), float(image.sun_elevation)])
-        else:
-            suns.append(image.acquired if ":" in image.acquired else None)
-    return suns
-
-
 def _remarks_on_lists(
     rows: Mapping[str, sheets.Scene], scenes: Mapping[str, sheets.Scene], settings: Configuration
 ) -> Iterator[str]:

@@ -144,12 +144,12 @@ def write_points(
     return folder / f"{name}.points"
 
 
-PAIR = ("view", "alignment", "surface", "suns")
+PAIR = ("view", "alignment", "surface")
 RUN = ("code", "workers", "scheduler", "scene", "max_points", "strip")
 
 
 def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):
-    """project_scene; ``options`` are its own, view, alignment, surface and suns, and those of its
+    """project_scene; ``options`` are its own, view, alignment and surface, and those of its
     settings."""
     run = {name: options.pop(name) for name in RUN if name in options}
     pair = {name: options.pop(name) for name in PAIR if name in options}

@@ -19,7 +19,6 @@ from stereotruth.project import (
     read_mapping,
     read_scenes,
     stores_of,
-    suns_of_pair,
 )
 from stereotruth.settings import merged
 from stereotruth.sheets import Image, Scene
@@ -209,17 +208,3 @@ def test_days_of_a_pair_are_those_of_the_images_sheet(names, days):
         for name, cell in acquired.items()
     }
     assert days_of_pair(names, images) == days
-
-
-def test_suns_of_a_pair_are_those_of_the_images_sheet():
-    """Angles before the time, which tells them; a day does not."""
-    cells = {
-        "l": {"acquired": "2020-10-26T03:12:45Z", "sun_azimuth": 140.0, "sun_elevation": 50.0},
-        "r": {"acquired": "2020-10-26T03:12:45Z"},
-        "n": {"acquired": "2020-10-26"},
-    }
-    images = {
-        name: Image(image=name, city="A", file=f"{name}.tif", **of) for name, of in cells.items()
-    }
-    assert suns_of_pair(("l", "r"), images) == [[140.0, 50.0], "2020-10-26T03:12:45Z"]
-    assert suns_of_pair(("n", ""), images) == [None, None]

@@ -20,7 +20,6 @@ from stereotruth.project import (
     read_images,
     read_scenes,
     stores_of,
-    suns_of_pair,
     surfaces_of,
 )
 

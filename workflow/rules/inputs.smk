@@ -249,10 +249,3 @@ def diachronic_of(scene):
     """Whether a scene's images share no light, by its row if that says."""
     cell = SCENES[scene].diachronic
     return {"diachronic": cell == "true" if cell else SETTINGS.project.diachronic}
-
-
-def suns_of(scene):
-    """What the images sheet says of the suns of a scene whose images share no light."""
-    if not diachronic_of(scene)["diachronic"]:
-        return [None, None]
-    return suns_of_pair(IMAGE_NAMES[scene], IMAGES)

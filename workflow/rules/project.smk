@@ -26,7 +26,6 @@ rule project:
         script=content_of("../scripts/project.py"),
         view="left",
         settings=lambda w: PROJECTION | diachronic_of(w.scene),
-        suns=lambda w: suns_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
@@ -52,7 +51,6 @@ use rule project as project_right with:
         script=content_of("../scripts/project.py"),
         view="right",
         settings=lambda w: PROJECTION | diachronic_of(w.scene),
-        suns=lambda w: suns_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
@@ -82,7 +80,6 @@ rule project_strip:
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
         settings=lambda w: PROJECTION | diachronic_of(w.scene),
-        suns=lambda w: suns_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"

@@ -21,7 +21,6 @@ if __name__ == "__main__":
             snakemake.params.view,
             snakemake.input.alignment,
             snakemake.input.surface or None,
-            snakemake.params.suns,
         )
         project_scene(
             inputs,

@@ -6,8 +6,8 @@ over the surface around a pixel, all the same, hardly anything has changed. Else
 together tell (:class:`Evidence`): agreements over windows of two kinds, one at another disparity,
 how much each image has to tell, and where the pixel lies. What they tell is learned from simulated
 cities of which all changes are known: decision trees, whose values sum up to the log odds of a
-change (eq. 18 of docs/explanation/surface.md, bench/change_probability.py). What has changed is
-larger than a pixel, so that other trees ask the probabilities of the surface around, too (eq. 19).
+change (eq. 17 of docs/explanation/surface.md, bench/change_probability.py). What has changed is
+larger than a pixel, so that other trees ask the probabilities of the surface around, too (eq. 18).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FULL_AGREEMENT = 0.8  # of the detail, with which hardly anything has changed:
 SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 LEAST_SIGNAL = 0.2  # share, with less of which images tell nothing, and the probability is
 UNKNOWN = 0.02  # the share that has changed there
-AGREED = 0.0007  # share that has, of all cities that the trees are fitted to
+AGREED = 0.0007  # about the share that has, of the cities that the trees are fitted to
 LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
 CHANGED = 0.4  # more probable, a label is left out
@@ -53,16 +53,15 @@ class Evidence(NamedTuple):
     """What both images tell of pixels [n], float32, NaN where nothing tells.
 
     ``agreement``: mean correlation of the images' detail over the surface up to SURROUNDINGS_PX
-    around a pixel, at its disparity, what lies in predicted shadows left apart; ``elsewhere``: the
-    greatest at a shifted disparity, by ``shift`` px up or down; ``signal``: what the same ground
-    would agree by, as noise leaves it. ``alike``: correlation of the brightness over the pixels
-    that are alike (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the
-    edges of shadows and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX.
-    ``contrast_left`` and
+    around a pixel, at its disparity; ``elsewhere``: the greatest at a shifted disparity, by
+    ``shift`` px up or down; ``signal``: what the same ground would agree by, as noise leaves it.
+    ``alike``: correlation of the brightness over the pixels that are alike
+    (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the edges of shadows
+    and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX. ``contrast_left`` and
     ``contrast_right``: standard deviation of the surface up to ALIKE_PX in each image, in that of
     its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
     GAIN_PX, as a logarithm. ``from_step``: px to the next step of the surface, STEP_PX at most;
-    ``slope`` of the disparity. ``is_lit``: whether shadows are predicted.
+    ``slope`` of the disparity.
     """
 
     agreement: Singles
@@ -76,7 +75,6 @@ class Evidence(NamedTuple):
     gain: Singles
     from_step: Singles
     slope: Singles
-    is_lit: Singles
 
 
 def change_evidence(
@@ -93,9 +91,9 @@ def change_evidence(
     images, DN².
     """
     compared = labels, window, noise, window_px, SURROUNDINGS_PX
-    detail = shifted_agreement(*compared, labelled, (), by_light=True)
+    detail = shifted_agreement(*compared, labelled, ())
     doubtful = labelled & ~(detail.here >= FULL_AGREEMENT)
-    shifted = shifted_agreement(*compared, doubtful, SHIFTS_PX, by_light=True)
+    shifted = shifted_agreement(*compared, doubtful, SHIFTS_PX)
     left, warped = left_and_warped(window, labels.disparity)
     surface, runs = (labels.disparity, labels.slope), wanted_runs(doubtful)
 
@@ -124,7 +122,6 @@ def change_evidence(
         gain,
         _from_step(labels.disparity),
         np.abs(labels.slope).sum(axis=0),
-        np.full(doubtful.shape, window.shaded is not None),
     )
     return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
 

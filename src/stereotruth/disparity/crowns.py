@@ -27,7 +27,6 @@ from ..lidar.lattice import LATTICE_M
 from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
 from .facet_raster import (
-    LEFT,
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
@@ -133,13 +132,13 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     rough, tops, xy = surface.tops, surface.vertices, visible.projected.xy
     corner = rough.corner[rough.is_gentle]
     z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(xy, corner, first, z_buffer, index, LEFT, 0)
+    raster_facets(xy, corner, first, z_buffer, index)
     disparity = np.where(index >= 0, z_buffer, np.nan)
     before = np.where(np.isnan(visible.disparity), -np.inf, visible.disparity)
     steep, unused = rough.corner[~rough.is_gentle], np.empty(shape, np.int32)
-    raster_facets(xy, steep, first, before, unused, LEFT, 0)
+    raster_facets(xy, steep, first, before, unused)
     tops_buffer = z_buffer.copy()
-    raster_facets(xy, steep, first, tops_buffer, unused, LEFT, 0)
+    raster_facets(xy, steep, first, tops_buffer, unused)
     before = np.maximum(before, visible.strips)
     all_around = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
     is_open = np.isin(visible.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))

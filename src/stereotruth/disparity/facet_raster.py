@@ -20,7 +20,6 @@ Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
-LEFT, RIGHT = 0, 2  # a view, by where its x and y stand in positions
 # What lies in front of a surface by less is the surface itself.
 OCCLUSION_TOLERANCE_PX = 0.25
 ROUNDING_PX = 1e-6  # of where an edge meets a row
@@ -151,31 +150,25 @@ def raster_triangle(
 
 @kernel
 def raster_facets(
-    xy: Floats,
-    corner: Steps,
-    first: tuple[int, int],
-    z_buffer: Floats,
-    index: Steps,
-    view: int,
-    number: int,
+    xy: Floats, corner: Steps, first: tuple[int, int], z_buffer: Floats, index: Steps
 ) -> None:
-    """The triangle of the greatest disparity at each pixel's centre of a ``view``, and that
-    disparity (eq. 7 of docs/explanation/surface.md).
+    """The triangle of the greatest disparity at each pixel's centre, and that disparity (eq. 7 of
+    docs/explanation/surface.md).
 
-    Raises ``z_buffer`` [rows, cols] and sets ``index``; the first triangle has the ``number``. Of
-    equals, the triangle of the lower number.
+    Raises ``z_buffer`` [rows, cols] and sets ``index``. Of equals, the triangle of the lower
+    number.
     """
     rows, cols = z_buffer.shape
     for t in range(len(corner)):
-        y = triple(xy[view + 1], corner[t])
+        y = triple(xy[1], corner[t])
         if misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x = triple(xy[view], corner[t])
+        x = triple(xy[0], corner[t])
         if misses(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), first[1], cols):
             continue
-        xl, xr = triple(xy[LEFT], corner[t]), triple(xy[RIGHT], corner[t])
-        d = (xl[0] - xr[0], xl[1] - xr[1], xl[2] - xr[2])
-        raster_triangle(x, y, d, first, number + t, z_buffer, index)
+        xr = triple(xy[2], corner[t])
+        d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
+        raster_triangle(x, y, d, first, t, z_buffer, index)
 
 
 @inner

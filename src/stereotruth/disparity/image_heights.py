@@ -37,7 +37,6 @@ from ..surface.scale import PART
 from ..surface.surface_store import Box, SurfaceStore
 from ..surface.vertices import Vertices
 from .facet_raster import (
-    LEFT,
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
@@ -178,7 +177,7 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     every = surface.vertices
     xy = inputs.project(every.lon_q, every.lat_q, every.h_q)
     above, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(xy, surface.facet, first, above, index, LEFT, 0)
+    raster_facets(xy, surface.facet, first, above, index)
     undecided = np.full(shape, -np.inf)
     higher = inputs.project(every.lon_q, every.lat_q, every.h_q + _RISE)
     rise = ((higher - xy) / _RISE).astype(np.float32)

@@ -64,10 +64,9 @@ class Detail:
     signal: NDArray[np.float32]
 
     @classmethod
-    def of(cls, patch: Patch, noise: float, shaded: NDArray[np.bool_] | None = None) -> Detail:
-        """By the variance of the ``noise``, DN², and what of the patch lies in shadow (``shaded``),
-        if that is known."""
-        pixels, signal = detail(patch.pixels, noise, shaded)
+    def of(cls, patch: Patch, noise: float) -> Detail:
+        """By the variance of the ``noise``, DN²."""
+        pixels, signal = detail(patch.pixels, noise)
         return cls(replace(patch, pixels=pixels), signal)
 
 

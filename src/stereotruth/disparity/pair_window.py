@@ -24,8 +24,6 @@ class PairWindow:
 
     The outer ``margin`` pixels have no labels of their own, but take part in those of others.
     ``left``, ``right``: patches; the right one holds all that the window's points can be seen in.
-    ``shaded``: which of their pixels lie in the shadow that the LiDAR's surface casts; None: it is
-    not known.
     """
 
     rows: slice
@@ -33,7 +31,6 @@ class PairWindow:
     margin: int
     left: Patch
     right: Patch
-    shaded: tuple[Bools, Bools] | None = None
 
     @property
     def first(self) -> tuple[int, int]:
@@ -45,20 +42,15 @@ class PairWindow:
         """(rows, cols)."""
         return self.rows.stop - self.rows.start, self.cols.stop - self.cols.start
 
-    def details(self, noise: tuple[float, float], by_light: bool = False) -> tuple[Detail, Detail]:
-        """Of both images, by the variances of their ``noise``, DN²; kept for the next call.
-
-        ``by_light``: with what is ``shaded`` left apart, if that is known.
-        """
-        shaded = self.shaded if by_light and self.shaded is not None else (None, None)
-        key = noise, shaded[0] is not None
-        if key not in self._details:
-            left, right = map(Detail.of, (self.left, self.right), noise, shaded)
-            self._details[key] = left, right
-        return self._details[key]
+    def details(self, noise: tuple[float, float]) -> tuple[Detail, Detail]:
+        """Of both images, by the variances of their ``noise``, DN²; kept for the next call."""
+        if noise not in self._details:
+            left, right = map(Detail.of, (self.left, self.right), noise)
+            self._details[noise] = left, right
+        return self._details[noise]
 
     @cached_property
-    def _details(self) -> dict[tuple[tuple[float, float], bool], tuple[Detail, Detail]]:
+    def _details(self) -> dict[tuple[float, float], tuple[Detail, Detail]]:
         return {}
 
     @property

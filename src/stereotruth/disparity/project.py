@@ -78,8 +78,7 @@ class _Blocks:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
         here = self.scene.pair.cols(cols)
         points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
-        blocks = self.scene.surface_blocks(rows, here), *self.scene.casters(rows, here)
-        surface = [block.sha256 for of_view in blocks for block in of_view]
+        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
@@ -189,9 +188,8 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
 
 
 def _parameters(inputs: SceneInputs) -> dict[str, Any]:
-    """Of a scene's labels: its view, the settings, and the suns whose shadows are predicted."""
-    suns = {} if inputs.predicted_suns is None else {"suns": inputs.predicted_suns}
-    return {"view": inputs.view} | asdict(inputs.settings) | suns
+    """Of a scene's labels: its view and the settings."""
+    return {"view": inputs.view} | asdict(inputs.settings)
 
 
 def _content(inputs: SceneInputs, code: str) -> str:

@@ -11,14 +11,12 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
    and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
    has the label of its nearest facet if nothing may hide it in either view; if its own points are
    the surer ones, theirs (:mod:`.facet_labels`).
-4. *Shadows.* What the surface puts in shadow in each of two images of different suns
-   (:mod:`.shadows`).
-5. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
+4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
    (:mod:`.image_agreement`). Rough surfaces, of which no triangle is a facet, get labels of their
    own, which the images confirm (:mod:`.crowns`).
-6. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
+5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
    (:mod:`.change_reasons`).
-7. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
+6. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
 
 The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_recipe`).
 """
@@ -42,7 +40,6 @@ from .paper_recipe import paper_labels
 from .pixel_labels import Pixels, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
-from .shadows import shaded
 from .status import Status
 from .surface_means import VOTE_PX
 from .visibility import ProjectedSurface, visible_surface
@@ -119,9 +116,6 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     rough = crowns(visible, scale)
     labels = without_contours(labels, rough, visible, scale)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
-
-    # shadows of both images
-    window = replace(window, shaded=shadows_of(scene, window, projected))
     return LidarLabels(labels, rough, own.pixels, window, comparison)
 
 
@@ -134,21 +128,6 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     labels = without_changes(labels, window, comparison)
     labels = with_crowns(labels, rough, window, comparison)
     return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)
-
-
-def shadows_of(
-    scene: SceneInputs, window: PairWindow, projected: ProjectedSurface
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """What of both images of a window lies in shadow by the suns of the ``scene``, see
-    :attr:`.SceneInputs.predicted_suns`."""
-    if scene.sun_views is None:
-        return None
-    rows, cols = (
-        slice(grid.start + window.margin, grid.stop - window.margin)
-        for grid in (window.rows, window.cols)
-    )
-    casters = scene.casters(rows, cols)
-    return shaded(projected, (window.left, window.right), scene.sun_views, scene.ground, casters)
 
 
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:

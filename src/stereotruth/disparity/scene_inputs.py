@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,11 @@ from numpy.typing import NDArray
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
-from ..epipolar.sun import sun_over
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_store import PointStore, open_stores
 from ..products.grids import require_complete
 from ..products.provenance import digest
-from ..settings import acquisition_time
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
@@ -32,23 +29,9 @@ from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
 from .settings import Settings
-from .shadows import SunView
 from .status import Status
 
 DAYS = 256  # of the points of a scene that have a number: 8 bits
-Sun = tuple[float, float]
-LOWEST_SUN_DEG = 15.0  # with a lower one most lies in shadow, and shadows are not predicted
-
-
-def _sun_at(time: str, model: EpipolarModel) -> Sun | None:
-    """Over the middle of an epipolar grid at a ``time`` (ISO); None of a day."""
-    taken = acquisition_time(time)
-    if not isinstance(taken, datetime):
-        return None
-    rows, cols = model.shape
-    lon, lat = model.epipolar_to_ground(cols / 2.0, rows / 2.0, model.reference_height)
-    azimuth, elevation = sun_over(taken, float(lon), float(lat))
-    return round(azimuth, 4), round(elevation, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +41,7 @@ class SceneInputs:
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
     file whose corrections the images were rectified with; without it, it counts as exact.
-    ``surface``: the store with the surface of the points; the recipe paper needs none. ``suns``
-    of the left and the right image: azimuth and elevation (degrees), or the time (ISO) that these
-    follow from where the rectified image does not say them, or None.
+    ``surface``: the store with the surface of the points; the recipe paper needs none.
     """
 
     left_store: Path
@@ -70,7 +51,6 @@ class SceneInputs:
     view: str = "left"
     alignment: Path | None = None
     surface: Path | None = None
-    suns: tuple[Sun | str | None, Sun | str | None] = (None, None)
 
     @classmethod
     def of(
@@ -82,19 +62,13 @@ class SceneInputs:
         view: str = "left",
         alignment: str | Path | None = None,
         surface: str | Path | None = None,
-        suns: Sequence[Sequence[float] | str | None] = (None, None),
     ) -> SceneInputs:
         """With absolute paths, since workers of a Dask cluster live in other folders, and the point
         stores in their order by name."""
         left, right = Path(left_store).absolute(), Path(right_store).absolute()
         points = tuple(sorted(Path(path).absolute() for path in point_stores))
         aligned, ground = (None if p is None else Path(p).absolute() for p in (alignment, surface))
-        of_left, of_right = (
-            sun if sun is None or isinstance(sun, str) else (float(sun[0]), float(sun[1]))
-            for sun in suns
-        )
-        given = of_left, of_right
-        return cls(left, right, points, settings, view, aligned, ground, given)
+        return cls(left, right, points, settings, view, aligned, ground)
 
     def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
         """The same with the surface of all its points, which is made in a ``folder`` by the pixel
@@ -199,42 +173,6 @@ class SceneInputs:
             scale = self.ground.scale
             reach = tuple(scale.height_reach / PART * side * LATTICE_DEG for side in scale.cell)
         return PointWindows(self.pair.model, self.rays, self.stores, self.settings.margin, reach)
-
-    @cached_property
-    def predicted_suns(self) -> tuple[Sun, Sun] | None:
-        """Of both images of the pair, by which shadows are predicted; None of images of one light,
-        and where a sun is not known or below LOWEST_SUN_DEG."""
-        if not (self.settings.diachronic and self.settings.on_surface):
-            return None
-        suns = []
-        for given, store in zip(self.suns, (self.left_store, self.right_store)):
-            sun, attrs = given, require_complete(store).attrs
-            if not isinstance(sun, tuple) and attrs.get("sun") is not None:
-                sun = float(attrs["sun"][0]), float(attrs["sun"][1])
-            if isinstance(sun, str):
-                sun = _sun_at(sun, EpipolarModel.from_dict(attrs["epipolar"]))
-            if sun is None or sun[1] < LOWEST_SUN_DEG:
-                return None
-            suns.append(sun)
-        left, right = suns
-        return (left, right) if self.view == "left" else (right, left)
-
-    @cached_property
-    def sun_views(self) -> tuple[SunView, SunView] | None:
-        """The ground as the suns of both images of the pair see it, see :attr:`predicted_suns`."""
-        if self.predicted_suns is None:
-            return None
-        left, right = (
-            SunView.of(sun, self.pair.model, self.ground.scale.cell) for sun in self.predicted_suns
-        )
-        return left, right
-
-    def casters(self, rows: slice, cols: slice) -> list[tuple[Block, ...]]:
-        """Of the view of each sun, blocks of the surface that may cast a shadow into a window."""
-        if self.sun_views is None:
-            return []
-        around = self.surface_blocks(rows, cols)
-        return [view.casters(around, self.ground.every) for view in self.sun_views]
 
     def surface_blocks(self, rows: slice, cols: slice) -> tuple[Block, ...]:
         """Blocks of the surface that a window shows, or that may hide this."""

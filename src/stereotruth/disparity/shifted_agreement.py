@@ -86,14 +86,12 @@ def shifted_agreement(
     wanted: Bools,
     shifts: tuple[float, ...] = SHIFTS_PX,
     apart: bool = True,
-    by_light: bool = False,
 ) -> ShiftedAgreement:
     """At the ``wanted`` pixels [h, w] of a window, over its ``labels``' surfaces.
 
     ``noise``: variances of both images, DN²; ``window_px``: side of the correlation's window;
     ``reach``: px up to which the surface is averaged; ``shifts`` of the disparity, px; ``apart``:
-    whether pixels beside a step count for nothing; ``by_light``: whether what lies in shadow is
-    left apart, if that is known.
+    whether pixels beside a step count for nothing.
     """
     shape = wanted.shape
     out = np.full((4, *shape), np.nan, np.float32)
@@ -105,7 +103,7 @@ def shifted_agreement(
             if row.size == 0:
                 continue
             if images is None:
-                images = window.details(noise, by_light)
+                images = window.details(noise)
             rows = slice(top + row.min(), top + row.max() + 1)
             cols = slice(side + col.min(), side + col.max() + 1)
             first = max(rows.start - pad, 0), max(cols.start - pad, 0)

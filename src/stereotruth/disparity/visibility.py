@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from ..lidar.lattice import LATTICE_M
 from ..surface.surface import GroundSurface
 from .facet_raster import (
-    LEFT,
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
     PixelValues,
@@ -129,7 +128,7 @@ def visible_surface(
     surface, first = projected.surface, projected.first
     every = slice(0, len(surface.undecided))
     z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(projected.xy, surface.facet, first, z_buffer, index, LEFT, 0)
+    raster_facets(projected.xy, surface.facet, first, z_buffer, index)
     strips = np.full(shape, -np.inf)
     projected.raster_prisms(surface.strips, strips)
     prisms = strips.copy()

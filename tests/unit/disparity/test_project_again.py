@@ -15,7 +15,7 @@ from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
 from stereotruth.lidar.point_store import ATTRIBUTES
 from stereotruth.products.files import sealed
-from stereotruth.products.grids import Strip, open_grid, seal
+from stereotruth.products.grids import Strip, seal
 
 from ...synthetic.box_scene import Scene, alignment_of, project_with, write_image, write_points
 from ...synthetic.stores import tree
@@ -87,21 +87,6 @@ def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
     shutil.rmtree(scene.images[0])
     name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
     assert project(scene, [scene.store], out, min_points=3) == everything
-
-
-def test_another_sun_is_another_shadow(scene, tmp_path):
-    """Of pairs that share no light; what a rectified image says of its sun counts, too."""
-    out, suns = tmp_path / "out.zarr", ((140.0, 50.0), (215.0, 35.0))
-    everything = project(scene, [scene.store], out, diachronic=True)
-    assert project(scene, [scene.store], out, diachronic=True, suns=suns) == everything
-    parameters = open_grid(out).attrs["provenance"]["parameters"]
-    assert parameters["suns"] == [list(sun) for sun in suns]
-    for store, sun in zip(scene.images, suns):
-        zarr.open_group(store, mode="r+").attrs["sun"] = list(sun)
-        seal(store)
-    assert project(scene, [scene.store], out, diachronic=True) == set()
-    lower = suns[0], (215.0, 34.0)
-    assert project(scene, [scene.store], out, diachronic=True, suns=lower) == everything
 
 
 def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_path):

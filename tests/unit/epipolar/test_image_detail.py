@@ -24,24 +24,6 @@ def test_a_shadow_has_the_detail_of_the_lit_ground() -> None:
     assert np.abs(found[2:-2, 2:-2] - MEAN).max() <= GREATEST
 
 
-def test_beside_the_edge_of_a_known_shadow_it_is_that_of_one_light() -> None:
-    """It correlates with the lit ground up to the edge, where there is none."""
-    lit = texture()
-    shadowed, shaded = lit.copy(), np.zeros(lit.shape, np.bool_)
-    shaded[:, 40:] = True
-    shadowed[shaded] = np.round(lit[shaded] / 5.0)
-    expected, _ = detail(lit, 0.0)
-    found, signal = detail(shadowed, 0.0, shaded)
-    assert (found[:, 39:41] == 0.0).all() and (found[2:-2, 2:39] > 0.0).all()
-    assert (found[:, :36] == expected[:, :36]).all()
-    for beside in (np.s_[2:-2, 36:39], np.s_[2:-2, 41:44]):
-        assert np.corrcoef(found[beside].ravel(), expected[beside].ravel())[0, 1] > 0.85
-    assert (signal == detail(shadowed, 0.0)[1]).all()
-    alone = np.zeros(lit.shape, np.bool_)
-    alone[30:34, 30:33] = True  # fewer than it takes, away from its edge
-    assert (detail(lit, 0.0, alone)[0][30:34, 30:33] == 0.0).all()
-
-
 def test_there_is_none_beside_nodata() -> None:
     image = texture()
     image[30, 30] = 0.0
