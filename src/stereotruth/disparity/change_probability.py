@@ -185,7 +185,7 @@ def probability_of_change(
     return out
 
 
-def _probability(of: DecisionTrees, features: Singles, signal: Singles) -> Floats:
+def _probability(fitted: DecisionTrees, features: Singles, signal: Singles) -> Floats:
     """By trees that sum up to log odds; UNKNOWN where noise leaves nothing to tell by."""
-    probability = 1.0 / (1.0 + np.exp(-of.sum_at(features).astype(np.float64)))
+    probability = 1.0 / (1.0 + np.exp(-fitted.sum_at(features).astype(np.float64)))
     return np.where(signal >= LEAST_SIGNAL, probability, UNKNOWN)
