@@ -35,7 +35,7 @@ Bools = NDArray[np.bool_]
 SURROUNDINGS_PX = 8  # pixels of the surface up to here: for the detail's agreement
 ALIKE_PX = 4  # for pixels that are alike, for contrast and gain,
 GAIN_PX = 16  # which is held against that up to here
-STEP_PX = 8  # steps farther off do not count
+FAR_PX = 8  # steps farther off do not count
 # px up to which, one of so many, probabilities are averaged; labels are compared up to VOTE_PX off
 AROUND = (4, 1), (8, 2), (VOTE_PX, 3)
 FULL_AGREEMENT = 0.8  # of the detail, with which hardly anything has changed:
@@ -60,7 +60,7 @@ class Evidence(NamedTuple):
     and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX. ``contrast_left`` and
     ``contrast_right``: standard deviation of the surface up to ALIKE_PX in each image, in that of
     its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
-    GAIN_PX, as a logarithm. ``from_step``: px to the next step of the surface, STEP_PX at most;
+    GAIN_PX, as a logarithm. ``from_step``: px to the next step of the surface, FAR_PX at most;
     ``slope`` of the disparity.
     """
 
@@ -127,10 +127,10 @@ def change_evidence(
 
 
 def _from_step(disparity: Floats) -> Singles:
-    """Pixels [h, w] to the next that lies beside a step, in a square, STEP_PX at most."""
+    """Pixels [h, w] to the next that lies beside a step, in a square, FAR_PX at most."""
     beside = ~apart_from_steps(disparity)
-    out = np.full(disparity.shape, STEP_PX, np.float32)
-    for px in range(STEP_PX - 1, -1, -1):
+    out = np.full(disparity.shape, FAR_PX, np.float32)
+    for px in range(FAR_PX - 1, -1, -1):
         out[box_max(beside, px)] = px
     return out
 

@@ -7,7 +7,7 @@ import pytest
 
 from stereotruth.disparity.change_probability import (
     CHANGED,
-    STEP_PX,
+    FAR_PX,
     UNKNOWN,
     Evidence,
     change_evidence,
@@ -83,7 +83,7 @@ def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
     inside[48:72, 58:92] = True  # no window reaches beyond the roof
     of_roof = Evidence(*(values[inside[doubtful]] for values in evidence))
     assert np.abs(of_roof.agreement).max() < 0.2
-    assert (of_roof.from_step == STEP_PX).all() and (of_roof.slope == 0.0).all()
+    assert (of_roof.from_step == FAR_PX).all() and (of_roof.slope == 0.0).all()
     # uniform of half a width of 50 DN, in units of the rounding; three times as bright
     expected = 50.0 / np.sqrt(3.0) * np.sqrt(12.0)
     assert np.median(of_roof.contrast_left) == pytest.approx(expected, rel=0.1)
