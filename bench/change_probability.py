@@ -1,6 +1,6 @@
 """The trees by which images of two lights tell how probable a change is, and how right they are.
 
-python bench/change_probability.py [--fit 1 2 3 4] [--seeds 61 62] [--folder FOLDER]
+python bench/change_probability.py [--fit 1 2 3 4 5 6] [--seeds 61 62] [--folder FOLDER]
 
 Of the simulated cities of changes.py whose images are a year apart: the share of labels that have
 changed by the probability that stereotruth.disparity.change_probability tells. With --fit the trees

@@ -72,6 +72,9 @@ def test_images_of_noise_alone_tell_nothing() -> None:
     found = probability_of_change(LEVEL, pair(*images), 9, (400.0, 400.0), ALL)
     assert (found[INNER] > CHANGED).mean() < 0.05
     assert np.median(found[INNER]) == UNKNOWN
+    blank = np.full((160, 260), 700.0)
+    nothing = probability_of_change(LEVEL, pair(blank, blank), 9, (4.0, 4.0), ALL)
+    assert (nothing[INNER] == UNKNOWN).all()
 
 
 def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
