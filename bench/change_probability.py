@@ -1,6 +1,7 @@
 """The trees by which images of two lights tell how probable a change is, and how right they are.
 
-python bench/change_probability.py [--fit 1 2 3 4 5 6] [--seeds 61 62] [--folder FOLDER]
+python bench/change_probability.py [--fit 1 2 3 4 5 6 7 8 9 10 11 12] [--seeds 61 62]
+                                   [--folder FOLDER]
 
 Of the simulated cities of changes.py whose images are a year apart: the share of labels that have
 changed by the probability that stereotruth.disparity.change_probability tells. With --fit the trees
@@ -45,7 +46,7 @@ KINDS = (
 DENSITY = 4.0  # points/m²
 BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.15, CHANGED, 0.7, 1.0
 # Share of the pixels that are fitted to, weight of those of new texture alone, which are few
-FEW, OF_TEXTURE = 0.3, 5.0
+FEW, OF_TEXTURE = 0.15, 5.0
 NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 200  # of the trees
 
 
@@ -88,7 +89,7 @@ def sample(case: Case, folder: Path, around: bool) -> Sample:
     features = [*evidence]
     if around:
         own = by_itself(evidence, doubtful)
-        features += with_surroundings(own, doubtful, labels.labels, labelled)
+        features += with_surroundings(own, doubtful, labels.labels, window, labelled)
     truth, changes = dated_truth(case, folder)
     changed, kept, hidden, texture = np.zeros((4, *labelled.shape), np.bool_)
     for out, pixels in zip((changed, kept, hidden), changed_and_kept(truth, changes)):

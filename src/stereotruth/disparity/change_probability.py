@@ -7,7 +7,8 @@ together tell (:class:`Evidence`): agreements over windows of two kinds, one at 
 how much each image has to tell, and where the pixel lies. What they tell is learned from simulated
 cities of which all changes are known: decision trees, whose values sum up to the log odds of a
 change (eq. 17 of docs/explanation/surface.md, bench/change_probability.py). What has changed is
-larger than a pixel, so that other trees ask the probabilities of the surface around, too (eq. 18).
+larger than a pixel, so that other trees ask the probabilities of the surface around, too, and of
+that part of it which looks like the pixel in both images (eq. 18).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.alike_correlation import alike_correlation
+from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
 from .pair_window import PairWindow
@@ -38,14 +40,15 @@ GAIN_PX = 16  # which is held against that up to here
 FAR_PX = 8  # steps farther off do not count
 # px up to which, one of so many, probabilities are averaged; labels are compared up to VOTE_PX off
 AROUND = (4, 1), (8, 2), (VOTE_PX, 3)
+ALIKE_AROUND = (8, 1), (VOTE_PX, 2)  # and over pixels that are alike
 FULL_AGREEMENT = 0.8  # of the detail, with which hardly anything has changed:
 SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 LEAST_SIGNAL = 0.2  # share, with less of which images tell nothing, and the probability is
-UNKNOWN = 0.02  # the share that has changed there
+UNKNOWN = 0.05  # the share that has changed there
 AGREED = 0.0007  # about the share that has, of the cities that the trees are fitted to
 LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
-CHANGED = 0.4  # more probable, a label is left out
+CHANGED = 0.3  # more probable, a label is left out
 TREES = Path(__file__).with_suffix(".tsv")
 
 
@@ -136,13 +139,16 @@ def _from_step(disparity: Floats) -> Singles:
 
 
 def with_surroundings(
-    own: Floats, doubtful: Bools, labels: Labels, labelled: Bools
+    own: Floats, doubtful: Bools, labels: Labels, window: PairWindow, labelled: Bools
 ) -> list[Singles]:
     """Log odds [n] of the ``doubtful`` pixels' ``own`` probability [h, w], and of its means over
-    the ``labelled`` surface around them, see AROUND."""
+    the ``labelled`` surface around them, see AROUND, and over its pixels that are alike, see
+    ALIKE_AROUND."""
     surface, runs = (labels.disparity, labels.slope), wanted_runs(doubtful)
     known = np.where(labelled, own, np.nan)
-    means = (surface_mean(known, *surface, reach, every, runs) for reach, every in AROUND)
+    images = left_and_warped(window, labels.disparity)
+    means = [surface_mean(known, *surface, *around, runs) for around in AROUND]
+    means += [alike_mean(known, *images, *surface, *around, runs) for around in ALIKE_AROUND]
     return [_log_odds(values[doubtful]) for values in (own, *means)]
 
 
@@ -180,7 +186,7 @@ def probability_of_change(
     doubtful, evidence = change_evidence(labels, window, window_px, noise, labelled)
     _, with_others = trees()
     out = by_itself(evidence, doubtful)
-    others = with_surroundings(out, doubtful, labels, labelled)
+    others = with_surroundings(out, doubtful, labels, window, labelled)
     out[doubtful] = _probability(with_others, np.stack([*evidence, *others]), evidence.signal)
     return out
 

@@ -1,0 +1,109 @@
+"""Means over the pixels of one surface that are as bright as the centre, in either image.
+
+What has changed ends where a roof or a shadow of either image does. Means over such pixels end
+there, too, where those over a square take in both sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import kernel
+from .alike_correlation import brightness
+from .surface_correlation import (
+    BLOCK,
+    Singles,
+    Steps,
+    columns_inside,
+    surface_of_row,
+    tolerance_px,
+)
+
+AS_BRIGHT = 0.2  # share of the centre's brightness by which that of a pixel may differ
+
+
+@kernel
+def _alike_mean(
+    values: Singles,
+    counted: Singles,
+    level: Singles,
+    level_warped: Singles,
+    disparity: Singles,
+    slope: Singles,
+    reach: int,
+    every: int,
+    runs: Steps,
+    out: Singles,
+) -> None:
+    """``counted``: disparity of the pixels that count, else NaN; ``level``, ``level_warped``:
+    brightness of both images. ``runs`` of wanted pixels, outside of which all is NaN."""
+    rows, cols = disparity.shape
+    out[:] = np.nan
+    surface = np.empty(3 * BLOCK, np.float32)
+    centre = np.empty(4 * BLOCK, np.float32)
+    sums = np.empty(2 * BLOCK, np.float32)
+    one, zero, share = np.float32(1.0), np.float32(0.0), np.float32(AS_BRIGHT)
+    for run in runs:
+        y, x0, size = run[0], run[1], run[2] - run[1]
+        surface_of_row(disparity, slope, y, x0, size, surface)
+        for k in range(size):
+            centre[k], centre[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
+            centre[2 * BLOCK + k] = share * level[y, x0 + k]
+            centre[3 * BLOCK + k] = share * level_warped[y, x0 + k]
+        sums[:] = zero
+        for step_down in range(-reach, reach + 1, every):
+            b = y + step_down
+            if b < 0 or b >= rows:
+                continue
+            down = np.float32(step_down)
+            for step in range(-reach, reach + 1, every):
+                across, tolerance = np.float32(step), tolerance_px(step_down, step)
+                first, end = columns_inside(x0, size, cols, step)
+                d, value, ll, ww = (
+                    counted[b, x0 + step + first : x0 + step + end],
+                    values[b, x0 + step + first : x0 + step + end],
+                    level[b, x0 + step + first : x0 + step + end],
+                    level_warped[b, x0 + step + first : x0 + step + end],
+                )
+                p, c, s = surface[first:], centre[first:], sums[first:]
+                for k in range(d.size):
+                    plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
+                    same = one if abs(d[k] - plane) <= tolerance else zero
+                    same *= one if abs(ll[k] - c[k]) <= c[2 * BLOCK + k] else zero
+                    same *= one if abs(ww[k] - c[BLOCK + k]) <= c[3 * BLOCK + k] else zero
+                    s[k] += same
+                    s[BLOCK + k] += same * value[k]
+        for k in range(size):
+            out[y, x0 + k] = sums[BLOCK + k] / sums[k]
+
+
+def alike_mean(
+    values: NDArray[np.floating],
+    left: NDArray[np.floating],
+    warped: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    reach: int,
+    every: int,
+    runs: Steps,
+) -> Singles:
+    """Mean of ``values`` [h, w] over the pixels that are alike; NaN where there are none.
+
+    These lie up to ``reach`` px around, one of so many (``every``) along each axis, on the surface
+    of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], have a value, and are as bright
+    as it within the share AS_BRIGHT in both images [h, w]. ``left`` is 0 and ``warped`` NaN where
+    an image has no value. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    """
+    levels = brightness(np.where(left != 0.0, left, np.nan)), brightness(warped)
+    has_value = np.isfinite(values)
+    single = [
+        np.ascontiguousarray(array, dtype=np.float32)
+        for array in (
+            np.where(has_value, values, 0.0), np.where(has_value, disparity, np.nan),
+            *levels, disparity, slope,
+        )
+    ]  # fmt: skip
+    out = np.empty(disparity.shape, np.float32)
+    _alike_mean(*single, reach, every, runs, out)
+    return out
