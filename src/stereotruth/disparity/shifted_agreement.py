@@ -147,13 +147,14 @@ def _means(
     averaged = box_max(wanted, reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
-    to_compare, to_average = wanted_runs(averaged), wanted_runs(wanted)
+    known = np.isfinite(compared)
+    to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
     level, slope = surface
     here, elsewhere, shifted = np.full((3, rows, cols), np.nan, np.float32)
     part = _Compared(
         original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
-        compared, wanted_runs(np.isfinite(compared)), clear, level, slope,
+        compared, wanted_runs(known), clear, level, slope,
     )  # fmt: skip
     voters = Voters.of((rows, cols), reach, every)
     of_shifts = np.array([*shifts, 0.0])
