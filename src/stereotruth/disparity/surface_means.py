@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import (
     BLOCK,
-    REGISTER,
     TOGETHER,
     is_near,
     surface_of_row,
@@ -67,7 +66,7 @@ def apart_from_steps(disparity: Floats) -> Bools:
 
 class Voters(NamedTuple):
     """Pixels that have a say in the means of others: arrays [h, w] with ``reach`` columns more on
-    the left and at least that many on the right, in which none has.
+    the left, and ``reach`` + 2 ``every`` on the right, in which none has.
 
     ``value``: 0 for none; ``disparity`` of those that have one, else NaN.
     """
@@ -80,7 +79,7 @@ class Voters(NamedTuple):
     @classmethod
     def of(cls, shape: tuple[int, int], reach: int, every: int) -> Voters:
         """None yet. Of pixels up to ``reach`` px off one of so many (``every``) votes."""
-        wide = shape[0], shape[1] + 2 * (reach + every) + REGISTER
+        wide = shape[0], shape[1] + 2 * (reach + every)
         return cls(np.zeros(wide, np.float32), np.full(wide, np.nan, np.float32), reach, every)
 
 
