@@ -9,6 +9,9 @@ from stereotruth.errors import InputError, in_words
 from stereotruth.project import read_mapping
 
 min_version("9.10")
+# Parallelism belongs to Dask and Snakemake: threads of linear algebra that wait for a core in use
+# take up to 70 times the processor time of one.
+shell.prefix("set -euo pipefail; export OPENBLAS_NUM_THREADS=1; ")
 
 
 class Refused(WorkflowError):

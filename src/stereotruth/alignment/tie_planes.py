@@ -31,6 +31,7 @@ OFF_M = 0.1  # m, at least
 HOLE_SPACINGS = 2.0  # of the points: pixels farther from the plane's points may show anything
 ROUNDS = 5  # of each of the two robust fits of a plane
 NEAREST_M = 0.03  # m: points nearer to a plane do not count for more
+ROUNDING_M = 1e-6  # m: more than heights are off by rounding
 
 
 class Guard(NamedTuple):
@@ -54,7 +55,8 @@ class SitePoints(NamedTuple):
     ``col``, ``row`` px [n] from the upper-left pixel of the site's wide box, ``height`` m [n];
     ``firm`` bool[n]: no vegetation or water by its class, and the only return of its pulse;
     ``first`` int[rows * cols + 1]: index of the first point of each pixel, whose points are sorted
-    by height; ``heights`` of the lowest and the highest point, m; ``shape`` of the box;
+    by height; ``soft`` int[n + 1]: how many points before each are not firm; ``heights`` of the
+    lowest and the highest point, m; ``shape`` of the box;
     ``parallax`` [2] px/m: by how much a point is displaced in the right image against the plane
     per metre that it lies above the plane, in px of the left image.
     """
@@ -64,6 +66,7 @@ class SitePoints(NamedTuple):
     height: Floats
     firm: Bools
     first: Integers
+    soft: Integers
     heights: tuple[float, float]
     shape: tuple[int, int]
     parallax: Floats
@@ -83,7 +86,8 @@ class SitePoints(NamedTuple):
         order = _by_pixel(col, row, height, shape[1], first)  # whatever the order of files
         col, row, height, firm = (values[order] for values in (col, row, height, firm))
         heights = float(height.min(initial=np.inf)), float(height.max(initial=-np.inf))
-        return cls(col, row, height, firm, first, heights, shape, parallax)
+        soft = np.concatenate([[0], np.cumsum(~firm)])
+        return cls(col, row, height, firm, first, soft, heights, shape, parallax)
 
     def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
         """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
@@ -206,14 +210,15 @@ def _fit_planes(points: SitePoints, centres: Integers, planes: Floats, share: Fl
         every = max(1, total // MOST_POINTS)
         size = total // every + 1
         u, v, h = np.empty(size), np.empty(size), np.empty(size)
-        n, seen = 0, 0
+        n, ahead = 0, every - 1  # of the points of a row, before the next one that is taken
         for y in range(j - HALF, j + HALF + 1):
-            for k in range(first[y * cols + i - HALF], first[y * cols + i + HALF + 1]):
-                seen += 1
-                if seen % every == 0 and points.firm[k]:
+            start, end = first[y * cols + i - HALF], first[y * cols + i + HALF + 1]
+            for k in range(start + ahead, end, every):
+                if points.firm[k]:
                     u[n], v[n] = (points.col[k] - i) / HALF, (points.row[k] - j) / HALF
                     h[n] = points.height[k]
                     n += 1
+            ahead = (ahead - (end - start)) % every
         if n < MIN_POINTS:
             continue
         plane = np.empty(3)
@@ -289,14 +294,15 @@ def _clear_pixels(
     middle = HALF + margin
     length = np.hypot(parallax[0], parallax[1])
     # Points of other pixels are displaced into the window if they are high enough.
+    over_pixel = 0.5 * (abs(plane[1]) + abs(plane[2]))
     most = max(abs(points.heights[0] - plane[0]), abs(points.heights[1] - plane[0])) + np.hypot(
         plane[1] * cols, plane[2] * rows
     )
-    reach = middle + int(most * length) + 1
     spare = middle + 1.01  # half a pixel here, half a pixel there, and roundings
-    over_pixel = 0.5 * (abs(plane[1]) + abs(plane[2]))
-    for y in range(max(centre[1] - reach, 0), min(centre[1] + reach + 1, rows)):
-        for i in range(max(centre[0] - reach, 0), min(centre[0] + reach + 1, cols)):
+    across = int(spare + (most + over_pixel) * abs(parallax[0]))
+    down = int(spare + (most + over_pixel) * abs(parallax[1]))
+    for y in range(max(centre[1] - down, 0), min(centre[1] + down + 1, rows)):
+        for i in range(max(centre[0] - across, 0), min(centre[0] + across + 1, cols)):
             start, end = first[y * cols + i], first[y * cols + i + 1]
             if start == end:
                 continue
@@ -306,6 +312,9 @@ def _clear_pixels(
             if abs(i - centre[0]) > spare + above * abs(parallax[0]):
                 continue
             if abs(y - centre[1]) > spare + above * abs(parallax[1]):
+                continue
+            if above < limit - ROUNDING_M and points.soft[start] == points.soft[end]:
+                _mark(held, i - centre[0] + middle, y - centre[1] + middle)
                 continue
             for k in range(start, end):
                 above = _above(points, plane, centre, k)

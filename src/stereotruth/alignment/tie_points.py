@@ -186,10 +186,10 @@ def _prepared(
             warp_patch(pixels, *at, carry, scale, big)
             if np.isfinite(big).mean() < 0.5:
                 continue
-            inner = _even(template)[1:-1, 1:-1]
+            inner, searched = _even(template)[1:-1, 1:-1], _even(big)
             mean = float((inner * clear).sum() / clear.sum())
-            scores = cv2.matchTemplate(_even(big), (inner - mean) * clear, cv2.TM_CCORR)
-            energy = cv2.matchTemplate(_even(big) ** 2, clear, cv2.TM_CCORR)
+            scores = cv2.matchTemplate(searched, (inner - mean) * clear, cv2.TM_CCORR)
+            energy = cv2.matchTemplate(searched**2, clear, cv2.TM_CCORR)
             energy = energy * float((((inner - mean) * clear) ** 2).sum())
             scores = scores / np.sqrt(np.maximum(energy, 1e-6))
             yield _Windows(

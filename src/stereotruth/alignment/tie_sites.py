@@ -32,6 +32,7 @@ MIN_CLEAR = 90  # pixels of a window, a fifth
 MIN_INFORMATION = 12.0  # smaller eigenvalue of a window, in pixels of the median slope
 ENOUGH = 120  # places of a scene
 NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
+IS_FIRM = ~np.isin(np.arange(256), NOT_FIRM)  # by class
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +224,7 @@ def _places_of(
     if len(points) < MIN_POINTS:
         return None
     col, row = left.project(points.lon, points.lat, points.height)
-    firm = ~np.isin(points.classification, NOT_FIRM)
+    firm = IS_FIRM[points.classification]
     several = points.number_of_returns > 1
     if several.mean() < 0.5:  # else the pulses' returns tell nothing here
         firm &= ~several

@@ -186,9 +186,12 @@ def with_reasons(
         return labels
     surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
     by_class = np.isin(surface.classes, (*VEGETATION_CLASSES, WATER_CLASS))
+    votes = window.grown(VOTES_PX)
+    asked = np.zeros_like(changed)
+    asked[votes] = changed[votes] & ~by_class[votes]
     shifted = shifted_agreement(
-        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX,
-        changed & ~by_class, WIDE_SHIFTS_PX,
+        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, asked,
+        WIDE_SHIFTS_PX,
     )  # fmt: skip
     agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
     rise = np.where(agrees, shifted.shift / px_per_m, np.nan)

@@ -11,20 +11,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.surface_correlation import surface_correlation, wanted_runs
+from ..epipolar.surface_correlation import BLOCK, correlate, padded_columns, wanted_runs
+from ..epipolar.warping import value_in_row
+from ..kernels import kernel
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .seen_surface import box_max
-from .surface_means import apart_from_steps, surface_mean, warp_to_left
+from .surface_means import Voters, apart_from_steps, fill_voters, mean_of_runs, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
 
 SHIFTS_PX = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
 # of what has changed already, over the heights of buildings
@@ -143,27 +147,105 @@ def _means(
     averaged = box_max(wanted, reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
-    to_compare, to_average = wanted_runs(averaged), wanted_runs(wanted)
+    known = np.isfinite(compared)
+    to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
     level, slope = surface
-
-    def mean(shift: float) -> Singles:
-        at = slice(row, row + rows), slice(col, col + cols)
-        warped = warp_to_left(right, *at, compared + shift)
-        correlation = surface_correlation(
-            original, warped, level, slope, window_px, clear, to_compare
-        )
-        return surface_mean(correlation, level, slope, reach, every, to_average)
-
-    elsewhere = np.full((rows, cols), np.nan, np.float32)
-    shifted = np.full((rows, cols), np.nan, np.float32)
-    for shift in shifts:
-        here = mean(shift)
-        better = here > np.where(np.isnan(elsewhere), -np.inf, elsewhere)
-        elsewhere[better], shifted[better] = here[better], shift
+    here, elsewhere, shifted = np.full((3, rows, cols), np.nan, np.float32)
+    part = _Compared(
+        original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
+        compared, wanted_runs(known), clear, level, slope,
+    )  # fmt: skip
+    voters = Voters.of((rows, cols), reach, every)
+    of_shifts = np.array([*shifts, 0.0])
+    _means_at_shifts(
+        part, window_px // 2, of_shifts, to_compare, voters, to_average, here, elsewhere, shifted
+    )
     signal = _signal(images, row, col, disparity)
     around_it = surface_mean(signal, level, slope, reach, every, to_average)
-    return mean(0.0), elsewhere, shifted, np.fmin(signal, around_it)
+    return here, elsewhere, shifted, np.fmin(signal, around_it)
+
+
+class _Compared(NamedTuple):
+    """A part of a window in which both images are compared at several disparities; arrays [h, w].
+
+    ``left`` image; ``right`` one [h or more, ``right_cols`` or more] from the same row on;
+    ``first``: columns of both images' first pixels in their grids. ``compared``: disparity (px) of
+    the pixels that are compared, NaN elsewhere, and the ``runs`` of these; ``clear``: those that
+    count. ``level`` (px) and ``slope`` [2, h, w] of the disparity of all.
+    """
+
+    left: Singles
+    right: Singles
+    right_cols: int
+    first: tuple[int, int]
+    compared: Floats
+    runs: Steps
+    clear: Bools
+    level: Singles
+    slope: Singles
+
+
+@kernel
+def _warp_shifted(
+    part: _Compared, shift: float, half: int, padded: Singles, known: Singles
+) -> None:
+    """Right image at the shifted disparity, and the disparities that count, to ``padded`` [3, h,
+    half + w or more] and ``known`` [h, w], as :func:`.correlate` takes them."""
+    none, right = np.float32(np.nan), part.right[:, : part.right_cols]
+    at, value = np.empty(BLOCK), np.empty(BLOCK, np.float32)
+    for run in part.runs:
+        y, x0, size = run[0], run[1], run[2] - run[1]
+        compared, level, clear = part.compared[y, x0:], part.level[y, x0:], part.clear[y, x0:]
+        for k in range(size):
+            at[k] = part.first[0] + (x0 + k) - (compared[k] + shift) - part.first[1]
+        for k in range(size):
+            value[k] = value_in_row(right, y, at[k])
+        warped, counted = padded[1, y, half + x0 :], padded[2, y, half + x0 :]
+        of_known = known[y, x0:]
+        for k in range(size):
+            has_value = np.isfinite(value[k])
+            of_known[k] = level[k] if has_value else none
+            warped[k] = value[k] if has_value else np.float32(0.0)
+            counted[k] = level[k] if has_value and clear[k] else none
+
+
+@kernel
+def _means_at_shifts(
+    part: _Compared,
+    half: int,
+    shifts: Floats,
+    to_compare: Steps,
+    voters: Voters,
+    to_average: Steps,
+    here: Singles,
+    elsewhere: Singles,
+    shifted: Singles,
+) -> None:
+    """Mean correlation at the last of the ``shifts`` (px) to ``here``; the greatest at the others
+    to ``elsewhere``, and which one that is to ``shifted`` [h, w]."""
+    rows, cols = part.left.shape
+    padded = np.empty((3, rows, padded_columns(cols, half)), np.float32)
+    known, correlation, expected = np.empty((3, rows, cols), np.float32)
+    padded[0], padded[1], padded[2], known[:] = 0.0, 0.0, np.nan, np.nan
+    padded[0, :, half : half + cols] = part.left
+    last = shifts.size - 1
+    for n in range(last + 1):
+        _warp_shifted(part, shifts[n], half, padded, known)
+        correlate(
+            padded[0], padded[1], known, padded[2], part.slope, half, (0.0, 0.0), to_compare,
+            correlation, expected,
+        )  # fmt: skip
+        fill_voters(correlation, part.level, voters)
+        mean_of_runs(part.level, part.slope, voters, to_average, here)
+        if n == last:
+            return
+        for run in to_average:
+            y = run[0]
+            for x in range(run[1], run[2]):
+                best = elsewhere[y, x]
+                if here[y, x] > best or (np.isnan(best) and not np.isnan(here[y, x])):
+                    elsewhere[y, x], shifted[y, x] = here[y, x], shifts[n]
 
 
 def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:

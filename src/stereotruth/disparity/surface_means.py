@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..epipolar.surface_correlation import (
     BLOCK,
-    columns_inside,
+    TOGETHER,
+    is_near,
     surface_of_row,
     tolerance_px,
     wanted_runs,
 )
 from ..epipolar.warping import warp_rows
-from ..kernels import kernel
+from ..kernels import inner, kernel
 from .image_patches import Patch
 from .pair_window import PairWindow
 
@@ -61,36 +64,54 @@ def apart_from_steps(disparity: Floats) -> Bools:
     return out
 
 
+class Voters(NamedTuple):
+    """Pixels that have a say in the means of others: arrays [h, w] with ``reach`` columns more on
+    the left, and ``reach`` + 2 ``every`` on the right, in which none has.
+
+    ``value``: 0 for none; ``disparity`` of those that have one, else NaN.
+    """
+
+    value: Singles
+    disparity: Singles
+    reach: int
+    every: int
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], reach: int, every: int) -> Voters:
+        """None yet. Of pixels up to ``reach`` px off one of so many (``every``) votes."""
+        wide = shape[0], shape[1] + 2 * (reach + every)
+        return cls(np.zeros(wide, np.float32), np.full(wide, np.nan, np.float32), reach, every)
+
+
 @kernel
-def _voters(values: NDArray, disparity: Singles, known: Singles, voters: Singles) -> None:
-    """Fills ``known`` with the ``values`` [h, w], 0 for none; ``voters`` with the disparity of
-    those that have one."""
-    for y in range(known.shape[0]):
-        for x in range(known.shape[1]):
+def fill_voters(values: NDArray, disparity: Singles, voters: Voters) -> None:
+    """Fills the ``voters`` with the ``values`` [h, w] of pixels and their disparity."""
+    reach = voters.reach
+    for y in range(disparity.shape[0]):
+        for x in range(disparity.shape[1]):
             value = values[y, x]
             has_value = np.isfinite(value)
-            known[y, x] = value if has_value else 0.0
-            voters[y, x] = disparity[y, x] if has_value else np.float32(np.nan)
+            voters.value[y, reach + x] = value if has_value else 0.0
+            voters.disparity[y, reach + x] = disparity[y, x] if has_value else np.float32(np.nan)
+
+
+@inner
+def _tolerance_up_to(down: int, across: int, reach: int) -> float:
+    """:func:`.tolerance_px` of a pixel up to ``reach`` px off, and less than 0 of others."""
+    return tolerance_px(down, across) if across <= reach else np.float32(-1.0)
 
 
 @kernel
-def _surface_mean(
-    values: Singles,
-    disparity: Singles,
-    voters: Singles,
-    slope: Singles,
-    reach: int,
-    every: int,
-    runs: Steps,
-    out: Singles,
+def mean_of_runs(
+    disparity: Singles, slope: Singles, voters: Voters, runs: Steps, out: Singles
 ) -> None:
-    """``voters``: disparity of the pixels that count, else NaN; ``runs`` of wanted pixels, outside
-    of which all is NaN."""
-    rows, cols = disparity.shape
+    """Mean of the ``voters`` on the surface of each pixel of ``runs``; NaN outside of these."""
+    rows = len(disparity)
+    reach, every = voters.reach, voters.every
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     sums = np.empty(2 * BLOCK, np.float32)
-    one, zero = np.float32(1.0), np.float32(0.0)
+    zero = np.float32(0.0)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
@@ -100,17 +121,26 @@ def _surface_mean(
             if b < 0 or b >= rows:
                 continue
             down = np.float32(step_down)
-            for step in range(-reach, reach + 1, every):
-                across, tolerance = np.float32(step), tolerance_px(step_down, step)
-                first, end = columns_inside(x0, size, cols, step)
-                d = voters[b, x0 + step + first : x0 + step + end]
-                value = values[b, x0 + step + first : x0 + step + end]
-                p, s = surface[first:], sums[first:]
-                for k in range(d.size):
-                    plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                    same = one if abs(d[k] - plane) <= tolerance else zero
-                    s[k] += same
-                    s[BLOCK + k] += same * value[k]
+            for step in range(-reach, reach + 1, TOGETHER * every):
+                second, third = step + every, step + 2 * every
+                across = np.float32(step), np.float32(second), np.float32(third)
+                limit = (
+                    _tolerance_up_to(step_down, step, reach),
+                    _tolerance_up_to(step_down, second, reach),
+                    _tolerance_up_to(step_down, third, reach),
+                )
+                at = reach + x0 + step
+                d, v = voters.disparity[b, at:], voters.value[b, at:]
+                dd, vv = d[every:], v[every:]
+                ddd, vvv = dd[every:], vv[every:]
+                p, s = surface, sums
+                for k in range(size):
+                    level, along, rise = p[k], p[BLOCK + k], down * p[2 * BLOCK + k]
+                    e = is_near(d[k], level + across[0] * along + rise, limit[0])
+                    f = is_near(dd[k], level + across[1] * along + rise, limit[1])
+                    g = is_near(ddd[k], level + across[2] * along + rise, limit[2])
+                    s[k] = s[k] + e + f + g
+                    s[BLOCK + k] = s[BLOCK + k] + e * v[k] + f * vv[k] + g * vvv[k]
         for k in range(size):
             out[y, x0 + k] = sums[BLOCK + k] / sums[k]
 
@@ -130,10 +160,10 @@ def surface_mean(
     pixels of ``runs`` (:func:`.wanted_runs`) alone where these are given.
     """
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
-    known, voters, out = np.empty((3, *disparity.shape), np.float32)
-    _voters(values, disparity, known, voters)
     slope = np.ascontiguousarray(slope, dtype=np.float32)
+    voters, out = Voters.of(disparity.shape, reach, every), np.empty(disparity.shape, np.float32)
+    fill_voters(values, disparity, voters)
     if runs is None:
         runs = wanted_runs(np.isfinite(disparity))
-    _surface_mean(known, disparity, voters, slope, reach, every, runs, out)
+    mean_of_runs(disparity, slope, voters, runs, out)
     return out

@@ -92,13 +92,13 @@ def _tolerance_within(down: int, across: int, half: int) -> float:
 
 
 @inner
-def _is_near(disparity: float, plane: float, limit: float) -> float:
+def is_near(disparity: float, plane: float, limit: float) -> float:
     """1 of a disparity that counts, else 0."""
     return np.float32(1.0) if abs(disparity - plane) <= limit else np.float32(0.0)
 
 
 @kernel
-def _correlation(
+def correlate(
     left: Singles,
     warped: Singles,
     disparity: Singles,
@@ -110,9 +110,12 @@ def _correlation(
     out: Singles,
     expected: Singles,
 ) -> None:
-    """``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both
-    images; ``runs`` of wanted pixels, outside of which all is NaN. ``left``, ``warped`` and
-    ``counted`` are those of :func:`_as_compared`, with columns more in which nothing counts."""
+    """:func:`correlation_and_expected`, of the pixels of ``runs``; outside of these all is NaN.
+
+    ``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both images.
+    ``left``, ``warped`` and ``counted`` have columns more in which nothing counts: ``half`` on the
+    left, see :func:`padded_columns`.
+    """
     rows = len(left)
     out[:], expected[:] = np.nan, np.nan
     surface = np.empty(3 * BLOCK, np.float32)
@@ -140,9 +143,9 @@ def _correlation(
                 p, c, s = surface, centre, sums
                 for k in range(whole):
                     level, along, rise = p[k], p[BLOCK + k], down * p[2 * BLOCK + k]
-                    e = _is_near(d[k], level + across[0] * along + rise, limit[0])
-                    f = _is_near(d[k + 1], level + across[1] * along + rise, limit[1])
-                    g = _is_near(d[k + 2], level + across[2] * along + rise, limit[2])
+                    e = is_near(d[k], level + across[0] * along + rise, limit[0])
+                    f = is_near(d[k + 1], level + across[1] * along + rise, limit[1])
+                    g = is_near(d[k + 2], level + across[2] * along + rise, limit[2])
                     ue, ve = (uu[k] - c[k]) * e, (vv[k] - c[BLOCK + k]) * e
                     uf, vf = (uu[k + 1] - c[k]) * f, (vv[k + 1] - c[BLOCK + k]) * f
                     ug, vg = (uu[k + 2] - c[k]) * g, (vv[k + 2] - c[BLOCK + k]) * g
@@ -168,6 +171,12 @@ def _correlation(
                 share = 1.0
             if share * np.sqrt(n) >= DECIDED:
                 expected[y, x0 + k] = share
+
+
+@inner
+def padded_columns(cols: int, half: int) -> int:
+    """Columns of the arrays of :func:`correlate` for so many of an image."""
+    return cols + 2 * half + TOGETHER + REGISTER
 
 
 @kernel
@@ -239,10 +248,10 @@ def correlation_and_expected(
     rows, cols = left.shape
     known, out, expected = np.empty((3, rows, cols), np.float32)
     half = window // 2
-    padded = np.empty((3, rows, cols + 2 * half + TOGETHER + REGISTER), np.float32)
+    padded = np.empty((3, rows, padded_columns(cols, half)), np.float32)
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     _as_compared(left, warped, disparity, clear, half, padded, known)
-    _correlation(
+    correlate(
         *padded[:2],
         known,
         padded[2],

@@ -8,27 +8,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..kernels import inlined, kernel
 from ..numerics.cubic_convolution import four_point_value
 
 Floats = NDArray[np.float64]
 
 
+@inlined
+def value_in_row(image: NDArray, y: int, x: float) -> float:
+    """Value at column ``x`` of row ``y``; see :func:`warp_rows`."""
+    if not (x >= 1.0 and x <= image.shape[1] - 3.0):
+        return np.nan
+    i = int(x)
+    a, b, c, d = image[y, i - 1], image[y, i], image[y, i + 1], image[y, i + 2]
+    if a == 0.0 or b == 0.0 or c == 0.0 or d == 0.0:
+        return np.nan
+    return four_point_value(a, b, c, d, x - i)
+
+
 @kernel
 def _warp(image: NDArray, at: Floats, out: Floats) -> None:
-    rows, cols = at.shape
-    for y in range(rows):
-        for k in range(cols):
-            out[y, k] = np.nan
-            x = at[y, k]
-            if not (x >= 1.0 and x <= image.shape[1] - 3.0):
-                continue
-            i = int(x)
-            f = x - i
-            a, b, c, d = image[y, i - 1], image[y, i], image[y, i + 1], image[y, i + 2]
-            if a == 0.0 or b == 0.0 or c == 0.0 or d == 0.0:
-                continue
-            out[y, k] = four_point_value(a, b, c, d, f)
+    for y in range(len(at)):
+        for k in range(at.shape[1]):
+            out[y, k] = value_in_row(image, y, at[y, k])
 
 
 def warp_rows(image: NDArray[np.floating], x: Floats) -> Floats:
