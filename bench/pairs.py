@@ -2,8 +2,9 @@
 
 Each pair of a drawn site is rectified by exact sensor models, matched by SGM as the benchmark runs
 it, and held against the exact truth: the share of the pixels that both images show whose disparity
-SGM misses by more than 1 px, or has not at all. ``--fit`` prints the coefficients of
-epipolar/pair_quality.py from sites of even numbers; without it, the rank correlation of what is
+SGM misses by more than 1 px, or has not at all. The site's roughness is that of a LiDAR of 4
+points/m². ``--fit`` prints the coefficients of epipolar/pair_quality.py from sites of even numbers;
+without it, the rank correlation of what is
 predicted with what is found over sites of odd numbers, which no fit has seen: within each site,
 since pairs are chosen within a site, and over all of them together.
 """
@@ -22,18 +23,24 @@ from scipy.stats import spearmanr
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
-from stereotruth.epipolar.pair_quality import quality_of
+from stereotruth.epipolar.pair_quality import USUAL_ROUGHNESS_M, quality_of
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.epipolar.site_pairs import SiteImage, SitePair, pairs_of_site
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.roughness import roughness_m
 from stereotruth.matching.sgm import SemiGlobalMatcher
 from stereotruth.products.grids import open_grid
+from stereotruth.simulate.cities import lidar_files
+from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.rpcs import draw_bias
 from stereotruth.simulate.site_images import pair_truth, simulate_site_image
 from stereotruth.simulate.sites import SiteSpec, drawn_site
 
 SEED = 2026
+SPACING_M = 0.5  # of the LiDAR's points
 FOLDER = Path("results/pairs")
 
 
@@ -71,43 +78,66 @@ def match(site: SiteSpec, images: dict[str, SiteImage], pair: SitePair, folder: 
     return shares | {"over_1_px": float((miss > 1).mean()), "pixels": int(counted.sum())}
 
 
+def roughness_of(site: SiteSpec, folder: Path) -> float | None:
+    """Of a site, by its LiDAR, m."""
+    stores = []
+    for file in lidar_files(site.city, site.area):
+        simulate_lidar_tile(
+            site.city, site.area, file, folder / file, spacing_m=SPACING_M, seed=SEED
+        )
+        stores.append(folder / f"{Path(file).stem}.points")
+        ingest(folder / file, stores[-1])
+    return roughness_m([PointStore(store) for store in stores])
+
+
 def rows_of(number: int, images: int, side_px: int) -> list[dict]:
     """All pairs of a drawn site: what is known before, and what SGM does."""
-    kept = FOLDER / f"{SEED}-{number}-{images}-{side_px}.json"
+    kept = FOLDER / f"{SEED}-{number}-{images}-{side_px}-{SPACING_M}.json"
     if kept.is_file():
         return json.loads(kept.read_text())
     site = drawn_site(number, SEED, images=images, side_px=side_px)
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
+        rough = {"roughness": roughness_of(site, folder)}
         opened = {image.name: exact_image(site, image.name, folder) for image in site.images}
         for pair in pairs_of_site(list(opened.values())):
             if pair.convergence < 1.5:
                 continue
             measured = match(site, opened, pair, folder)
             states = {site.image(name).state for name in (pair.left, pair.right)}
-            rows.append({"site": number, **asdict(pair), **measured, "seasons": len(states)})
+            rows.append(
+                {"site": number, **asdict(pair), **measured, **rough, "seasons": len(states)}
+            )
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(rows))
     return rows
 
 
-TERMS = ("base over height", "way of the shadows")
+TERMS = ("base over height", "way of the shadows", "roughness over the usual one")
 
 
 def fit(rows: list[dict]) -> np.ndarray:
-    """Log odds of a wrong match [3]: at nothing, then per term; each site has its own level."""
+    """Log odds of a wrong match [4]: at nothing, then per term.
+
+    Each site has its own level, which its roughness is fitted to.
+    """
     sites = np.array([row["site"] for row in rows])
-    levels = (sites[:, None] == np.unique(sites)).astype(float)
+    numbers, first = np.unique(sites, return_index=True)
+    levels = (sites[:, None] == numbers).astype(float)
     terms = np.array([(2 * np.tan(np.radians(r["convergence"]) / 2), r["shadow"]) for r in rows])
     wrong = np.clip([row["over_1_px"] for row in rows], 0.01, 0.99)
     found = np.linalg.lstsq(np.hstack([terms, levels]), np.log(wrong / (1 - wrong)), rcond=None)[0]
-    return np.append(found[len(TERMS) :].mean(), found[: len(TERMS)])
+    of_pair, of_site = found[: terms.shape[1]], found[terms.shape[1] :]
+    rough = np.log([rows[k]["roughness"] / USUAL_ROUGHNESS_M for k in first])
+    by_roughness, at_nothing = np.polyfit(rough, of_site, 1)
+    return np.array([at_nothing, *of_pair, by_roughness])
 
 
 def predicted(row: dict) -> float:
     """Share of right matches, as ``stereotruth pairs`` predicts it."""
-    return quality_of(SitePair(**{f.name: row[f.name] for f in fields(SitePair)})).matched
+    pair = SitePair(**{f.name: row[f.name] for f in fields(SitePair)})
+    return quality_of(pair, row["roughness"]).matched
 
 
 def rank(rows: list[dict]) -> float:

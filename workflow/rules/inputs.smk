@@ -142,6 +142,15 @@ def point_stores(wildcards):
     ]
 
 
+def point_stores_of_city(wildcards):
+    """The points of all scenes of a city, each store once."""
+    stores = [store for of in scenes_of(wildcards.city) for store in STORES[of.scene]]
+    return [
+        f"results/ingest/{wildcards.city}/{scene}/{lidar}.points"
+        for scene, lidar in dict.fromkeys(stores)
+    ]
+
+
 def images_of_surface(wildcards):
     """The images that the surface of some points is for, each once."""
     scenes = [SCENES[scene] for scene, first in SURFACES.items() if first == wildcards.scene]

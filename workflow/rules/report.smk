@@ -45,6 +45,7 @@ rule report_city:
 rule report_site:
     input:
         images=files_of_sheet,
+        points=point_stores_of_city,
         adjusted=adjustment_of_site,
         closure=closure_of,
         page="results/report/{city}/index.html",
@@ -72,7 +73,9 @@ rule report_site:
             for name, row in sheet_images(w.city).items()
         },
         scenes=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
-        code=source_digest("report.site_page", "alignment.site_images"),
+        code=source_digest(
+            "report.site_page", "alignment.site_images", "lidar.roughness"
+        ),
         templates=templates_of("report", "site_page.html.jinja"),
     message:
         "Writing the page of the images of {wildcards.city}"

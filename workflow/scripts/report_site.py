@@ -4,6 +4,8 @@ from pathlib import Path
 
 from stereotruth.alignment.site_images import GivenImage, open_image
 from stereotruth.job import job
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.roughness import roughness_m
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import read_json
 from stereotruth.products.html_page import INDEX
@@ -23,7 +25,11 @@ if __name__ == "__main__":
         write_site_page(
             city,
             [image_of(image) for image in images],
-            pairs_of(images, snakemake.params.scenes),
+            pairs_of(
+                images,
+                snakemake.params.scenes,
+                roughness_m([PointStore(path) for path in given.points]),
+            ),
             snakemake.output[0],
             adjusted=read_json(given.adjusted[0]) if given.adjusted else {},
             closure=read_json(given.closure[0]) if given.closure else {},

@@ -11,9 +11,11 @@ from pathlib import Path
 
 from .. import sheets
 from ..configuration import Configuration
-from ..epipolar.pair_quality import RatedPair, rate
+from ..epipolar.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
 from ..epipolar.site_pairs import SitePair
 from ..errors import InputError
+from ..lidar.point_store import PointStore
+from ..lidar.roughness import roughness_m
 from ..project import configured, names_in_pair, read_images, sheet
 from ..sheets import DIACHRONIC_DAYS
 from .add_scene import append_row
@@ -22,6 +24,7 @@ from .site import images_of
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
 Names = tuple[str, str]  # of a pair's left and right image
+INGESTED = Path("results/ingest")
 OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
 
 
@@ -100,11 +103,26 @@ class Choice:
         return True
 
 
-def rated_pairs(city: str, settings: Configuration) -> list[RatedPair]:
-    """All pairs of a site, best first; the order of the sheet's rows plays no part."""
+def roughness_of(city: str, settings: Configuration) -> float | None:
+    """Roughness of a city by the points that its scenes have ingested, m; None without any."""
+    cities = sheets.read_cities(sheet(settings, "cities"))
+    images = read_images(settings, cities)
+    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images)
+    folders = [INGESTED / city / name for name, scene in scenes.items() if scene.city == city]
+    stores = [PointStore(path) for folder in folders for path in sorted(folder.glob("*.points"))]
+    return roughness_m(stores) if stores else None
+
+
+def rated_pairs(
+    city: str, settings: Configuration, roughness: float | None = None
+) -> list[RatedPair]:
+    """All pairs of a site, best first; the order of the sheet's rows plays no part.
+
+    ``roughness`` of the site, m; None: not known.
+    """
     cities = sheets.read_cities(sheet(settings, "cities"))
     opened = images_of(city, read_images(settings, cities), settings)
-    rated = rate([one.image for one in opened])
+    rated = rate([one.image for one in opened], roughness)
     if not rated:
         raise InputError(
             f"no two images of city {city!r} share ground",
@@ -201,7 +219,21 @@ def list_pairs(
     given: dict[str, str],
     configfiles: Sequence[Path] | None = None,
 ) -> tuple[list[RatedPair], list[str]]:
-    """All pairs of a site, best first, and what was written; nothing if ``choice`` is None."""
+    """All pairs of a site, best first; and in words how rough the site is, and what was written:
+    nothing if ``choice`` is None."""
     settings, _ = configured(configfiles)
-    rated = rated_pairs(city, settings)
-    return rated, [] if choice is None else write_pairs(city, choice, rated, settings, given)
+    roughness = roughness_of(city, settings)
+    rated = rated_pairs(city, settings, roughness)
+    lines = [_in_words(city, roughness)]
+    if choice is not None:
+        lines += write_pairs(city, choice, rated, settings, given)
+    return rated, lines
+
+
+def _in_words(city: str, roughness: float | None) -> str:
+    if roughness is None:
+        return f"matched is that of a usual site: no LiDAR of {city} has been ingested"
+    return (
+        f"matched follows from the ingested LiDAR, too: steps of {roughness:.1f} m between squares "
+        f"of 2 m on the average, of a usual site {USUAL_ROUGHNESS_M} m"
+    )

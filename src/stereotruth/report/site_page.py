@@ -60,9 +60,15 @@ def image_of(image: site_pairs.SiteImage) -> SiteImage:
 
 
 def pairs_of(
-    images: Sequence[site_pairs.SiteImage], scenes: Mapping[str, tuple[str, str]]
+    images: Sequence[site_pairs.SiteImage],
+    scenes: Mapping[str, tuple[str, str]],
+    roughness_m: float | None,
 ) -> list[Pair]:
-    """All pairs of a site, best first; ``scenes``: names of the images of each, in any order."""
+    """All pairs of a site, best first.
+
+    ``scenes``: names of the images of each, in any order; ``roughness_m`` of the site, None: not
+    known.
+    """
     names = {frozenset(pair): scene for scene, pair in scenes.items()}
     return [
         Pair(
@@ -74,7 +80,7 @@ def pairs_of(
             one.quality.reason,
             names.get(frozenset((one.pair.left, one.pair.right)), ""),
         )
-        for one in rate(images)
+        for one in rate(images, roughness_m)
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
@@ -17,8 +18,11 @@ from stereotruth.command.pairs_table import show_pairs
 from stereotruth.epipolar.pair_quality import RatedPair, quality_of
 from stereotruth.epipolar.site_pairs import SitePair
 from stereotruth.errors import InputError
+from stereotruth.lidar.ingest import ingest
 from stereotruth.project import configured, names_in_pair, read_images, read_scenes
 from stereotruth.simulate.site_images import simulate_site_image
+
+from ...synthetic.las import write_las
 
 HEADER = "scene\tcity\tleft_image\tright_image\tlidar\tlidar_crs\tgeoid\tgcps\n"
 
@@ -84,6 +88,21 @@ def test_chosen_pairs_become_rows_that_the_sheet_is_read_with(rows):
         sorted((r.pair.left, r.pair.right)) for r in rated
     )
     assert sum("already" in line for line in lines) == 2
+
+
+def test_points_that_scenes_have_ingested_enter_the_prediction(rows):
+    rated, lines = list_pairs("Stack", Choice(most=2), LIDAR)
+    assert "no LiDAR of Stack has been ingested" in lines[0]
+    scene = Path("s.tsv").read_text().splitlines()[1].split("\t")[0]
+    rng = np.random.default_rng(1)
+    xyz = np.array([500_040.0, 3_390_070.0, 0.0]) + rng.uniform(0, (90, 90, 30), (30_000, 3))
+    write_las(Path("tall.las"), xyz=xyz)
+    ingest(Path("tall.las"), Path(f"results/ingest/Stack/{scene}/tall.points"))
+    again, lines = list_pairs("Stack", None, {})
+    assert "steps of" in lines[0] and len(lines) == 1
+    names = [[(one.pair.left, one.pair.right) for one in listed] for listed in (rated, again)]
+    assert names[0] == names[1]
+    assert all(one.quality.matched < two.quality.matched for one, two in zip(again, rated))
 
 
 def test_without_lidar_nothing_is_written(rows):

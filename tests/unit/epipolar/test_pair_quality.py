@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from stereotruth.epipolar.pair_quality import quality_of
+from stereotruth.epipolar.pair_quality import USUAL_ROUGHNESS_M, quality_of
 from stereotruth.epipolar.site_pairs import SitePair
 
 GOOD = SitePair(
@@ -31,3 +31,10 @@ def test_the_reason_of_a_good_pair_and_of_flat_ones():
     flat = quality_of(replace(GOOD, convergence=2.0))
     assert flat.reason == "heights follow badly: 1 px is 14 m"
     assert "sun is not known" in quality_of(replace(GOOD, shadow=None, sun=None)).reason
+
+
+def test_what_stands_on_a_site_lowers_the_prediction_of_all_its_pairs():
+    usual = quality_of(GOOD, USUAL_ROUGHNESS_M)
+    assert usual == quality_of(GOOD)
+    assert quality_of(GOOD, 2.0).matched < usual.matched < quality_of(GOOD, 0.8).matched
+    assert quality_of(GOOD, 0.0).matched == quality_of(GOOD, 0.05).matched < 1.0
