@@ -73,9 +73,7 @@ rule report_site:
             for name, row in sheet_images(w.city).items()
         },
         scenes=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
-        code=source_digest(
-            "report.site_page", "alignment.site_images", "lidar.roughness"
-        ),
+        code=source_digest("report.site_page", "alignment.site_images", "lidar.roughness"),
         templates=templates_of("report", "site_page.html.jinja"),
     message:
         "Writing the page of the images of {wildcards.city}"
