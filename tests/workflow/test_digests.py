@@ -44,7 +44,7 @@ REACH = {
     "evaluate_truth_city": {"evaluation", "dataset", "products"},
     "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
     "report_city": {"report", "dataset", "epipolar", "products"},
-    "report_site": {"report", "alignment", "epipolar", "products"},
+    "report_site": {"report", "alignment", "epipolar", "lidar", "products"},
     "audit": {"evaluation", "alignment", "dataset", "epipolar", "products"},
     "training_city": {
         "evaluation",
