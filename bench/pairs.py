@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import spearmanr
+from site_alignment import make_points
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
@@ -28,13 +29,10 @@ from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.epipolar.site_pairs import SiteImage, SitePair, pairs_of_site
-from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.point_store import open_stores
 from stereotruth.lidar.roughness import roughness_m
 from stereotruth.matching.sgm import SemiGlobalMatcher
 from stereotruth.products.grids import open_grid
-from stereotruth.simulate.cities import lidar_files
-from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.rpcs import draw_bias
 from stereotruth.simulate.site_images import pair_truth, simulate_site_image
 from stereotruth.simulate.sites import SiteSpec, drawn_site
@@ -78,18 +76,6 @@ def match(site: SiteSpec, images: dict[str, SiteImage], pair: SitePair, folder: 
     return shares | {"over_1_px": float((miss > 1).mean()), "pixels": int(counted.sum())}
 
 
-def roughness_of(site: SiteSpec, folder: Path) -> float | None:
-    """Of a site, by its LiDAR, m."""
-    stores = []
-    for file in lidar_files(site.city, site.area):
-        simulate_lidar_tile(
-            site.city, site.area, file, folder / file, spacing_m=SPACING_M, seed=SEED
-        )
-        stores.append(folder / f"{Path(file).stem}.points")
-        ingest(folder / file, stores[-1])
-    return roughness_m([PointStore(store) for store in stores])
-
-
 def rows_of(number: int, images: int, side_px: int) -> list[dict]:
     """All pairs of a drawn site: what is known before, and what SGM does."""
     kept = FOLDER / f"{SEED}-{number}-{images}-{side_px}-{SPACING_M}.json"
@@ -99,7 +85,7 @@ def rows_of(number: int, images: int, side_px: int) -> list[dict]:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        rough = {"roughness": roughness_of(site, folder)}
+        rough = {"roughness": roughness_m(open_stores(make_points(site, folder, SPACING_M, SEED)))}
         opened = {image.name: exact_image(site, image.name, folder) for image in site.images}
         for pair in pairs_of_site(list(opened.values())):
             if pair.convergence < 1.5:

@@ -54,6 +54,19 @@ SEED = 2030
 SPACING_M = 0.5  # of the LiDAR's points
 
 
+def make_points(site: SiteSpec, folder: Path, spacing_m: float, seed: int) -> list[Path]:
+    """Point stores of a site's LiDAR, in a folder."""
+    stores = []
+    for file in lidar_files(site.city, site.area):
+        simulate_lidar_tile(
+            site.city, site.area, file, folder / file, spacing_m=spacing_m, seed=seed
+        )
+        stores.append(folder / f"{Path(file).stem}.points")
+        ingest(folder / file, stores[-1])
+        (folder / file).unlink()
+    return stores
+
+
 def make_site(site: SiteSpec, folder: Path, spacing_m: float = SPACING_M) -> None:
     """Images, point stores and control points of a site, below its folder."""
     for image in site.images:
@@ -62,12 +75,7 @@ def make_site(site: SiteSpec, folder: Path, spacing_m: float = SPACING_M) -> Non
             simulate_site_image(site, image, made, seed=SEED)
     if not (folder / "points").is_dir():
         with atomic_folder(folder / "points") as scratch:
-            for file in lidar_files(site.city, site.area):
-                simulate_lidar_tile(
-                    site.city, site.area, file, scratch / file, spacing_m=spacing_m, seed=SEED
-                )
-                ingest(scratch / file, scratch / f"{Path(file).stem}.points")
-                (scratch / file).unlink()
+            make_points(site, scratch, spacing_m, SEED)
     simulate_site_points(site, folder / "gcps.csv", folder / "exact.csv", seed=SEED)
 
 

@@ -134,21 +134,20 @@ def ground_of_stores(scene):
     return None if found is None else found.runs
 
 
+def paths_of_stores(city, stores):
+    """Paths of point stores by their (scene, name)."""
+    return [f"results/ingest/{city}/{scene}/{lidar}.points" for scene, lidar in stores]
+
+
 def point_stores(wildcards):
     """The points of a scene; files that another scene of the city reads, too, are read once."""
-    return [
-        f"results/ingest/{wildcards.city}/{scene}/{lidar}.points"
-        for scene, lidar in STORES[wildcards.scene]
-    ]
+    return paths_of_stores(wildcards.city, STORES[wildcards.scene])
 
 
 def point_stores_of_city(wildcards):
     """The points of all scenes of a city, each store once."""
     stores = [store for of in scenes_of(wildcards.city) for store in STORES[of.scene]]
-    return [
-        f"results/ingest/{wildcards.city}/{scene}/{lidar}.points"
-        for scene, lidar in dict.fromkeys(stores)
-    ]
+    return paths_of_stores(wildcards.city, dict.fromkeys(stores))
 
 
 def images_of_surface(wildcards):

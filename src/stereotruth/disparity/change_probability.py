@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.alike_correlation import alike_correlation
+from ..epipolar.alike_correlation import alike_correlation, brightness_of_pair
 from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
@@ -146,9 +146,9 @@ def with_surroundings(
     ALIKE_AROUND."""
     surface, runs = (labels.disparity, labels.slope), wanted_runs(doubtful)
     known = np.where(labelled, own, np.nan)
-    images = left_and_warped(window, labels.disparity)
+    bright = brightness_of_pair(*left_and_warped(window, labels.disparity))
     means = [surface_mean(known, *surface, *around, runs) for around in AROUND]
-    means += [alike_mean(known, *images, *surface, *around, runs) for around in ALIKE_AROUND]
+    means += [alike_mean(known, bright, *surface, *around, runs) for around in ALIKE_AROUND]
     return [_log_odds(values[doubtful]) for values in (own, *means)]
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..kernels import inner, kernel
 from .surface_correlation import (
     BLOCK,
     DECIDED,
@@ -20,6 +20,7 @@ from .surface_correlation import (
     Steps,
     about_means,
     columns_inside,
+    is_near,
     surface_of_row,
     tolerance_px,
 )
@@ -46,6 +47,34 @@ def brightness(image: NDArray[np.floating]) -> Singles:
     return np.where(has_value, total / np.maximum(count, np.float32(1.0)), np.float32(np.nan))
 
 
+def brightness_of_pair(
+    left: NDArray[np.floating], warped: NDArray[np.floating]
+) -> tuple[Singles, Singles]:
+    """:func:`brightness` of both images [h, w]; ``left`` is 0 and ``warped`` NaN where an image has
+    no value."""
+    return brightness(np.where(left != 0.0, left, np.nan)), brightness(warped)
+
+
+@inner
+def alike_of_row(
+    level: Singles, level_warped: Singles, share: float, y: int, x0: int, size: int, c: Singles
+) -> None:
+    """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and the ``share``
+    of each by which that of a pixel may differ to be alike, see :func:`is_alike`."""
+    for k in range(size):
+        c[k], c[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
+        c[2 * BLOCK + k] = share * level[y, x0 + k]
+        c[3 * BLOCK + k] = share * level_warped[y, x0 + k]
+
+
+@inner
+def is_alike(level: float, level_warped: float, c: Singles, k: int) -> float:
+    """1 of a pixel as bright in both images as pixel ``k`` of :func:`alike_of_row`, else 0."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    same = one if abs(level - c[k]) <= c[2 * BLOCK + k] else zero
+    return same * (one if abs(level_warped - c[BLOCK + k]) <= c[3 * BLOCK + k] else zero)
+
+
 @kernel
 def _alike_correlation(
     left: Singles,
@@ -64,18 +93,15 @@ def _alike_correlation(
     rows, cols = left.shape
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
-    centre = np.empty(6 * BLOCK, np.float32)
+    bright, centre = np.empty(4 * BLOCK, np.float32), np.empty(2 * BLOCK, np.float32)
     sums = np.empty(6 * BLOCK, np.float32)
     one, zero, share = np.float32(1.0), np.float32(0.0), np.float32(ALIKE)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
+        alike_of_row(level, level_warped, share, y, x0, size, bright)
         for k in range(size):
             centre[k], centre[BLOCK + k] = left[y, x0 + k], warped[y, x0 + k]
-            centre[2 * BLOCK + k] = level[y, x0 + k]
-            centre[3 * BLOCK + k] = level_warped[y, x0 + k]
-            centre[4 * BLOCK + k] = share * level[y, x0 + k]
-            centre[5 * BLOCK + k] = share * level_warped[y, x0 + k]
         sums[:] = zero
         for b in range(max(y - reach, 0), min(y + reach + 1, rows)):
             down = np.float32(b - y)
@@ -89,12 +115,10 @@ def _alike_correlation(
                     level[b, x0 + step + first : x0 + step + end],
                     level_warped[b, x0 + step + first : x0 + step + end],
                 )
-                p, c, s = surface[first:], centre[first:], sums[first:]
+                p, q, c, s = surface[first:], bright[first:], centre[first:], sums[first:]
                 for k in range(d.size):
                     plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                    same = one if abs(d[k] - plane) <= tolerance else zero
-                    same *= one if abs(ll[k] - c[2 * BLOCK + k]) <= c[4 * BLOCK + k] else zero
-                    same *= one if abs(ww[k] - c[3 * BLOCK + k]) <= c[5 * BLOCK + k] else zero
+                    same = is_near(d[k], plane, tolerance) * is_alike(ll[k], ww[k], q, k)
                     u = (uu[k] - c[k]) * same
                     v = (vv[k] - c[BLOCK + k]) * same
                     s[k] += same
@@ -134,7 +158,7 @@ def alike_correlation(
     both images, DN²), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves so little
     that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
-    level_warped = brightness(warped)
+    level, level_warped = brightness_of_pair(left, warped)
     known = np.isfinite(level_warped) & np.isfinite(disparity) & (left != 0.0)
     level_warped[~known] = np.nan
     single = [
@@ -142,7 +166,6 @@ def alike_correlation(
         for values in (left, np.where(known, warped, 0.0))
     ]
     out = np.empty(left.shape, np.float32)
-    level = brightness(np.where(left != 0.0, left, np.nan))
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
     _alike_correlation(*single, level, level_warped, *surface, reach, noise, runs, out)
     return out

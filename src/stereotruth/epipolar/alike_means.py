@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import kernel
-from .alike_correlation import brightness
+from .alike_correlation import alike_of_row, is_alike
 from .surface_correlation import (
     BLOCK,
     Singles,
     Steps,
     columns_inside,
+    is_near,
     surface_of_row,
     tolerance_px,
 )
@@ -41,16 +42,13 @@ def _alike_mean(
     rows, cols = disparity.shape
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
-    centre = np.empty(4 * BLOCK, np.float32)
+    bright = np.empty(4 * BLOCK, np.float32)
     sums = np.empty(2 * BLOCK, np.float32)
-    one, zero, share = np.float32(1.0), np.float32(0.0), np.float32(AS_BRIGHT)
+    zero, share = np.float32(0.0), np.float32(AS_BRIGHT)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        for k in range(size):
-            centre[k], centre[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
-            centre[2 * BLOCK + k] = share * level[y, x0 + k]
-            centre[3 * BLOCK + k] = share * level_warped[y, x0 + k]
+        alike_of_row(level, level_warped, share, y, x0, size, bright)
         sums[:] = zero
         for step_down in range(-reach, reach + 1, every):
             b = y + step_down
@@ -66,12 +64,10 @@ def _alike_mean(
                     level[b, x0 + step + first : x0 + step + end],
                     level_warped[b, x0 + step + first : x0 + step + end],
                 )
-                p, c, s = surface[first:], centre[first:], sums[first:]
+                p, q, s = surface[first:], bright[first:], sums[first:]
                 for k in range(d.size):
                     plane = p[k] + across * p[BLOCK + k] + down * p[2 * BLOCK + k]
-                    same = one if abs(d[k] - plane) <= tolerance else zero
-                    same *= one if abs(ll[k] - c[k]) <= c[2 * BLOCK + k] else zero
-                    same *= one if abs(ww[k] - c[BLOCK + k]) <= c[3 * BLOCK + k] else zero
+                    same = is_near(d[k], plane, tolerance) * is_alike(ll[k], ww[k], q, k)
                     s[k] += same
                     s[BLOCK + k] += same * value[k]
         for k in range(size):
@@ -80,8 +76,7 @@ def _alike_mean(
 
 def alike_mean(
     values: NDArray[np.floating],
-    left: NDArray[np.floating],
-    warped: NDArray[np.floating],
+    brightness: tuple[Singles, Singles],
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     reach: int,
@@ -92,16 +87,15 @@ def alike_mean(
 
     These lie up to ``reach`` px around, one of so many (``every``) along each axis, on the surface
     of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], have a value, and are as bright
-    as it within the share AS_BRIGHT in both images [h, w]. ``left`` is 0 and ``warped`` NaN where
-    an image has no value. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    as it within the share AS_BRIGHT in both images, by the ``brightness`` [h, w] of these
+    (:func:`.brightness_of_pair`). Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
-    levels = brightness(np.where(left != 0.0, left, np.nan)), brightness(warped)
     has_value = np.isfinite(values)
     single = [
         np.ascontiguousarray(array, dtype=np.float32)
         for array in (
             np.where(has_value, values, 0.0), np.where(has_value, disparity, np.nan),
-            *levels, disparity, slope,
+            *brightness, disparity, slope,
         )
     ]  # fmt: skip
     out = np.empty(disparity.shape, np.float32)

@@ -17,18 +17,18 @@ from .point_store import Points, PointStore, query_points
 
 Floats = NDArray[np.float64]
 
-SQUARE_M = 2.0  # points of a square count as their highest: as much of 1 point/m² as of many
+SQUARE_M = 2.0  # so wide that 1 point/m² leaves few squares without a point
 HIGHEST_M = 20.0  # a step counts for no more
-MOST_CELLS = 64  # of the stores, spread evenly: 0.9 km²
-LEAST_STEPS = 1000  # fewer tell nothing
+MOST_CELLS = 64  # that are read, 0.9 km²
+LEAST_STEPS = 1000  # with fewer the roughness is not known
 
 
 def roughness_m(stores: Sequence[PointStore]) -> float | None:
-    """Mean step between the highest points of neighbouring squares of SQUARE_M, m, but for the
-    slope of the ground. None of few points.
+    """Mean step between the highest points of neighbouring squares of SQUARE_M, m, where these are
+    measured from the plane of the ground. None if too few squares hold points.
 
-    Of MOST_CELLS cells of the point stores, which lie evenly among all. The same whatever the order
-    of the stores.
+    MOST_CELLS cells of the point stores are read, evenly spread. The order of the stores plays no
+    part.
     """
     rows, cols = (np.concatenate([getattr(s, f"cell_{k}") for s in stores]) for k in ("row", "col"))
     cells = np.unique(np.stack([rows, cols], axis=1), axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.epipolar.alike_correlation import brightness
+from stereotruth.epipolar.alike_correlation import brightness_of_pair
 from stereotruth.epipolar.alike_means import AS_BRIGHT, alike_mean
 from stereotruth.epipolar.surface_correlation import wanted_runs
 
@@ -19,7 +19,7 @@ def by_hand(
     y: int, x: int, reach: int, every: int,
 ) -> float:  # fmt: skip
     """The mean at one pixel, in float64."""
-    levels = brightness(np.where(left != 0, left, np.nan)), brightness(right)
+    levels = brightness_of_pair(left, right)
     steps = range(-reach, reach + 1, every)
     found = []
     for b in (y + step for step in steps if 0 <= y + step < SHAPE[0]):
@@ -42,7 +42,8 @@ def test_it_is_the_mean_of_the_pixels_that_are_alike(reach: int, every: int) -> 
     disparity = np.full(SHAPE, 3.0)
     disparity[20:] += 5.0
     given = values, left, right, disparity
-    found = alike_mean(*given, FLAT, reach, every, wanted_runs(EVERY))
+    bright = brightness_of_pair(left, right)
+    found = alike_mean(values, bright, disparity, FLAT, reach, every, wanted_runs(EVERY))
     expected = np.array(
         [[by_hand(*given, y, x, reach, every) for x in range(SHAPE[1])] for y in range(SHAPE[0])]
     )
@@ -59,7 +60,8 @@ def test_it_ends_at_an_edge_of_either_image() -> None:
     right[:, 40:] *= 0.4
     values = np.zeros(SHAPE)
     values[:, 20:40] = 1.0
-    found = alike_mean(values, left, right, np.full(SHAPE, 2.0), FLAT, 8, 1, wanted_runs(EVERY))
+    bright = brightness_of_pair(left, right)
+    found = alike_mean(values, bright, np.full(SHAPE, 2.0), FLAT, 8, 1, wanted_runs(EVERY))
     beside_edges = np.abs(np.arange(SHAPE[1]) - 19.5) < 2.0  # brightness is of 3 x 3 px
     beside_edges |= np.abs(np.arange(SHAPE[1]) - 39.5) < 2.0
     assert np.array_equal(found[:, ~beside_edges], values[:, ~beside_edges])
@@ -68,7 +70,8 @@ def test_it_ends_at_an_edge_of_either_image() -> None:
 @pytest.mark.parametrize("share", [0.02, 0.4])
 def test_what_is_wanted_has_the_values_that_all_together_have(share: float) -> None:
     rng = np.random.default_rng(2)
-    given = *rng.uniform(0.5, 1.0, (3, *SHAPE)), np.full(SHAPE, 2.0), FLAT, 5, 1
+    values, left, right = rng.uniform(0.5, 1.0, (3, *SHAPE))
+    given = values, brightness_of_pair(left, right), np.full(SHAPE, 2.0), FLAT, 5, 1
     wanted = rng.uniform(size=SHAPE) < share
     every, some = (alike_mean(*given, wanted_runs(of)) for of in (EVERY, wanted))
     assert np.array_equal(every[wanted], some[wanted], equal_nan=True)
