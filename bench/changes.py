@@ -79,7 +79,9 @@ SHARES = {
     },
 }  # fmt: skip
 SHARES["mixed in noise"] = SHARES["mixed"]
+SHARES["woods"] = {}
 SPOILT = "noise", "mixed in noise"  # images of little contrast and much noise
+WOODED = "leaves", "woods"
 CONDITIONS = ("one day", "a year apart")
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
@@ -113,7 +115,7 @@ class Case:
             river_m=70.0 if water else 0.0, lakes=0.0, zone_m=200.0, towers_m=(20.0, 45.0),
             zones={"fields": 4.0, "village": 1.0, "park": 0.5} if is_open else TOWN,
             vehicles=8.0 if self.kind in ("moved", "mixed", "mixed in noise") else 0.0,
-            canopy=Canopy(ground_m2=150.0) if self.kind == "leaves" else None,
+            canopy=Canopy(ground_m2=150.0) if self.kind in WOODED else None,
             ground_look=(1.0, 0.3) if self.kind in SPOILT else (1.0, 1.0),
         )  # fmt: skip
         dates = Dates(3 * YEAR, (4 if self.apart else 3) * YEAR, 0.0, **SHARES[self.kind])

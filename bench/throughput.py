@@ -101,7 +101,7 @@ BOUNDS = {  # part of a profile: what its time goes into
     "breaklines": "half-planes of the points on both sides of each edge",
     "facet_raster": "triangles drawn into both views",
     "pixel_labels": "exact sums by pixel: one pass over the points",
-    "image_agreement": "windows of pixels, not of points",
+    "change_evidence": "windows of pixels, not of points",
     "paper_correlation": "200 samples a point in vectors: arithmetic",
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
@@ -19,6 +20,18 @@ GROUND = np.full(SHAPE, 2, np.uint8)  # ASPRS
 def texture(seed: int = 0, low: float = 200.0, high: float = 1200.0) -> np.ndarray:
     """Whole DN of an image."""
     return np.round(np.random.default_rng(seed).uniform(low, high, (160, 260)))
+
+
+def through_optics(seed: int, contrast: float = 100.0, blur: float = 1.0) -> np.ndarray:
+    """An image of white texture behind optics that blur it by some px, of a standard deviation of
+    the brightness, DN, about 700."""
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=(160, 260)), blur)
+    return np.round(700.0 + contrast * field / field.std())
+
+
+def with_noise(image: np.ndarray, sigma: float, seed: int) -> np.ndarray:
+    """Whole DN of an image with white noise."""
+    return np.round(image + np.random.default_rng(seed).normal(0.0, sigma, image.shape))
 
 
 def right_of(left: np.ndarray, disparity: np.ndarray) -> np.ndarray:

@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.summed_area import window_sums
-from .image_agreement import TOGETHER_PX, Comparison
+from .image_agreement import Comparison
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Pixels
 from .reason import Reason
 from .seen_surface import box_max
-from .shifted_agreement import LEAST, WIDE_SHIFTS_PX, shifted_agreement
+from .change_evidence import WINDOW_PX
+from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
 from .status import VEGETATION_CLASSES, WATER_CLASS, Status
 
 Floats = NDArray[np.float64]
@@ -48,10 +49,10 @@ CROWN_PX, CROWN_PIXELS = 6, 5  # a tree has grown: up to here the LiDAR has so m
 CROP_M = 3.2  # no crop is higher, and no storey lower
 VEHICLE_M = 3.3  # no vehicle is higher
 SHORE_M = 4.0  # above the water, what a flood reaches
-# Of the pixels up to AROUND_PX around, the share that a crown and a vehicle take at most. Images of
-# one light are compared by votes, which widen a patch by some 8 px; others are not.
-CROWN_SHARE = 0.25
-VEHICLE_SHARE, VEHICLE_SHARE_APART = 0.28, 0.16
+# Of the pixels up to AROUND_PX around, the share that a crown and a vehicle take at most.
+CROWN_SHARE, VEHICLE_SHARE = 0.25, 0.16
+TOGETHER_PX = 4  # pixels up to here are averaged, for the shift at which the images agree
+LEAST = 0.3  # agreement that chance has at one of the shifts
 
 
 class Evidence(NamedTuple):
@@ -104,9 +105,9 @@ def box_count(chosen: Bools, reach: int) -> NDArray[np.int64]:
     return window_sums(np.pad(chosen, reach), 2 * reach + 1)
 
 
-def evidence_of(surface: ChangedSurface, rise: Floats, vehicle_share: float) -> Evidence:
+def evidence_of(surface: ChangedSurface, rise: Floats) -> Evidence:
     """From the ``surface`` of the LiDAR and the ``rise`` (m) [h, w] of what the images show over
-    it; ``vehicle_share``: of the pixels around, that a vehicle takes at most."""
+    it."""
     changed, own = surface.changed, surface.own
     classes = np.where(own.count > 0, own.surface_class, 0)
     ground = -box_max(np.where(classes == GROUND_CLASS, -own.highest, -np.inf), AROUND_PX)
@@ -118,7 +119,7 @@ def evidence_of(surface: ChangedSurface, rise: Floats, vehicle_share: float) -> 
         surface_class=surface.classes,
         rise=np.where(changed, rise, np.nan),
         is_low=surface.height - ground <= VEHICLE_M,
-        is_small=share <= vehicle_share,
+        is_small=share <= VEHICLE_SHARE,
         is_crown=vegetation & (share <= CROWN_SHARE),
         is_shore=surface.height < water + SHORE_M,
     )
@@ -190,11 +191,10 @@ def with_reasons(
     asked = np.zeros_like(changed)
     asked[votes] = changed[votes] & ~by_class[votes]
     shifted = shifted_agreement(
-        labels.labels, window, comparison.noise, comparison.window_px, TOGETHER_PX, asked,
+        labels.labels, window, comparison.noise, WINDOW_PX, TOGETHER_PX, asked,
         WIDE_SHIFTS_PX,
     )  # fmt: skip
     agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
     rise = np.where(agrees, shifted.shift / px_per_m, np.nan)
-    share = VEHICLE_SHARE_APART if comparison.diachronic else VEHICLE_SHARE
-    evidence = evidence_of(surface, rise, share)
+    evidence = evidence_of(surface, rise)
     return replace(labels, change=by_votes(*pixel_reasons(evidence), evidence))

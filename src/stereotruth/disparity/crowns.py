@@ -224,32 +224,38 @@ def with_crowns(
 
     Labels of other statuses stay as they are.
     """
+    merged, new = merged_with(labels, crowns, window)
+    status, correlation, of_all = labels.status.copy(), labels.correlation, merged.labels
+    if new.any():
+        by_images = contradicted(of_all, window, comparison, new, merged.surface_class)
+        correlation = np.where(new, by_images.correlation, correlation)
+        variance = np.where(new, of_all.variance + by_images.variance, of_all.variance)
+        of_all = replace(of_all, variance=variance)
+        status[by_images.changed] = Status.CHANGED
+        new &= ~by_images.changed
+    status[new] = Status.LABELLED_CROWN
+    return replace(merged, status=status, labels=of_all, correlation=correlation)
+
+
+def merged_with(
+    labels: WindowLabels, crowns: Crowns, window: PairWindow
+) -> tuple[WindowLabels, Bools]:
+    """What labels, crowns where these are seen, and other labels elsewhere, show; and which pixels
+    [h, w] have a crown's. The status is that of the ``labels``."""
     row, col = np.nonzero(crowns.visible & (labels.status == Status.EDGE_IN_PIXEL))
     inside, _ = window.usable(row, col, crowns.labels.disparity[row, col])
     new = np.zeros(labels.status.shape, np.bool_)
     new[row[inside], col[inside]] = True
-    status, correlation = labels.status.copy(), labels.correlation
-    height = np.where(new, crowns.height, labels.height)
-    surface_class = np.where(new, crowns.surface_class, labels.surface_class)
+    of_crowns, others = crowns.labels, labels.labels
     merged = Labels(
-        np.where(new, crowns.labels.disparity, labels.labels.disparity),
-        np.where(new, crowns.labels.slope, labels.labels.slope),
-        np.where(new, crowns.labels.variance, labels.labels.variance),
+        np.where(new, of_crowns.disparity, others.disparity),
+        np.where(new, of_crowns.slope, others.slope),
+        np.where(new, of_crowns.variance, others.variance),
     )
-    if inside.any():
-        by_images = contradicted(merged, window, comparison, new, surface_class)
-        correlation = np.where(new, by_images.correlation, correlation)
-        variance = np.where(new, merged.variance + by_images.variance, merged.variance)
-        merged = replace(merged, variance=variance)
-        status[by_images.changed] = Status.CHANGED
-        new &= ~by_images.changed
-    status[new] = Status.LABELLED_CROWN
     return replace(
         labels,
-        status=status,
         labels=merged,
-        height=height,
-        surface_class=surface_class,
+        height=np.where(new, crowns.height, labels.height),
+        surface_class=np.where(new, crowns.surface_class, labels.surface_class),
         day=np.where(new, crowns.day, labels.day),
-        correlation=correlation,
-    )
+    ), new

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..surface.scale import SurfaceScale, detection_weight
+from ..surface.scale import SurfaceScale
 from .rays import Rays
 
 
@@ -26,13 +26,3 @@ class PixelScale:
     def spacing_px(self) -> float:
         """Mean spacing of points in pixels."""
         return self.surface.spacing_m / self.pixel_m
-
-    @property
-    def points_per_px(self) -> float:
-        """Points in a pixel on the average; no more than one for each ground cell."""
-        return 1.0 / self.spacing_px**2
-
-    @property
-    def detection_weight(self) -> float:
-        """See :func:`stereotruth.surface.scale.detection_weight`."""
-        return detection_weight(self.spacing_px)

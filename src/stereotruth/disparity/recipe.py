@@ -81,14 +81,7 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     """Of a window, by the surface of the points around it."""
     settings, scale = scene.settings, scene.scale
     shape, first, projection = window.shape, window.first, points.projection
-    comparison = Comparison(
-        settings.window,
-        settings.correlation_threshold,
-        scale.points_per_px,
-        scale.detection_weight,
-        scene.noise,
-        settings.diachronic,
-    )
+    comparison = Comparison(settings.window, scene.noise, settings.diachronic)
 
     # points: what each pixel's own ones say
     own = own_labels(

@@ -23,18 +23,17 @@ class Settings:
     and an `uncertainty` of their own. Rough surfaces, as crowns are, have labels where both views
     must see them, `labelled_crown` (12), with the `uncertainty` that the roughness of their points
     leaves; which of these are in the tiles, `tiles.max_uncertainty_px` says. Where a step lies
-    between points, other pixels are `edge_in_pixel`. Where the images contradict the LiDAR over
-    most of a surface (25 px around a pixel), pixels are `changed`. A value is always the LiDAR's.
+    between points, other pixels are `edge_in_pixel`. Where both images tell that what the LiDAR
+    shows has probably changed, pixels are `changed`. A value is always the LiDAR's.
     `paper`: as in the WHU-Stereo paper, a pixel's label is that of mean X, mean Y and max Z of its
     points, and points around which the images do not correlate are dropped"""
 
     window: Annotated[Odd, Field(ge=3, le=31), Unit("px")] = 9
-    """side of the correlation window; with `surface`, of the pixels in it only those of the same
-    surface count"""
+    """side of the correlation window; with `surface` that of the layer `correlation`, and of the
+    pixels in it only those of the same surface count"""
 
     correlation_threshold: Annotated[Number, Field(ge=-1, le=1)] = 0.5
-    """with `paper` a point below is dropped; with `surface` a pixel below votes for change, by the
-    correlation that it would have without the images' noise"""
+    """with `paper`: a point below is dropped"""
 
     edge_margin_px: Annotated[Number, Field(ge=0, le=1), Unit("px")] = 0
     """with `surface`: a pixel whose centre lies nearer to the edge between its surface (roof,
@@ -46,11 +45,10 @@ class Settings:
 
     diachronic: Flag = False
     """with `surface`: whether both images of a pair were taken under different suns or in different
-    seasons. Shadows and leaves change their brightness then where no height has changed. So their
-    detail is compared, at the labels' disparity and at others, and the brightness of pixels that
-    are alike in both; a pixel that has probably changed is `changed`. Column `diachronic` of the
-    scenes sheet says it of a scene. Their `uncertainty` has the probability of a change that the
-    images do not show"""
+    seasons. Shadows and leaves change their brightness then where no height has changed, so that
+    the same evidence tells less of a change. Column `diachronic` of the scenes sheet says it of a
+    scene. The `uncertainty` of such labels has the probability of a change that the images do not
+    show"""
 
     @property
     def on_surface(self) -> bool:
@@ -76,16 +74,15 @@ class Settings:
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # here, since these load compiled code and a workflow plans with the settings
+        from .change_evidence import EVIDENCE_PX
         from .change_reasons import REASON_PX
-        from .image_agreement import NEARBY_PX
         from .seen_surface import OUTER_RINGS
         from .surface_means import VOTE_PX
 
         # one for each ring of neighbours: planes, their pooled noise, support
         reach = OUTER_RINGS + 3
-        # steps beside pixels, windows, votes about them, and the votes nearby; in
-        # the rim of a change, by the mean of what is not voted against
-        reach += VOTE_PX + max(VOTE_PX, NEARBY_PX) + self.window // 2 + 1
+        # what the images tell of a pixel, and of those around
+        reach += VOTE_PX + max(EVIDENCE_PX, self.window // 2 + 1)
         return reach + REASON_PX  # of changes
 
 

@@ -34,8 +34,6 @@ SHIFTS_PX = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
 # of what has changed already, over the heights of buildings
 WIDE_SHIFTS_PX = (-40.0, -34.0, -28.0, -23.0, -19.0, -15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0)
 WIDE_SHIFTS_PX += (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0, 19.0)
-SIGNAL = 0.6  # of both images, for absence of agreement to tell something
-LEAST = 0.3  # of agreement and advantage; chance has up to 0.3 at one of the shifts, and 0 here
 # Fisher's z of a correlation of n independent pixels has the variance 1 / n, a difference of two
 # has twice that. The optics leave one independent pixel of INDEPENDENT_PX2.
 SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all shifts reaches 2
@@ -70,15 +68,6 @@ class ShiftedAgreement:
         )
         limit = SIGNIFICANT * np.sqrt(2.0 * INDEPENDENT_PX2 / self.pixels)
         return z_elsewhere - z_here > limit
-
-    def contradicts(self) -> Bools:
-        """Where the images contradict the labels [h, w].
-
-        That is, where they agree significantly better elsewhere; or, with more signal than noise,
-        where the agreement and its advantage over that elsewhere sum up to less than LEAST.
-        """
-        is_none = (self.signal > SIGNAL) & (2.0 * self.here - self.elsewhere < LEAST)
-        return is_none | self.is_shifted
 
 
 def shifted_agreement(

@@ -43,8 +43,7 @@ BASE_OVER_HEIGHT = 0.6  # of the pair in which tolerances are px of disparity: G
 FACET_RESIDUAL_PX = 0.5
 EVEN_RESIDUAL_PX = 0.15
 TOP_RESIDUAL_PX = 1.0
-# Trees and huts of fewer pixels are found by the images: where points are farther apart than this,
-# a label between them needs a higher correlation.
+# Objects of fewer pixels are seen by the images alone, where points are farther apart than this.
 NOTICED_PX = 1.5
 # Crowns bulge: all around lies below their planes, however steeply it falls, while at the foot of a
 # step it rises. A triangle of a dome is no higher than this, less where points are sparse

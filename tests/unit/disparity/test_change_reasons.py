@@ -19,10 +19,10 @@ from stereotruth.simulate.changes import REASONS
 IMAGE = 200, 300
 ROWS, COLS = slice(10, 190), slice(50, 250)
 SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
-LARGE, SMALL = np.s_[60:110, 60:120], np.s_[80:92, 90:108]  # of the window
+LARGE, SMALL = np.s_[60:110, 60:120], np.s_[80:90, 90:106]  # of the window
 GROUND, TREE, BUILDING, WATER = 2, 5, 6, 9  # ASPRS
 DISPARITY, HEIGHT_M, PX_PER_M = 4, 50.0, 1.0
-COMPARISON = Comparison(9, 0.5, 2.0, 1.0, (0.0, 0.0))
+COMPARISON = Comparison(9, (0.0, 0.0))
 
 
 def texture(seed: int) -> np.ndarray:

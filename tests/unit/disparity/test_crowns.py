@@ -51,7 +51,7 @@ def wood(tmp_path_factory) -> Scene:
 
 
 def test_a_canopy_is_labelled_with_an_uncertainty_of_its_own(wood) -> None:
-    grid = wood.project(correlation_threshold=-1)
+    grid = wood.project()
     status, disparity = grid["status"].values, grid["disparity"].values
     assert np.array_equal(is_labelled(status), np.isfinite(disparity))
     crown = status == Status.LABELLED_CROWN
@@ -73,7 +73,7 @@ def test_a_canopy_is_labelled_with_an_uncertainty_of_its_own(wood) -> None:
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_any_cut_gives_the_same_crowns(wood, view) -> None:
     def labels(rows: slice, cols: slice):
-        settings = Settings(correlation_threshold=-1)
+        settings = Settings()
         return label_window(wood.inputs(settings, view), rows, cols)[0]
 
     whole = labels(slice(60, 180), slice(80, 220))

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.disparity.image_agreement import Agreement
+from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.pixel_labels import Labels
 from stereotruth.disparity.surface_means import apart_from_steps, surface_mean, warp_to_left
 from stereotruth.epipolar.surface_correlation import surface_correlation
+
+from ...synthetic import textured_fields as fields
 
 LEVEL = np.zeros((2, 80, 80))
 
@@ -64,37 +67,6 @@ def test_correlation_is_that_of_numpy() -> None:
     ).all()
 
 
-def test_single_failures_are_not_change_but_a_region_is() -> None:
-    correlation = np.full((80, 80), 0.9)
-    rng = np.random.default_rng(2)
-    correlation[rng.random((80, 80)) < 0.2] = 0.1
-    disparity = np.zeros((80, 80))
-    assert not Agreement(correlation, disparity, LEVEL, 0.5).outvoted().any()
-    disparity[30:50, 30:50] = 15.0
-    correlation[30:50, 30:50] = np.where(rng.random((20, 20)) < 0.2, 0.9, 0.1)
-    changed = Agreement(correlation, disparity, LEVEL, 0.5).outvoted()
-    assert changed[30:50, 30:50].all()
-    assert changed.sum() == 400
-    disparity[40, 40] = np.nan
-    assert not Agreement(correlation, disparity, LEVEL, 0.5).outvoted()[40, 40]
-
-
-def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
-    """A hillside of 0.8 px per px votes as one; ground does not vote for a roof of 3.5 px."""
-    x = np.broadcast_to(np.arange(60.0), (60, 60))
-    slope = np.zeros((2, 60, 60))
-    slope[0] = 0.8
-    correlation = np.full((60, 60), 0.9)
-    correlation[30, 30] = 0.1
-    assert not Agreement(correlation, 0.8 * x, slope, 0.5).outvoted().any()
-    roof = np.s_[22:38, 22:38]
-    disparity, correlation = np.zeros((60, 60)), np.full((60, 60), 0.9)
-    disparity[roof], correlation[roof] = 3.5, 0.2
-    changed = Agreement(correlation, disparity, np.zeros((2, 60, 60)), 0.5).outvoted()
-    assert changed[roof].all()
-    assert changed.sum() == 256
-
-
 def test_surface_mean_is_that_of_the_surface() -> None:
     values = np.ones((60, 60))
     disparity = np.zeros((60, 60))
@@ -107,60 +79,76 @@ def test_surface_mean_is_that_of_the_surface() -> None:
     assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level)).all()
 
 
-@pytest.mark.parametrize("noise", [20.0, 200.0])
-@pytest.mark.parametrize("size, trust", [(10, 1.0), (8, 0.5)])
-def test_what_is_small_is_told_by_what_is_usual_around_it(noise, size, trust) -> None:
-    """A hut amid agreeing ground: its surroundings outvote it, its own pixels do not.
-
-    Where points are sparse, they miss larger things, and fewer failures are enough.
-    """
-    left = texture((80, 80))
-    warped = left + np.random.default_rng(1).normal(0.0, noise, left.shape)
-    warped[36 : 36 + size, 36 : 36 + size] = texture((size, size), seed=2)
-    level = np.zeros((80, 80))
-    correlation = surface_correlation(left, warped, level, LEVEL, 9)
-    assert not Agreement(correlation, level, LEVEL, 0.5).outvoted().any()
-    found = Agreement(correlation, level, LEVEL, 0.5, trust).outvoted_nearby()
-    assert found[38:42, 38:42].all()
-    assert not found[:24].any() and not found[:, 58:].any()
+def contradicted_by(
+    left: np.ndarray,
+    right: np.ndarray,
+    labels: Labels = fields.LEVEL,
+    noise: float = 0.0,
+    diachronic: bool = False,
+) -> np.ndarray:
+    """Pixels of a small field whose labels the images contradict; ``noise``: of both, DN."""
+    comparison = Comparison(9, (noise**2, noise**2), diachronic)
+    return contradicted(
+        labels, fields.pair(left, right), comparison, fields.ALL, fields.GROUND
+    ).changed
 
 
-def test_a_roof_that_is_blurred_into_the_ground_is_no_change() -> None:
+@pytest.mark.parametrize("diachronic", [False, True])
+@pytest.mark.parametrize("noise", [4.0, 20.0])
+def test_a_change_is_found_up_to_its_rim_and_nothing_else(noise: float, diachronic: bool) -> None:
+    """A field in which the left image shows something else, and single pixels that noise spoils."""
+    ground = fields.through_optics(0)
+    right = fields.right_of(ground, np.full(ground.shape, 4))
+    ground[fields.ROWS, fields.COLS][fields.FIELD] = fields.through_optics(5)[:40, :50]
+    images = (fields.with_noise(image, noise, seed) for seed, image in enumerate((ground, right)))
+    found = contradicted_by(*images, noise=noise, diachronic=diachronic)
+    assert found[42:78, 52:98].mean() > 0.99  # 2 px inside
+    found[37:83, 47:103] = False
+    assert not found.any()
+
+
+@pytest.mark.parametrize("size", [8, 10])
+def test_what_is_small_is_found(size: int) -> None:
+    """A hut amid agreeing ground."""
+    ground = fields.through_optics(0)
+    right = fields.right_of(ground, np.full(ground.shape, 4))
+    hut = np.s_[50 : 50 + size, 60 : 60 + size]
+    ground[fields.ROWS, fields.COLS][hut] = 1.5 * fields.through_optics(5)[:size, :size]
+    images = (fields.with_noise(image, 4.0, seed) for seed, image in enumerate((ground, right)))
+    found = contradicted_by(*images, noise=4.0)
+    assert found[52 : 48 + size, 62 : 58 + size].all()
+    found[47 : 53 + size, 57 : 63 + size] = False
+    assert not found.any()
+
+
+@pytest.mark.parametrize("contrast", [2.0, 7.0, 20.0])
+def test_noise_is_no_change(contrast: float) -> None:
+    """The same ground in noisy images keeps its labels, however weak its texture is."""
+    ground = fields.through_optics(6, contrast, 1.5)
+    right = fields.right_of(ground, np.full(ground.shape, 4))
+    images = (fields.with_noise(image, 10.0, seed) for seed, image in enumerate((ground, right)))
+    assert contradicted_by(*images, noise=10.0)[10:-10, 10:-10].mean() < 0.01
+
+
+def test_change_shows_through_noise() -> None:
+    """Other ground, of a contrast of twice the noise."""
+    images = (fields.with_noise(fields.through_optics(s, 20.0, 1.5), 10.0, s) for s in (1, 2))
+    assert contradicted_by(*images, noise=10.0)[10:-10, 10:-10].mean() > 0.95
+
+
+@pytest.mark.parametrize("diachronic", [False, True])
+def test_a_roof_that_is_blurred_into_the_ground_is_no_change(diachronic: bool) -> None:
     """A bright roof beside dull ground, which the other view shows beside more ground."""
-    ground, roof = 60 + 0.05 * texture((80, 80)), 2000 + texture((80, 80), seed=1)
-    left = np.where(np.arange(80) < 40, roof, ground)
-    warped = np.where(np.arange(80) < 40, roof, ground)
-    left[:, 40:42] += np.array([600.0, 60.0])  # what the optics bring over
-    disparity = np.where(np.arange(80) < 40, 15.0, 0.0) * np.ones((80, 1))
-    disparity[:, 39:41] = np.nan  # the edge itself has no label
-    clear = apart_from_steps(disparity)
-    assert not clear[:, 38:42].any() and clear[1:-1, 1:38].all() and clear[1:-1, 42:-1].all()
-    warped[:, 39:41] = np.nan
-    mixed = surface_correlation(left, warped, disparity, LEVEL, 9)
-    assert Agreement(mixed, disparity, LEVEL, 0.5, 1.0).outvoted_nearby()[20:60, 41:44].all()
-    found = surface_correlation(left, warped, disparity, LEVEL, 9, clear)
-    assert found[20:60, 41:46] == pytest.approx(1.0, abs=1e-4)
-    assert not Agreement(found, disparity, LEVEL, 0.5, 1.0).outvoted_nearby().any()
-
-
-@pytest.mark.parametrize("noise", [20.0, 100.0])
-def test_the_rim_of_a_change_belongs_to_it(noise) -> None:
-    """Ground that a building hides which only the images have: its corners are outvoted by what
-    is around; no pixel counts as changed whose window holds nothing of it."""
-    left = texture((100, 100))
-    warped = left + np.random.default_rng(1).normal(0.0, noise, left.shape)
-    warped[30:70, 30:70] = texture((40, 40), seed=2)
-    level, slope = np.zeros((100, 100)), np.zeros((2, 100, 100))
-    correlation = surface_correlation(left, warped, level, slope, 9)
-    changed = Agreement(correlation, level, slope, 0.5).outvoted()
-    inside = np.zeros((100, 100), np.bool_)
-    inside[30:70, 30:70] = True
-    assert changed[45:55, 45:55].all() and not changed[30:34, 30:34].any()
-    found = changed | Agreement(correlation, level, slope, 0.5).beside(changed)
-    assert (found & inside).sum() > 0.97 * inside.sum()
-    touched = np.zeros((100, 100), np.bool_)
-    touched[26:74, 26:74] = True
-    assert not (found & ~touched).any()
+    x = np.arange(260)
+    ground, roof = 60 + 0.05 * fields.texture(), 2000 + fields.texture(1)
+    left = np.where(x < 120, roof, ground)
+    right = fields.right_of(left, np.where(x < 120, 15, 4) * np.ones((160, 1), int))
+    left[:, 120:122] += np.array([600.0, 60.0])  # what the optics bring over
+    disparity = np.where(x[fields.COLS] < 120, 15.0, 4.0) * np.ones(fields.SHAPE)
+    disparity[:, 59:61] = np.nan  # the edge itself has no label
+    labels = Labels(disparity, fields.LEVEL.slope, fields.LEVEL.variance)
+    found = contradicted_by(left, right, labels, diachronic=diachronic)
+    assert not found[20:-20, 20:-20].any()
 
 
 def test_steps_are_told_from_slopes() -> None:

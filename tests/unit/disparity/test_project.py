@@ -130,7 +130,7 @@ def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, n
         return facet_labels(visible, own, *rest)
 
     monkeypatch.setattr(module, "facet_labels", record)
-    inputs = scene.inputs(Settings(correlation_threshold=-1))
+    inputs = scene.inputs(Settings())
     rows, cols = scene.model.shape
     layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
     inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
@@ -176,13 +176,9 @@ def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
     assert off["surface wrong"] < 0.5 * off["paper wrong"]
 
 
-@pytest.mark.parametrize("threshold", [-1, 0.5])
-def test_box_hides_a_run_of_the_ground(box, threshold) -> None:
-    """Hidden ground beside the box, walls without points included, to 2 px at its border.
-
-    Without votes (threshold -1) by the surface of the points alone.
-    """
-    grid = box.project(correlation_threshold=threshold)
+def test_box_hides_a_run_of_the_ground(box) -> None:
+    """Hidden ground beside the box, walls without points included, to 2 px at its border."""
+    grid = box.project()
     status = grid["status"].values
     hidden = hidden_truth(box)
     assert 800 < hidden.sum() < 20_000
@@ -202,8 +198,7 @@ def test_box_hides_a_run_of_the_ground(box, threshold) -> None:
     cols = np.flatnonzero((hidden | wall).any(axis=0))
     run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
     rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
-    tolerance = 1.5 if threshold == -1 else 4.5  # windows reach over edges
-    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=tolerance)
+    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=1.5)
 
 
 @pytest.mark.parametrize("only_in", ["lidar", "images"])
@@ -339,7 +334,7 @@ def test_edge_margin_trades_labels_for_certainty(box) -> None:
     """Wider margins leave fewer labels and none of the wrong surface."""
     shares, wrong, edges = [], [], []
     for margin in (0.0, 0.1, 0.25, 0.5):
-        grid = box.project(correlation_threshold=-1, edge_margin_px=margin)
+        grid = box.project(edge_margin_px=margin)
         disparity = grid["disparity"].values
         known = np.isfinite(disparity) & np.isin(box.surface[2], (HEIGHT, ROOF))
         shares.append(known.mean())

@@ -26,9 +26,8 @@ def box(tmp_path_factory) -> Scene:
     return Scene(tmp_path_factory.mktemp("box"), box=True, spacing=SPACING)
 
 
-@pytest.mark.parametrize("threshold", [-1, 0.5])  # without votes of the images, and with them
-def test_a_plane_is_labelled_between_its_points(plane, threshold) -> None:
-    grid = plane.project(correlation_threshold=threshold)
+def test_a_plane_is_labelled_between_its_points(plane) -> None:
+    grid = plane.project()
     disparity, status = grid["disparity"].values, grid["status"].values
     labelled = is_labelled(status)
     assert np.array_equal(labelled, np.isfinite(disparity))
@@ -56,10 +55,9 @@ def test_by_the_papers_recipe_sparse_points_tell_of_the_other(plane, caplog) -> 
     assert not (grid["status"].values == Status.LABELLED_BETWEEN).any()
 
 
-@pytest.mark.parametrize("threshold", [-1, 0.5])
-def test_nothing_hidden_by_a_box_has_a_label(box, threshold) -> None:
+def test_nothing_hidden_by_a_box_has_a_label(box) -> None:
     """No hidden pixel, no wall, no label of the wrong surface; what is clear keeps its label."""
-    grid = box.project(correlation_threshold=threshold)
+    grid = box.project()
     status, disparity = grid["status"].values, grid["disparity"].values
     labelled = is_labelled(status)
     hidden = hidden_truth(box)

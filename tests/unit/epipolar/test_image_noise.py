@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.disparity.image_agreement import free_of_noise
 from stereotruth.epipolar.image_noise import noise_of, resampled_noise
 from stereotruth.epipolar.image_reader import Source
 from stereotruth.epipolar.surface_correlation import correlation_and_expected
@@ -64,19 +63,3 @@ def test_expected_correlation_is_that_of_the_same_ground(contrast: float) -> Non
     assert told.mean() > 0.9
     assert expected[told].mean() == pytest.approx(attenuated, abs=0.08)
     assert found[told].mean() == pytest.approx(expected[told].mean(), abs=0.1)
-
-
-@pytest.mark.parametrize("contrast", [2.0, 7.0, 20.0])
-def test_noise_is_no_change(contrast: float) -> None:
-    """The same ground in noisy images keeps its labels, however weak its texture is."""
-    ground, noise = texture(6, contrast), (100.0, 100.0)
-    left, right = (noisy(ground, 10.0, seed).astype(np.float32) for seed in (7, 8))
-    found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, noise)
-    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5, 1.0, 9).outvoted().mean() < 0.01
-
-
-def test_change_shows_through_noise() -> None:
-    """Other ground, of a contrast of twice the noise."""
-    left, right = (noisy(texture(seed, 20.0), 10.0, seed + 9).astype(np.float32) for seed in (1, 2))
-    found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, (100.0, 100.0))
-    assert free_of_noise(found, expected, LEVEL[0], LEVEL, 0.5, 1.0, 9).outvoted().mean() > 0.95

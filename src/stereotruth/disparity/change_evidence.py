@@ -1,0 +1,230 @@
+"""What both images of a pair tell of each label: whether they show the LiDAR's surface.
+
+The right image is brought to the left by the labels themselves, and is compared with the left one
+over the pixels of one surface (:mod:`stereotruth.epipolar.surface_correlation`). Windows of a few
+pixels agree closely on most labels; such pixels are asked no more. Of the others several things
+together tell (:class:`Evidence`): agreement over windows of several kinds, the brightness that both
+images have at a pixel, agreement at other disparities, and where the pixel lies.
+
+All is computed in a fixed order from the pixels around each pixel alone, so that results do not
+depend on blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..epipolar.alike_correlation import alike_correlation, brightness_of_pair
+from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
+from .pair_window import PairWindow
+from .pixel_labels import Labels
+from .seen_surface import box_max
+from .shifted_agreement import SHIFTS_PX, shifted_agreement
+from .status import VEGETATION_CLASSES
+from .surface_means import apart_from_steps, left_and_warped, surface_mean
+from .young_crowns import beside_young_crowns
+
+Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
+
+CLOSE_PX = 5  # side of the windows that see what is a few pixels wide
+AGREED = 0.95  # correlation of these, mean of 3 x 3: with more, hardly anything has changed
+WINDOW_PX = 9  # side of the windows in which details are correlated,
+SURROUNDINGS_PX = 8  # whose agreement is averaged over the surface up to here
+NEAR_PX = 2  # up to here differences of brightness are averaged
+ALIKE_PX = 4  # for pixels that are alike, for contrast and gain,
+GAIN_PX = 16  # which is held against that up to here
+FAR_PX = 8  # steps farther off do not count
+# Pixels around one that its evidence follows from: brightness beside those near it
+EVIDENCE_PX = NEAR_PX + GAIN_PX + 1
+LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
+ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
+# Both images of the same ground differ by noise; by labels that are off by so many px over the
+# brightness of a slope; and by this share of the brightness.
+OFF_PX, OFF_SHARE = 0.1, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledWindow:
+    """A ``window`` of a pair whose images are compared by ``labels``; arrays [h, w].
+
+    ``labelled``: pixels that are asked about; ``surface_class`` (ASPRS) of what the labels show;
+    ``noise`` of both images, variances in DN².
+    """
+
+    window: PairWindow
+    labels: Labels
+    labelled: Bools
+    surface_class: NDArray[np.uint8]
+    noise: tuple[float, float]
+
+    @property
+    def surface(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Disparity (px) [h, w] and its slope [2, h, w], which decide what belongs to a surface."""
+        return self.labels.disparity, self.labels.slope
+
+    @cached_property
+    def images(self) -> tuple[Singles, NDArray[np.float64]]:
+        """Left image, 0 where it has no value, and the right one brought to it, NaN there."""
+        return left_and_warped(self.window, self.labels.disparity)
+
+    @cached_property
+    def brightness(self) -> tuple[Singles, Singles]:
+        """Of both images."""
+        return brightness_of_pair(*self.images)
+
+    @cached_property
+    def clear(self) -> Bools:
+        """Pixels that no pixel of another surface touches. The optics blur a bright roof into the
+        ground beside it, in one view into other ground than in the other."""
+        return apart_from_steps(self.labels.disparity)
+
+    @cached_property
+    def vegetation(self) -> Bools:
+        """Where the LiDAR has some, which changes most."""
+        return np.isin(self.surface_class, VEGETATION_CLASSES)
+
+    @cached_property
+    def young(self) -> Bools:
+        """What is beside a young crown, which grows."""
+        return beside_young_crowns(self.surface_class)
+
+    def correlation(self, window_px: int) -> tuple[Singles, Singles]:
+        """Of both images over each pixel's surface, and the one expected of the same ground, see
+        :func:`.correlation_and_expected`; of the labelled pixels."""
+        runs = wanted_runs(self.labelled)
+        return correlation_and_expected(
+            *self.images, *self.surface, window_px, self.noise, self.clear, runs
+        )
+
+
+class Evidence(NamedTuple):
+    """What both images tell of pixels [n], float32, NaN where nothing tells.
+
+    ``close``: correlation of the images in a window of CLOSE_PX, as it would be without noise;
+    ``close_most``, ``close_least``, ``close_mean``: of the pixels up to 1 px off. ``difference``:
+    of the brightness of both images at a pixel, in standard deviations; ``difference_beside`` and
+    ``difference_near``: mean of the surface up to 1 px and NEAR_PX off.
+
+    ``agreement``: mean correlation of the images' detail over the surface up to SURROUNDINGS_PX
+    around a pixel, at its disparity; ``elsewhere``: the greatest at a shifted disparity, by
+    ``shift`` px up or down; ``signal``: what the same ground would agree by, as noise leaves it.
+
+    ``alike``: correlation of the brightness over the pixels that are alike
+    (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the edges of shadows
+    and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX. ``contrast_left`` and
+    ``contrast_right``: standard deviation of the surface up to ALIKE_PX in each image, in that of
+    its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
+    GAIN_PX, as a logarithm.
+
+    ``from_step``: px to the next step of the surface, FAR_PX at most; ``slope`` of the disparity.
+    ``vegetation``, ``young``: 1 where :class:`LabelledWindow` says so.
+    """
+
+    close: Singles
+    close_most: Singles
+    close_least: Singles
+    close_mean: Singles
+    difference: Singles
+    difference_beside: Singles
+    difference_near: Singles
+    agreement: Singles
+    elsewhere: Singles
+    shift: Singles
+    signal: Singles
+    alike: Singles
+    alike_around: Singles
+    contrast_left: Singles
+    contrast_right: Singles
+    gain: Singles
+    from_step: Singles
+    slope: Singles
+    vegetation: Singles
+    young: Singles
+
+
+def change_evidence(of: LabelledWindow) -> tuple[Bools, Evidence]:
+    """Which labelled pixels [h, w] of a window do not agree closely, and the evidence of these."""
+    with_noise, expected = of.correlation(CLOSE_PX)
+    close = np.minimum(with_noise / expected, np.float32(1.0))
+    close_mean = surface_mean(close, *of.surface, 1, 1, wanted_runs(of.labelled))
+    doubtful = of.labelled & ~(close_mean > AGREED)
+    detail = shifted_agreement(
+        of.labels, of.window, of.noise, WINDOW_PX, SURROUNDINGS_PX, doubtful, SHIFTS_PX
+    )
+    runs = wanted_runs(box_max(doubtful, ALIKE_PX))
+    alike = alike_correlation(*of.images, *of.surface, ALIKE_PX, of.noise, runs)
+    arrays = Evidence(
+        close,
+        box_max(np.nan_to_num(close, nan=-1.0), 1),
+        -box_max(np.nan_to_num(-close, nan=-1.0), 1),
+        close_mean,
+        *_differences(of, doubtful),
+        detail.here,
+        detail.elsewhere,
+        np.abs(detail.shift),
+        detail.signal,
+        alike,
+        surface_mean(alike, *of.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
+        *_contrasts_and_gain(of, doubtful),
+        _from_step(of.clear),
+        np.abs(of.labels.slope).sum(axis=0),
+        of.vegetation,
+        of.young,
+    )
+    return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
+
+
+def _differences(of: LabelledWindow, doubtful: Bools) -> list[Singles]:
+    """By how much the left image differs from the right one [h, w], whose brightness is brought to
+    that of the surface up to GAIN_PX, in standard deviations; and means of that."""
+    left, warped = of.images
+    known = (left != 0.0) & np.isfinite(warped)
+    runs = wanted_runs(box_max(doubtful, NEAR_PX))
+    levels = [
+        surface_mean(np.where(known, image, np.nan), *of.surface, GAIN_PX, GAIN_PX // 4, runs)
+        for image in of.images
+    ]
+    down, across = np.gradient(left)
+    variance = OFF_PX**2 * (down**2 + across**2) + OFF_SHARE**2 * left**2
+    variance += sum(max(noise, ROUNDING) for noise in of.noise)
+    off = np.abs(left - warped * (levels[0] / levels[1])) / np.sqrt(variance)
+    difference = np.where(known, off, np.nan).astype(np.float32)
+    runs = wanted_runs(doubtful)
+    return [
+        difference,
+        *(surface_mean(difference, *of.surface, reach, 1, runs) for reach in (1, NEAR_PX)),
+    ]
+
+
+def _contrasts_and_gain(of: LabelledWindow, doubtful: Bools) -> list[Singles]:
+    """Contrast of both images, and how their ratio differs from that around [h, w]."""
+    runs = wanted_runs(doubtful)
+
+    def mean(values: NDArray[np.floating], reach: int, every: int = 1) -> Singles:
+        return surface_mean(values, *of.surface, reach, every, runs)
+
+    left, warped = of.images
+    both = (left != 0.0) & (warped > 0.0)
+    logarithms = [np.log(np.where(both, image, np.nan) / LEVEL) for image in (left, warped)]
+    levels = [mean(image, ALIKE_PX) for image in logarithms]
+    contrasts = []
+    for image, level, variance in zip(logarithms, levels, of.noise):
+        spread = np.maximum(mean(image**2, ALIKE_PX) - level**2, 0.0)
+        contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
+    wide = mean(logarithms[0] - logarithms[1], GAIN_PX, GAIN_PX // 4)
+    return [*contrasts, np.abs(levels[0] - levels[1] - wide)]
+
+
+def _from_step(clear: Bools) -> Singles:
+    """Pixels [h, w] to the next that is not ``clear`` of steps, in a square, FAR_PX at most."""
+    out = np.full(clear.shape, FAR_PX, np.float32)
+    for px in range(FAR_PX - 1, -1, -1):
+        out[box_max(~clear, px)] = px
+    return out
