@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.summed_area import window_sums
+from .change_evidence import WINDOW_PX
 from .image_agreement import Comparison
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Pixels
 from .reason import Reason
 from .seen_surface import box_max
-from .change_evidence import WINDOW_PX
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
 from .status import VEGETATION_CLASSES, WATER_CLASS, Status
 

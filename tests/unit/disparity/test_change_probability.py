@@ -63,9 +63,7 @@ def test_a_new_roof_has_changed_and_the_ground_up_to_it_has_not(diachronic: bool
 @LIGHTS
 def test_what_images_agree_on_has_hardly_changed(diachronic: bool) -> None:
     left = ground(0)
-    found = probability(
-        pair(left, right_of(left, np.full((160, 260), 4))), diachronic=diachronic
-    )
+    found = probability(pair(left, right_of(left, np.full((160, 260), 4))), diachronic=diachronic)
     assert found[INNER].max() < 0.01
 
 
