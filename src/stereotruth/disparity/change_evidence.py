@@ -149,73 +149,80 @@ class Evidence(NamedTuple):
     young: Singles
 
 
-def change_evidence(of: LabelledWindow) -> tuple[Bools, Evidence]:
+def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     """Which labelled pixels [h, w] of a window do not agree closely, and the evidence of these."""
-    with_noise, expected = of.correlation(CLOSE_PX)
+    with_noise, expected = compared.correlation(CLOSE_PX)
     close = np.minimum(with_noise / expected, np.float32(1.0))
-    close_mean = surface_mean(close, *of.surface, 1, 1, wanted_runs(of.labelled))
-    doubtful = of.labelled & ~(close_mean > AGREED)
+    close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
+    doubtful = compared.labelled & ~(close_mean > AGREED)
     detail = shifted_agreement(
-        of.labels, of.window, of.noise, WINDOW_PX, SURROUNDINGS_PX, doubtful, SHIFTS_PX
+        compared.labels,
+        compared.window,
+        compared.noise,
+        WINDOW_PX,
+        SURROUNDINGS_PX,
+        doubtful,
+        SHIFTS_PX,
     )
     runs = wanted_runs(box_max(doubtful, ALIKE_PX))
-    alike = alike_correlation(*of.images, *of.surface, ALIKE_PX, of.noise, runs)
+    alike = alike_correlation(*compared.images, *compared.surface, ALIKE_PX, compared.noise, runs)
     arrays = Evidence(
         close,
         box_max(np.nan_to_num(close, nan=-1.0), 1),
         -box_max(np.nan_to_num(-close, nan=-1.0), 1),
         close_mean,
-        *_differences(of, doubtful),
+        *_differences(compared, doubtful),
         detail.here,
         detail.elsewhere,
         np.abs(detail.shift),
         detail.signal,
         alike,
-        surface_mean(alike, *of.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
-        *_contrasts_and_gain(of, doubtful),
-        _from_step(of.clear),
-        np.abs(of.labels.slope).sum(axis=0),
-        of.vegetation,
-        of.young,
+        surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
+        *_contrasts_and_gain(compared, doubtful),
+        _from_step(compared.clear),
+        np.abs(compared.labels.slope).sum(axis=0),
+        compared.vegetation,
+        compared.young,
     )
     return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
 
 
-def _differences(of: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
     """By how much the left image differs from the right one [h, w], whose brightness is brought to
     that of the surface up to GAIN_PX, in standard deviations; and means of that."""
-    left, warped = of.images
+    left, warped = compared.images
     known = (left != 0.0) & np.isfinite(warped)
     runs = wanted_runs(box_max(doubtful, NEAR_PX))
     levels = [
-        surface_mean(np.where(known, image, np.nan), *of.surface, GAIN_PX, GAIN_PX // 4, runs)
-        for image in of.images
+        surface_mean(np.where(known, image, np.nan), *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
+        for image in compared.images
     ]
     down, across = np.gradient(left)
     variance = OFF_PX**2 * (down**2 + across**2) + OFF_SHARE**2 * left**2
-    variance += sum(max(noise, ROUNDING) for noise in of.noise)
-    off = np.abs(left - warped * (levels[0] / levels[1])) / np.sqrt(variance)
+    variance += sum(max(noise, ROUNDING) for noise in compared.noise)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a black image
+        off = np.abs(left - warped * (levels[0] / levels[1])) / np.sqrt(variance)
     difference = np.where(known, off, np.nan).astype(np.float32)
     runs = wanted_runs(doubtful)
     return [
         difference,
-        *(surface_mean(difference, *of.surface, reach, 1, runs) for reach in (1, NEAR_PX)),
+        *(surface_mean(difference, *compared.surface, reach, 1, runs) for reach in (1, NEAR_PX)),
     ]
 
 
-def _contrasts_and_gain(of: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
     """Contrast of both images, and how their ratio differs from that around [h, w]."""
     runs = wanted_runs(doubtful)
 
     def mean(values: NDArray[np.floating], reach: int, every: int = 1) -> Singles:
-        return surface_mean(values, *of.surface, reach, every, runs)
+        return surface_mean(values, *compared.surface, reach, every, runs)
 
-    left, warped = of.images
+    left, warped = compared.images
     both = (left != 0.0) & (warped > 0.0)
     logarithms = [np.log(np.where(both, image, np.nan) / LEVEL) for image in (left, warped)]
     levels = [mean(image, ALIKE_PX) for image in logarithms]
     contrasts = []
-    for image, level, variance in zip(logarithms, levels, of.noise):
+    for image, level, variance in zip(logarithms, levels, compared.noise):
         spread = np.maximum(mean(image**2, ALIKE_PX) - level**2, 0.0)
         contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
     wide = mean(logarithms[0] - logarithms[1], GAIN_PX, GAIN_PX // 4)

@@ -40,14 +40,15 @@ UNKNOWN = 0.05  # tell by, and the probability is the share that has changed
 TREES = Path(__file__).with_suffix(".tsv")
 
 
-def with_surroundings(own: Floats, doubtful: Bools, of: LabelledWindow) -> list[Singles]:
+def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) -> list[Singles]:
     """Log odds [n] of the ``doubtful`` pixels' ``own`` probability [h, w], and of its means over
     the labelled surface around them, see AROUND, and over its pixels that are alike, see
     ALIKE_AROUND."""
-    runs, known = wanted_runs(doubtful), np.where(of.labelled, own, np.nan)
-    means = [surface_mean(known, *of.surface, *around, runs) for around in AROUND]
+    runs, known = wanted_runs(doubtful), np.where(compared.labelled, own, np.nan)
+    means = [surface_mean(known, *compared.surface, *around, runs) for around in AROUND]
     means += [
-        alike_mean(known, of.brightness, *of.surface, *around, runs) for around in ALIKE_AROUND
+        alike_mean(known, compared.brightness, *compared.surface, *around, runs)
+        for around in ALIKE_AROUND
     ]
     return [_log_odds(values[doubtful]) for values in (own, *means)]
 
@@ -72,14 +73,14 @@ def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:
     return out
 
 
-def probability_of_change(of: LabelledWindow, diachronic: bool) -> Floats:
+def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     """That what labelled pixels [h, w] show has changed; anything at other pixels.
 
     ``diachronic``: whether the images share no light.
     """
-    doubtful, evidence = change_evidence(of)
+    doubtful, evidence = change_evidence(compared)
     out = by_itself(evidence, doubtful, diachronic)
-    others = with_surroundings(out, doubtful, of)
+    others = with_surroundings(out, doubtful, compared)
     out[doubtful] = _probability(trees()[2 * diachronic + 1], evidence, others)
     return out
 

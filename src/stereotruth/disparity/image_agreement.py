@@ -65,11 +65,13 @@ def contradicted(
     ``surface_class`` [h, w] (ASPRS): of what the labels show. Labels of images of one light count
     as right where these do not contradict them.
     """
-    of = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
-    probability = probability_of_change(of, comparison.diachronic)
-    limit = np.where(of.vegetation, CROWN_CHANGED, np.where(of.young, YOUNG_CHANGED, CHANGED))
+    compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
+    probability = probability_of_change(compared, comparison.diachronic)
+    limit = np.where(
+        compared.vegetation, CROWN_CHANGED, np.where(compared.young, YOUNG_CHANGED, CHANGED)
+    )
     changed = labelled & (probability > limit)
-    correlation, _ = of.correlation(comparison.window_px)
+    correlation, _ = compared.correlation(comparison.window_px)
     variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
     return Contradicted(changed, correlation, variance)
 
