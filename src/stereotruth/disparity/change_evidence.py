@@ -31,7 +31,6 @@ from .young_crowns import beside_young_crowns
 
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
-Steps = NDArray[np.int32]
 
 CLOSE_PX = 5  # side of the windows that see what is a few pixels wide
 AGREED = 0.95  # correlation of these, mean of 3 x 3: with more, hardly anything has changed

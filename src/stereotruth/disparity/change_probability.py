@@ -21,15 +21,15 @@ from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
 from .change_evidence import Evidence, LabelledWindow, change_evidence
-from .surface_means import VOTE_PX, surface_mean
+from .surface_means import surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
-# px up to which, one of so many, probabilities are averaged; labels are compared up to VOTE_PX off
-AROUND = (2, 1), (4, 1), (8, 2), (VOTE_PX, 3)
-ALIKE_AROUND = (4, 1), (8, 1), (VOTE_PX, 2)  # and over pixels that are alike
+MEANS_PX = 12  # pixels up to here have a say in the probability of one
+AROUND = (2, 1), (4, 1), (8, 2), (MEANS_PX, 3)  # px up to which, one of so many, it is averaged;
+ALIKE_AROUND = (4, 1), (8, 1), (MEANS_PX, 2)  # and over pixels that are alike
 SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
 from .facet_labels import facet_labels
@@ -41,7 +42,6 @@ from .pixel_labels import Pixels, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
 from .status import Status
-from .surface_means import VOTE_PX
 from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
 
@@ -115,8 +115,8 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
 def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
     """The labels of a window by the surface of the points around it, as far as images agree."""
     labels, rough, own, window, comparison = lidar_labels(scene, window, points)
-    # changes count up to REASON_PX off; labels farther from these than votes reach need no images
-    labels = labels.around(window.grown(REASON_PX + VOTE_PX))
+    # changes count up to REASON_PX off; labels without a say in these need no images
+    labels = labels.around(window.grown(REASON_PX + MEANS_PX))
     is_rough = labels.status == Status.EDGE_IN_PIXEL
     labels = without_changes(labels, window, comparison)
     labels = with_crowns(labels, rough, window, comparison)

@@ -75,14 +75,14 @@ class Settings:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # here, since these load compiled code and a workflow plans with the settings
         from .change_evidence import EVIDENCE_PX
+        from .change_probability import MEANS_PX
         from .change_reasons import REASON_PX
         from .seen_surface import OUTER_RINGS
-        from .surface_means import VOTE_PX
 
         # one for each ring of neighbours: planes, their pooled noise, support
         reach = OUTER_RINGS + 3
         # what the images tell of a pixel, and of those around
-        reach += VOTE_PX + max(EVIDENCE_PX, self.window // 2 + 1)
+        reach += MEANS_PX + max(EVIDENCE_PX, self.window // 2 + 1)
         return reach + REASON_PX  # of changes
 
 

@@ -26,9 +26,6 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 
-VOTE_PX = 12  # pixels up to here vote,
-VOTE_STEP = 3  # every so many: 81 votes at most
-
 
 def warp_to_left(right: Patch, rows: slice, cols: slice, disparity: Floats) -> Floats:
     """Right image at (x - disparity, y) of every pixel of a window of the left grid, float64[h, w].
@@ -149,8 +146,8 @@ def surface_mean(
     values: NDArray[np.floating],
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
-    reach: int = VOTE_PX,
-    every: int = VOTE_STEP,
+    reach: int,
+    every: int,
     runs: Steps | None = None,
 ) -> Singles:
     """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.

@@ -76,7 +76,7 @@ def test_surface_mean_is_that_of_the_surface() -> None:
     found = surface_mean(values, disparity, level, 4, 1)
     assert found[:, :30] == pytest.approx(1.0)
     assert found[:, 30:] == pytest.approx(5.0)
-    assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level)).all()
+    assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level, 4, 1)).all()
 
 
 def contradicted_by(
