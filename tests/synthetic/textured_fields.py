@@ -48,3 +48,16 @@ def pair(left: np.ndarray, right: np.ndarray) -> PairWindow:
     whole = slice(20, 240)
     patches = (read_patch(left, ROWS, COLS, 1), read_patch(right, ROWS, whole, 1))
     return PairWindow(ROWS, COLS, 0, *patches)
+
+
+def ground(seed: int) -> np.ndarray:
+    """Of little contrast."""
+    return texture(seed, 450.0, 550.0)
+
+
+def built(brightness: float = 3.0) -> PairWindow:
+    """A bright roof, 12 px above the ground, in the right image alone."""
+    left = ground(0)
+    right = right_of(left, np.full((160, 260), 4))
+    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][FIELD] = brightness * ground(1)[:40, :50]
+    return pair(left, right)

@@ -23,6 +23,8 @@ from ...synthetic.textured_fields import (
     LEVEL,
     ROWS,
     SHAPE,
+    built,
+    ground,
     pair,
     right_of,
     texture,
@@ -31,24 +33,11 @@ from ...synthetic.textured_fields import (
 INNER = np.s_[20:-20, 20:-20]
 
 
-def ground(seed: int) -> np.ndarray:
-    """Of little contrast."""
-    return texture(seed, 450.0, 550.0)
-
-
 def evidence_of(
     window: PairWindow, labels: Labels = LEVEL, classes: np.ndarray = GROUND
 ) -> tuple[np.ndarray, Evidence]:
     """Of images without noise."""
     return change_evidence(LabelledWindow(window, labels, ALL, classes, (0.0, 0.0)))
-
-
-def built() -> PairWindow:
-    """A bright roof, 12 px above the ground, in the right image alone."""
-    left = ground(0)
-    right = right_of(left, np.full((160, 260), 4))
-    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][FIELD] = 3.0 * ground(1)[:40, :50]
-    return pair(left, right)
 
 
 def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:

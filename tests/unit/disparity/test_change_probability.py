@@ -20,18 +20,14 @@ from ...synthetic.textured_fields import (
     LEVEL,
     ROWS,
     SHAPE,
+    built,
+    ground,
     pair,
     right_of,
-    texture,
 )
 
 NO_NOISE = 0.0, 0.0
 INNER = np.s_[20:-20, 20:-20]
-
-
-def ground(seed: int) -> np.ndarray:
-    """Of little contrast."""
-    return texture(seed, 450.0, 550.0)
 
 
 def probability(
@@ -41,14 +37,6 @@ def probability(
 
 
 LIGHTS = pytest.mark.parametrize("diachronic", [False, True])
-
-
-def built(brightness: float = 3.0) -> PairWindow:
-    """A bright roof, 12 px above the ground, in the right image alone."""
-    left = ground(0)
-    right = right_of(left, np.full((160, 260), 4))
-    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][FIELD] = brightness * ground(1)[:40, :50]
-    return pair(left, right)
 
 
 @LIGHTS

@@ -79,6 +79,35 @@ def test_surface_mean_is_that_of_the_surface() -> None:
     assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level, 4, 1)).all()
 
 
+def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
+    """A hillside of 0.8 px per px is one surface; ground does not count for a roof of 3.5 px."""
+    x = np.broadcast_to(np.arange(60.0), (60, 60))
+    slope, fails = np.zeros((2, 60, 60)), np.zeros((60, 60))
+    slope[0], fails[30, 30] = 0.8, 1.0
+    assert not (surface_mean(fails, 0.8 * x, slope, 12, 3) > 0.5).any()
+    roof = np.s_[22:38, 22:38]
+    disparity, fails = np.zeros((60, 60)), np.zeros((60, 60))
+    disparity[roof], fails[roof] = 3.5, 1.0
+    changed = surface_mean(fails, disparity, np.zeros((2, 60, 60)), 12, 3) > 0.5
+    assert changed[roof].all()
+    assert changed.sum() == 256
+
+
+def test_beside_a_blurred_roof_pixels_apart_from_steps_correlate() -> None:
+    """A bright roof beside dull ground, which the other view shows beside more ground."""
+    ground, roof = 60 + 0.05 * texture((80, 80)), 2000 + texture((80, 80), seed=1)
+    left = np.where(np.arange(80) < 40, roof, ground)
+    warped = left.copy()
+    left[:, 40:42] += np.array([600.0, 60.0])  # what the optics bring over
+    disparity = np.where(np.arange(80) < 40, 15.0, 0.0) * np.ones((80, 1))
+    disparity[:, 39:41] = np.nan  # the edge itself has no label
+    clear = apart_from_steps(disparity)
+    assert not clear[:, 38:42].any() and clear[1:-1, 1:38].all() and clear[1:-1, 42:-1].all()
+    warped[:, 39:41] = np.nan
+    found = surface_correlation(left, warped, disparity, LEVEL, 9, clear)
+    assert found[20:60, 41:46] == pytest.approx(1.0, abs=1e-4)
+
+
 def contradicted_by(
     left: np.ndarray,
     right: np.ndarray,
