@@ -27,6 +27,7 @@ from stereotruth.disparity.change_probability import (
     TREES,
     UNCHANGED,
     by_itself,
+    probability_by,
     trees,
     with_surroundings,
 )
@@ -184,8 +185,7 @@ def report(of: list[Case], folder: Path) -> None:
     diachronic = of[0].apart
     with ProcessPoolExecutor(JOBS) as pool:
         for kind, s in samples(of, folder, around=True, pool=pool):
-            odds = trees()[2 * diachronic + 1].sum_at(s.evidence).astype(np.float64)
-            p = 1.0 / (1.0 + np.exp(-odds))
+            p = probability_by(trees()[2 * diachronic + 1], s.evidence)
             counts += [np.histogram(p[part], BINS)[0] for part in (s.changed, ~s.changed)]
             counts[:, np.searchsorted(BINS, UNCHANGED) - 1] += s.agreed
             left, changed = p > CHANGED, s.changed

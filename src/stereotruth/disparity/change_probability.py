@@ -69,7 +69,7 @@ def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:
     """Probability [h, w] that a pixel has changed, by its own evidence alone; UNCHANGED where it is
     not ``doubtful``. ``diachronic``: whether the images share no light."""
     out = np.full(doubtful.shape, UNCHANGED)
-    out[doubtful] = _probability(trees()[2 * diachronic], evidence, [])
+    out[doubtful] = probability_by(trees()[2 * diachronic], np.stack(evidence))
     return out
 
 
@@ -81,11 +81,13 @@ def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     doubtful, evidence = change_evidence(compared)
     out = by_itself(evidence, doubtful, diachronic)
     others = with_surroundings(out, doubtful, compared)
-    out[doubtful] = _probability(trees()[2 * diachronic + 1], evidence, others)
+    out[doubtful] = probability_by(trees()[2 * diachronic + 1], np.stack([*evidence, *others]))
     return out
 
 
-def _probability(fitted: DecisionTrees, evidence: Evidence, others: list[Singles]) -> Floats:
-    """By trees that sum up to log odds; UNKNOWN where noise leaves nothing to tell by."""
-    odds = fitted.sum_at(np.stack([*evidence, *others])).astype(np.float64)
-    return np.where(evidence.signal >= LEAST_SIGNAL, 1.0 / (1.0 + np.exp(-odds)), UNKNOWN)
+def probability_by(fitted: DecisionTrees, features: Singles) -> Floats:
+    """By trees that sum up to log odds, of the ``features`` [k, n], evidence first; UNKNOWN where
+    noise leaves nothing to tell by."""
+    odds = fitted.sum_at(features).astype(np.float64)
+    signal = features[Evidence._fields.index("signal")]
+    return np.where(signal >= LEAST_SIGNAL, 1.0 / (1.0 + np.exp(-odds)), UNKNOWN)
