@@ -168,13 +168,11 @@ def fit_all(seeds: list[int], folder: Path) -> None:
     halves = seeds[: len(seeds) // 2], seeds[len(seeds) // 2 :]
     sums: list[DecisionTrees] = []
     for around, half in zip((False, True), halves):
-        found = []
         for condition in CONDITIONS:
             with ProcessPoolExecutor(JOBS) as pool:
                 of = samples(cases(half, condition, fitted=True), folder, around, pool)
-                found.append(fit([s for _, s in of]))
-        sums = [*found, *found] if not around else [sums[0], found[0], sums[1], found[1]]
-        DecisionTrees.save(TREES, sums if around else [sums[0], sums[0], sums[1], sums[1]])
+                sums.append(fit([s for _, s in of]))
+        DecisionTrees.save(TREES, sums)
         trees.cache_clear()
 
 
@@ -185,7 +183,7 @@ def report(of: list[Case], folder: Path) -> None:
     diachronic = of[0].apart
     with ProcessPoolExecutor(JOBS) as pool:
         for kind, s in samples(of, folder, around=True, pool=pool):
-            p = probability_by(trees()[2 * diachronic + 1], s.evidence)
+            p = probability_by(trees(diachronic)[1], s.evidence)
             counts += [np.histogram(p[part], BINS)[0] for part in (s.changed, ~s.changed)]
             counts[:, np.searchsorted(BINS, UNCHANGED) - 1] += s.agreed
             left, changed = p > CHANGED, s.changed

@@ -164,7 +164,9 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
         SHIFTS_PX,
     )
     runs = wanted_runs(box_max(doubtful, ALIKE_PX))
-    alike = alike_correlation(*compared.images, *compared.surface, ALIKE_PX, compared.noise, runs)
+    alike = alike_correlation(
+        *compared.images, compared.brightness, *compared.surface, ALIKE_PX, compared.noise, runs
+    )
     arrays = Evidence(
         close,
         box_max(np.nan_to_num(close, nan=-1.0), 1),

@@ -59,17 +59,19 @@ def _log_odds(probability: NDArray[np.floating]) -> Singles:
 
 
 @cache
-def trees() -> list[DecisionTrees]:
-    """Those of the log odds by a pixel's own evidence, and those that ask its surroundings, too;
-    of images of one light, then of images that share none."""
-    return DecisionTrees.load(TREES)
+def trees(diachronic: bool) -> list[DecisionTrees]:
+    """Those of the log odds by a pixel's own evidence, and those that ask its surroundings, too.
+
+    ``diachronic``: whether the images share no light. The table has both of either by turns.
+    """
+    return DecisionTrees.load(TREES)[diachronic::2]
 
 
 def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:
     """Probability [h, w] that a pixel has changed, by its own evidence alone; UNCHANGED where it is
     not ``doubtful``. ``diachronic``: whether the images share no light."""
     out = np.full(doubtful.shape, UNCHANGED)
-    out[doubtful] = probability_by(trees()[2 * diachronic], np.stack(evidence))
+    out[doubtful] = probability_by(trees(diachronic)[0], np.stack(evidence))
     return out
 
 
@@ -81,7 +83,7 @@ def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     doubtful, evidence = change_evidence(compared)
     out = by_itself(evidence, doubtful, diachronic)
     others = with_surroundings(out, doubtful, compared)
-    out[doubtful] = probability_by(trees()[2 * diachronic + 1], np.stack([*evidence, *others]))
+    out[doubtful] = probability_by(trees(diachronic)[1], np.stack([*evidence, *others]))
     return out
 
 

@@ -144,6 +144,7 @@ def _alike_correlation(
 def alike_correlation(
     left: NDArray[np.floating],
     warped: NDArray[np.floating],
+    brightness: tuple[Singles, Singles],
     disparity: NDArray[np.floating],
     slope: NDArray[np.floating],
     reach: int,
@@ -153,14 +154,15 @@ def alike_correlation(
     """Correlation of two images [h, w] over the pixels up to ``reach`` px around that are alike.
 
     These lie on the surface of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], and
-    are as bright as it within the share ALIKE in both images. ``left`` is 0 and ``warped`` NaN
-    where an image has no value. The coefficient is as it would be without ``noise`` (variances of
-    both images, DN²), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves so little
-    that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    are as bright as it within the share ALIKE in both images, by their ``brightness``
+    (:func:`brightness_of_pair`). ``left`` is 0 and ``warped`` NaN where an image has no value. The
+    coefficient is as it would be without ``noise`` (variances of both images, DN²), 1 at most. NaN
+    with fewer than LEAST_PIXELS, and where noise leaves so little that chance may do as well. Of
+    the pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
-    level, level_warped = brightness_of_pair(left, warped)
+    level, level_warped = brightness
     known = np.isfinite(level_warped) & np.isfinite(disparity) & (left != 0.0)
-    level_warped[~known] = np.nan
+    level_warped = np.where(known, level_warped, np.float32(np.nan))
     single = [
         np.ascontiguousarray(values, dtype=np.float32)
         for values in (left, np.where(known, warped, 0.0))

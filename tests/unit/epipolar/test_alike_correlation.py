@@ -10,6 +10,7 @@ from stereotruth.epipolar.alike_correlation import (
     LEAST_PIXELS,
     alike_correlation,
     brightness,
+    brightness_of_pair,
 )
 from stereotruth.epipolar.surface_correlation import wanted_runs
 
@@ -32,6 +33,16 @@ def scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return left, right, disparity
 
 
+def compared(
+    left: np.ndarray, right: np.ndarray, disparity: np.ndarray, slope: np.ndarray, reach: int = 4,
+    noise: tuple[float, float] = NO_NOISE, wanted: np.ndarray = EVERY,
+) -> np.ndarray:  # fmt: skip
+    """The coefficients of the ``wanted`` pixels, with the brightness of both images."""
+    images = left, right
+    levels, runs = brightness_of_pair(*images), wanted_runs(wanted)
+    return alike_correlation(*images, levels, disparity, slope, reach, noise, runs)
+
+
 def by_hand(
     left: np.ndarray, right: np.ndarray, disparity: np.ndarray, y: int, x: int, reach: int
 ) -> float:
@@ -52,7 +63,7 @@ def by_hand(
 def test_it_is_the_coefficient_of_the_pixels_that_are_alike(reach: int) -> None:
     left, right, disparity = scene()
     flat = np.zeros((2, *SHAPE))
-    found = alike_correlation(left, right, disparity, flat, reach, NO_NOISE, wanted_runs(EVERY))
+    found = compared(left, right, disparity, flat, reach)
     expected = np.array(
         [
             [by_hand(left, right, disparity, y, x, reach) for x in range(SHAPE[1])]
@@ -70,7 +81,7 @@ def test_a_shadow_lowers_it_nowhere() -> None:
     right = left.copy()
     right[:, 30:] *= 0.3
     flat = np.full(SHAPE, 2.0), np.zeros((2, *SHAPE))
-    found = alike_correlation(left, right, *flat, 4, NO_NOISE, wanted_runs(EVERY))
+    found = compared(left, right, *flat)
     beside = found[:, 26:34]
     assert np.nanmin(beside) > 0.99
 
@@ -82,7 +93,7 @@ def test_other_ground_beside_does_not_count() -> None:
     right = left.copy()
     left[:, 30:] = rng.uniform(1400.0, 1600.0, left[:, 30:].shape)
     flat = np.full(SHAPE, 2.0), np.zeros((2, *SHAPE))
-    found = alike_correlation(left, right, *flat, 4, NO_NOISE, wanted_runs(EVERY))
+    found = compared(left, right, *flat)
     assert np.nanmin(found[:, :29]) > 0.99
     assert np.nanmean(found[:, 31:]) < 0.2
 
@@ -94,7 +105,7 @@ def test_noise_is_taken_off_and_what_it_drowns_is_not_known() -> None:
     flat = np.full(SHAPE, 2.0), np.zeros((2, *SHAPE))
 
     def found(images: list[np.ndarray]) -> np.ndarray:
-        return alike_correlation(*images, *flat, 4, (144.0, 144.0), wanted_runs(EVERY))
+        return compared(*images, *flat, noise=(144.0, 144.0))
 
     assert abs(np.nanmedian(found(images)) - 1.0) < 0.2
     noise_alone = [rng.normal(500.0, 12.0, SHAPE) for _ in range(2)]
@@ -106,10 +117,7 @@ def test_what_is_wanted_has_the_values_that_all_together_have(share: float) -> N
     left, right, disparity = scene(4)
     flat = np.zeros((2, *SHAPE))
     wanted = np.random.default_rng(5).uniform(size=SHAPE) < share
-    every, some = (
-        alike_correlation(left, right, disparity, flat, 4, NO_NOISE, wanted_runs(of))
-        for of in (EVERY, wanted)
-    )
+    every, some = (compared(left, right, disparity, flat, wanted=of) for of in (EVERY, wanted))
     assert np.array_equal(every[wanted], some[wanted], equal_nan=True)
 
 
