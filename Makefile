@@ -4,7 +4,7 @@
 # make dataset        set up, then make the tiles of all cities in the layout of the published dataset
 # make verify         hold all tiles against the checksums of their manifests
 # make test           set up, then pass the tests that every change needs
-# make test-all       set up, then pass all: kills and restarts, browsers, benchmarks, real scenes too
+# make test-all       set up, then pass all: whole runs, kills, draws, browsers, benchmarks, real scenes too
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 # make test-s3        set up, then pass the tests with object storage (a server of its own)
@@ -17,6 +17,8 @@ PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
+# Many processes run the same modules: each would compile anew what nobody may keep compiled.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup first-run first-city first-labels help docs networks test test-all test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
 

@@ -137,15 +137,14 @@ def fit(of: list[Sample]) -> DecisionTrees:
         max_iter=NUMBER, max_leaf_nodes=LEAVES, learning_rate=RATE, min_samples_leaf=LEAST_PIXELS,
         early_stopping=False, random_state=0,
     ).fit(features, changed, sample_weight=weights)  # fmt: skip
-    rows = [(0, LEAF, 0.0, 0, 0, 0, float(fitted._baseline_prediction.item()))]
+    rows = [(0, LEAF, 0.0, 0, 0, float(fitted._baseline_prediction.item()))]
     for number, (predictor,) in enumerate(fitted._predictors, 1):
         for at, node in enumerate(predictor.nodes):
             if node["is_leaf"]:
-                rows.append((number, LEAF, 0.0, 0, 0, 0, node["value"]))
+                rows.append((number, LEAF, 0.0, 0, 0, node["value"]))
                 continue
-            steps = int(node["left"]) - at, int(node["right"]) - at
             asked = int(node["feature_idx"]), node["num_threshold"], node["missing_go_to_left"]
-            rows.append((number, *asked, *steps, 0.0))
+            rows.append((number, *asked, int(node["right"]) - at, 0.0))
     return DecisionTrees(*(np.array(column) for column in zip(*rows)))
 
 

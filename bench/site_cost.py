@@ -206,7 +206,7 @@ def main() -> None:
     rows = []
     for spacing in arguments.spacing:
         name = f"{arguments.side}_{arguments.images}_{arguments.seed}_{spacing:g}"
-        rows.append(measure(arguments.folder / name, arguments, spacing))
+        rows.append(measure(arguments.folder.resolve() / name, arguments, spacing))
         print(json.dumps(rows[-1], indent=1), flush=True)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

@@ -22,7 +22,8 @@ FIRST = (
 
 
 def pytest_collection_modifyitems(items):
-    """Whole runs before short tests, so that no process is left with one at the end."""
+    """Whole runs before short tests, so that no process is left with one at the end; those that
+    need the stages after the tiles are slow."""
 
     def place(item: pytest.Item) -> int:
         file = PurePosixPath(item.nodeid.partition("::")[0])
@@ -31,6 +32,9 @@ def pytest_collection_modifyitems(items):
         return FIRST.index(file.stem) if file.stem in FIRST else len(FIRST)
 
     items.sort(key=place)
+    for item in items:
+        if "later" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -113,6 +113,7 @@ def test_a_global_that_is_no_constant_is_refused(content_after):
         content_after(("parts", "TABLE = (1.0, 2.0)", "TABLE = object()"))
 
 
+@pytest.mark.slow
 def test_an_edit_of_what_a_kernel_calls_compiles_it_and_another_edit_does_not(tmp_path) -> None:
     """A run's job starts sooner without the compiler, whose imports take longer than Numba's."""
     (tmp_path / "main.py").write_text(MAIN)

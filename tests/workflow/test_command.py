@@ -101,6 +101,7 @@ def module() -> str:
     return textwrap.dedent(block) + OWN_RULE
 
 
+@pytest.mark.slow
 def test_a_module_of_another_workflow_makes_the_same(own):
     """What the command has made stays; the other workflow's own rule goes on from it."""
     (own / "Snakefile").write_text(module().replace("Demo", "Tiny"))
@@ -136,6 +137,7 @@ def test_snakemake_from_elsewhere_reads_the_defaults_and_the_folder(own, tmp_pat
     assert run.status != 0 and "unknown key 'tile'" in run.text
 
 
+@pytest.mark.slow
 def test_what_is_out_of_date_is_said_with_the_cause(own):
     gcps = own / "in/gcps.csv"
     text = gcps.read_text()

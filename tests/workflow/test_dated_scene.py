@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import zarr
 
 from stereotruth.disparity.status import Status, is_labelled
@@ -28,6 +29,7 @@ GRID = "results/project/Tiny/Tiny-1.zarr"
 CHANGED_M, SAME_M = 1.0, 0.01
 
 
+@pytest.mark.slow
 def test_what_changed_since_the_lidar_is_found_and_named(project, tmp_path) -> None:
     """Sheets, images and LAZ in; out of the last grid as the bench asks, with some room."""
     (spec,) = CITY.scenes

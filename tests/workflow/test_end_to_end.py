@@ -119,6 +119,7 @@ def edited(made, tmp_path_factory) -> Project:
     return project
 
 
+@pytest.mark.slow
 def test_remarks_in_the_code_run_nothing(edited):
     assert plan(edited) == {}
 
@@ -210,6 +211,7 @@ def test_the_right_view_is_a_second_product(made, both_views):
     assert (miss < 0.2).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_verify_finds_an_edited_tile(made, tmp_path):
     """That one alone; of a city whose tiles are whole, the stages after the tiles verify them."""
     other = made.copy(tmp_path / "other")
@@ -395,6 +397,7 @@ def test_a_mistake_ends_in_one_clear_message(wrong, made, mistake, tmp_path):
     assert [*tmp_path.rglob("*.partial")] == []
 
 
+@pytest.mark.slow
 def test_a_run_names_all_mistakes_and_leaves_nothing(wrong):
     """A scene that fails does not stop the other, of which two files fail at the same time."""
     mistakes = (two_gcps, lidar_without_crs)

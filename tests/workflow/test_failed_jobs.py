@@ -56,6 +56,7 @@ def writes(pid: int, file: Path) -> bool:
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
 
+@pytest.mark.slow
 @linux
 def test_a_job_that_is_killed_after_an_edit_is_due_with_all_that_follows(made, tmp_path):
     other = made.copy(tmp_path / "other")

@@ -98,6 +98,7 @@ def test_deleted_results_are_made_again(cloned, tmp_path):
     assert not (other.folder / "results").exists()  # a plan makes nothing
 
 
+@pytest.mark.slow
 def test_tiles_without_results_are_still_known(made, tmp_path):
     """Whoever deletes the results for their size keeps tiles that follow the configuration."""
     other = made.copy(tmp_path / "other")
@@ -200,6 +201,7 @@ def test_an_input_that_cannot_be_read_ends_the_plan_with_one_sentence(cloned, fi
         kept.rename(place)
 
 
+@pytest.mark.slow
 def test_a_file_beside_an_image_that_comes_later_is_an_input(cloned):
     for name in ("left.tif.msk", "left_Rpc.Txt", "right.TIF.aux.xml", "left.tfw"):
         (cloned.folder / "in" / name).write_bytes(b"1")

@@ -10,6 +10,7 @@ import yaml
 from ..synthetic.project import Project
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("torch") is not None, reason="PyTorch is installed here")
 def test_a_network_says_what_to_install(project: Project) -> None:
     root = project.folder / "pairs"

@@ -22,6 +22,7 @@ def system(rng: np.random.Generator, n: int = 600):
     return design, sites, np.column_stack([u, v])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_class", [0.0, 0.02])
 def test_uncertainty_of_the_estimate_is_honest(of_class):
     """True parameters drawn from the prior, errors shared in sites, a fifth blunders.

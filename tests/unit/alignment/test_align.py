@@ -154,6 +154,7 @@ def covariance_at(fit, col, row) -> np.ndarray:
     return design @ fit.covariance @ np.swapaxes(design, -1, -2)
 
 
+@pytest.mark.slow
 def test_covariance_predicts_the_spread_over_many_measurements(images, tmp_path):
     """Deviations at a corner over 200 sets of noise, against the predicted: within 20 %."""
     errors, predicted = [], []

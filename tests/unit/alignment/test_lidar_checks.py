@@ -161,6 +161,7 @@ def estimated(shifts: np.ndarray, sigma: float, rng: np.random.Generator, noise:
     return estimate(equations, prior)
 
 
+@pytest.mark.slow
 def test_a_fault_of_height_is_measured_with_an_honest_deviation():
     """Errors drawn from the prior, a fault of 2 m on top."""
     rng = np.random.default_rng(5)

@@ -51,6 +51,7 @@ def stores(tmp_path_factory) -> tuple[Path, Path, Footprint]:
     return folder / "whole.points", folder / "part.points", footprint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "view"), [("surface", "left"), ("surface", "right"), ("paper", "left")]
 )
@@ -141,6 +142,7 @@ def test_a_site_has_the_ground_of_all_its_pairs(tmp_path):
         assert both.held[row - both.row, first - both.col : last - both.col + 1].all()
 
 
+@pytest.mark.slow
 def test_ground_without_points_is_named_with_its_area(stores, tmp_path, caplog):
     """A gap of one cell of the stores in what both images show."""
     scene = BoxScene(tmp_path, box=True)

@@ -168,6 +168,7 @@ def test_a_simpler_model_is_refined_too(images, points):
     assert max(relative_error(refined)) < 0.03
 
 
+@pytest.mark.slow
 def test_no_tie_point_lies_under_a_mask(images, points, tmp_path):
     cloud = np.zeros(SIZE[::-1], np.uint8)
     cloud[:, : SIZE[0] // 3] = 1
@@ -214,6 +215,7 @@ def test_lidar_of_another_datum_changes_nothing(images, tmp_path):
     assert (refined.right.affine == planted.right.affine).all()
 
 
+@pytest.mark.slow
 def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
     cloud = lidar()
     cloud[:, 2] += 1.0
@@ -236,6 +238,7 @@ def test_lidar_beside_its_place_is_doubted(images, tmp_path):
     assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("metres", "doubted"), [(0.0, False), (0.4, False), (-30.0, True)])
 def test_heights_without_control_points_are_held_against_the_rpcs(
     images, tmp_path, metres, doubted
@@ -257,6 +260,7 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
     assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
 
 
+@pytest.mark.slow
 def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
     cloud = lidar()
     half = cloud[:, 0] < LON

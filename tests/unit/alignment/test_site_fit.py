@@ -94,6 +94,7 @@ def test_images_together_are_better_than_by_their_points_alone():
     assert joint.point_sigma == pytest.approx(0.25, rel=0.15)
 
 
+@pytest.mark.slow
 def test_stated_covariance_is_that_of_the_errors():
     size = []
     for seed in range(25):

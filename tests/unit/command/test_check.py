@@ -59,6 +59,7 @@ def test_doubts_end_strict_runs(folder):
     assert any("left out" in text for text in texts(Level.ERROR))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "level", "words"),
     [

@@ -386,6 +386,7 @@ def test_a_redirect_to_an_allowed_host_is_followed_when_listed_and_when_read(fol
                 assert stream.read(4) == b"LASF"
 
 
+@pytest.mark.slow
 def test_a_catalogue_that_never_ends_is_not_read_to_its_end(folder, monkeypatch):
     monkeypatch.setattr("stereotruth.lidar.catalogue.MOST_BYTES", 1000)
     with serving() as site:

@@ -17,6 +17,7 @@ from ...synthetic.exact_surface import exact_heights, write_heights
 from ...synthetic.small_cities import TOWN
 
 
+@pytest.mark.slow
 def test_a_model_is_judged_against_lidar_without_a_project(tmp_path):
     scene = TOWN.scenes[0]
     for name in lidar_files(TOWN, scene):

@@ -95,6 +95,7 @@ def test_offset_is_whole_and_of_tile_or_scene(
     assert np.nanmax(np.abs(back - original)) <= 1 / 2048
 
 
+@pytest.mark.slow
 def test_overlapping_tiles_share_no_ground_across_splits(scene: SceneFiles, tmp_path: Path) -> None:
     summary = run([scene], tmp_path / "T", stride=SIZE * 3 // 4)
     assert summary["splits"]["realised"]["none"] > 0
@@ -105,6 +106,7 @@ def test_overlapping_tiles_share_no_ground_across_splits(scene: SceneFiles, tmp_
     assert not (tmp_path / "S").exists()
 
 
+@pytest.mark.slow
 def test_two_scenes_of_one_city(scene: SceneFiles, tmp_path: Path) -> None:
     """A second pair over the same ground: its tiles count on, and share no ground across splits."""
     other = make_scene(tmp_path / "s2", turn=0.3)

@@ -93,6 +93,7 @@ def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) 
     assert seen < 0.7 * whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_labels_are_those_of_all_blocks(tmp_path, monkeypatch, view) -> None:
     monkeypatch.setattr("stereotruth.surface.make_surface.block_side", lambda scale: 32)

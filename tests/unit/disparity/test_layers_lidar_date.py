@@ -79,6 +79,7 @@ def test_nothing_else_depends_on_days(box, tmp_path):
     assert none == two and "disparity" in two
 
 
+@pytest.mark.slow
 def test_bytes_are_the_same_for_any_blocks_windows_and_workers(box, tmp_path):
     """Points of one file of both days, in the order of a file that mixes them."""
     day = np.where(box.points[:, 0] < LON, WEST, EAST)

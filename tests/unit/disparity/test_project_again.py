@@ -79,6 +79,7 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     assert project(scene, [scene.store], out) == touched  # and without the file again
 
 
+@pytest.mark.slow
 def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
     out = tmp_path / "out.zarr"
     everything = project(scene, [scene.store], out)
@@ -89,6 +90,7 @@ def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
     assert project(scene, [scene.store], out, min_points=3) == everything
 
 
+@pytest.mark.slow
 def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_path):
     """And what else its file says makes no block anew."""
     out, file = tmp_path / "out.zarr", tmp_path / "alignment.json"
@@ -105,6 +107,7 @@ def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_p
     assert np.nanmin(known[3.0]["uncertainty"] - known[1.0]["uncertainty"]) > 0.01
 
 
+@pytest.mark.slow
 def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
     for view in ("left", "right"):
         whole = tmp_path / f"{view}.zarr"
@@ -119,6 +122,7 @@ def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
         assert tree(out) == tree(whole)
 
 
+@pytest.mark.slow
 def test_a_store_that_does_not_say_what_it_is_made_of_is_never_taken_over(scene, tmp_path):
     name_points(scene.store, {})
     out = tmp_path / "out.zarr"
@@ -128,6 +132,7 @@ def test_a_store_that_does_not_say_what_it_is_made_of_is_never_taken_over(scene,
     assert project(scene, [scene.store], out) >= everything - {"0-0.json"}
 
 
+@pytest.mark.slow
 def test_workers_of_a_dask_cluster_write_the_same_bytes(scene, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
     project(scene, [scene.store], tmp_path / "out.zarr")

@@ -111,6 +111,7 @@ def test_two_strips_at_one_place_are_found(tmp_path, compress) -> None:
     assert damaged_block(path) == "blocks 1 and 3 of 4 share bytes"
 
 
+@pytest.mark.slow
 def test_a_block_that_holds_more_than_its_pixels_is_found_in_little_memory(tmp_path) -> None:
     """A gigabyte of zeros in a megabyte of deflate."""
     path = write(tmp_path / "a.tif", compress="deflate", blockysize=200)

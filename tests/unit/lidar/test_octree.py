@@ -71,6 +71,7 @@ def read(location: str, ground: Ground | None, patience_s: float = PATIENCE_S) -
     return got if ground is None else got[:, ground.contains((got[:3].T * scales + offsets).T)]
 
 
+@pytest.mark.slow
 def test_a_footprint_has_the_points_of_the_whole_file(made):
     rng = np.random.default_rng(5)
     with serving(made.content) as server:
@@ -92,6 +93,7 @@ def test_bytes_are_those_of_the_touched_nodes():
     assert server.sent <= 1.2 * plan.bytes < 0.5 * len(made.content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", SERVER_FAULTS)
 def test_a_server_that_fails_is_overcome_or_named(made, fault):
     truth = cropped(made.content, GROUND)

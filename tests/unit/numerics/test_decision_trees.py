@@ -10,13 +10,13 @@ import pytest
 from stereotruth.numerics.decision_trees import COLUMNS, DecisionTrees
 
 TWO_TREES = """\
-0	0	-1	0	0	0	0	0.5
-0	1	0	2	1	1	2	0
-0	1	-1	0	0	0	0	10
-0	1	1	-1	0	1	2	0
-0	1	-1	0	0	0	0	20
-0	1	-1	0	0	0	0	30
-1	0	-1	0	0	0	0	7
+0	0	-1	0	0	0	0.5
+0	1	0	2	1	2	0
+0	1	-1	0	0	0	10
+0	1	1	-1	0	2	0
+0	1	-1	0	0	0	20
+0	1	-1	0	0	0	30
+1	0	-1	0	0	0	7
 """
 
 
@@ -61,3 +61,47 @@ def test_no_pixel_changes_another(tmp_path):
     whole = of.sum_at(features)
     assert np.array_equal(whole[::7], of.sum_at(features[:, ::7]))
     assert of.sum_at(features[:, :0]).shape == (0,)
+
+
+def grown(rng: np.random.Generator, leaves: int) -> list[tuple[int, float, int, int, float]]:
+    """Nodes of a tree of so many ``leaves``: feature, limit, missing_is_below, above, value."""
+    if leaves == 1:
+        return [(-1, 0.0, 0, 0, float(rng.normal()))]
+    left = int(rng.integers(1, leaves))
+    below, above = grown(rng, left), grown(rng, leaves - left)
+    asked = int(rng.integers(0, 3)), float(rng.normal()), int(rng.integers(0, 2))
+    return [(*asked, len(below) + 1, 0.0), *below, *above]
+
+
+def trees_of(leaves: list[int]) -> DecisionTrees:
+    """Drawn trees, of so many leaves each."""
+    rng = np.random.default_rng(len(leaves))
+    rows = [(n, *node) for n, most in enumerate(leaves) for node in grown(rng, most)]
+    types = np.int32, np.int32, np.float32, np.int32, np.int32, np.float32
+    return DecisionTrees(*(np.array(column, kind) for column, kind in zip(zip(*rows), types)))
+
+
+def followed(of: DecisionTrees, pixel: np.ndarray) -> np.float32:
+    """The sum at one pixel, down one tree after the other."""
+    total = np.float32(0.0)
+    for number in np.unique(of.tree):
+        node = int(np.flatnonzero(of.tree == number)[0])
+        while of.feature[node] >= 0:
+            x = pixel[of.feature[node]]
+            below = of.missing_is_below[node] if np.isnan(x) else x <= of.limit[node]
+            node += 1 if below else int(of.above[node])
+        total += of.value[node]
+    return total
+
+
+def test_trees_of_any_form_are_followed() -> None:
+    of = trees_of([1, 2, 3, 16, 5, 31, 16, 30])
+    features = np.random.default_rng(1).normal(size=(3, 700)).astype(np.float32)
+    features[np.random.default_rng(2).uniform(size=features.shape) < 0.1] = np.nan
+    expected = [followed(of, pixel) for pixel in features.T]
+    assert of.sum_at(features).tolist() == expected
+
+
+def test_a_tree_of_too_many_leaves_is_refused() -> None:
+    with pytest.raises(ValueError, match="32 leaves"):
+        trees_of([4, 32]).sum_at(np.zeros((3, 1), np.float32))

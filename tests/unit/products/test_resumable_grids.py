@@ -165,6 +165,7 @@ def _hold(path: Path, entered, leave, shared: bool) -> None:
         leave.wait(20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others", [True, False])
 def test_one_job_at_a_time_but_strips_together(tmp_path, others, caplog) -> None:
     """A job waits for one of a killed run that is still at work, strips do not for each other."""

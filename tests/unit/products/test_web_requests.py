@@ -90,6 +90,7 @@ DRIPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DRIPS)
 def test_a_server_that_drips_is_left(kind):
     """What comes drop by drop keeps each reading below its time-out."""

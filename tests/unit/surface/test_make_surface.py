@@ -70,6 +70,7 @@ def triangles(store: SurfaceStore) -> dict[str, set]:
     return found
 
 
+@pytest.mark.slow
 def test_triangles_are_the_same_for_any_blocks(stores, tmp_path, monkeypatch):
     make_surface(stores, tmp_path / "one", cell=CELL)
     one = SurfaceStore(tmp_path / "one")

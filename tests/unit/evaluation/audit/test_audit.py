@@ -195,6 +195,7 @@ def test_each_fault_has_its_line_and_a_click_sorts(audited, tmp_path):
         assert len(seen.found) >= 8 and seen.found == sorted(seen.found)
 
 
+@pytest.mark.slow
 def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
     root, out = tmp_path / "data", tmp_path / "out"
     for seed in range(2):

@@ -90,6 +90,7 @@ def test_a_shift_is_recovered_and_taken_out(judge, exact):
     assert edges == pytest.approx(exact["edges"]["position_error_m"], abs=0.03)
 
 
+@pytest.mark.slow
 def test_hills_without_roofs_tell_the_shift_too(judge):
     hills = Town(boxes=0, hills_m=3.0)
     model = hills.heights(*SHIFT[:2]) + SHIFT[2]
@@ -164,6 +165,7 @@ def test_slopes_are_told(judge):
     assert errors["ground, slope 30–90°"]["points"] > 0.1 * total
 
 
+@pytest.mark.slow
 def test_a_geoid_left_out_is_a_shift_up(judge, tmp_path):
     lon, lat = TO_WGS84.transform(WEST, NORTH)
     grid = tmp_path / "geoid.tif"

@@ -161,6 +161,7 @@ def test_no_record_is_told(tmp_path):
         read_record(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system counts as it does")
 def test_peak_memory_is_that_of_the_process_alone():
     """Not that of the process which started it, as Linux's ru_maxrss would have it."""

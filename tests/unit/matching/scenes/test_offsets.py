@@ -29,6 +29,7 @@ def test_offsets_of_blocks_bring_a_large_relief_into_a_small_range():
     assert np.isnan(match(Exact(), left, right, (-16, 16), **given)).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_offsets_are_found_from_the_images():
     y, x = np.mgrid[:512, :1024]
     truth = 0.2 * x - 100 + 5 * np.sin(y / 40)

@@ -169,6 +169,7 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
     assert np.nanmax(np.abs(whole - at_once)) < 1e-4
 
 
+@pytest.mark.slow
 def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_path, monkeypatch):
     """It widens the window of every block; parts that cannot reach a block are left out."""
     monkeypatch.setattr(surface_model, "CHUNK", 128)
