@@ -46,6 +46,7 @@ class Guard(NamedTuple):
     common_px: float
 
 
+# the widest first
 GUARDS = (Guard(2.5, 1.0, 0.005), Guard(1.8, 0.75, 0.012), Guard(1.2, 0.5, 0.05))
 
 
@@ -95,10 +96,13 @@ class SitePoints(NamedTuple):
         _fit_planes(self, centres, planes, share)
         return planes, share
 
-    def clear_pixels(self, centre: Integers, plane: Floats, guard: Guard) -> Bools:
-        """Pixels [SIDE, SIDE] of a window that show its plane alone: see the kernel."""
-        clear = np.empty((SIDE, SIDE), bool)
-        _clear_pixels(self, guard, centre, plane, clear)
+    def clear_pixels(self, centres: Integers, planes: Floats) -> Bools:
+        """Pixels [guards, k, SIDE, SIDE] of windows around ``centres`` int[k, 2] that show their
+        ``planes`` [k, 4] alone, by each of GUARDS: see the kernel."""
+        guards = np.array([(guard.px, guard.spacings) for guard in GUARDS])
+        clear = np.empty((len(guards), len(centres), SIDE, SIDE), bool)
+        for number, (centre, plane) in enumerate(zip(centres, planes)):
+            _clear_pixels(self, guards, centre, plane, clear[:, number])
         return clear
 
 
@@ -267,17 +271,19 @@ def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float
 @kernel
 def _clear_pixels(
     points: SitePoints,
-    guard: Guard,
+    guards: Floats,
     centre: Integers,
     plane: Floats,
     clear: Bools,
 ) -> None:
-    """Fill ``clear`` [SIDE, SIDE]: the pixels of a window that show its plane and nothing else.
+    """Fill ``clear`` [guards, SIDE, SIDE]: the pixels of a window that show its plane and nothing
+    else.
 
     A point off the plane, by height or because it is not firm, is seen at its own pixel in the left
     image, and in the right image displaced by its parallax; both places, what lies between them and
     a guard around all are not clear. Neither is a pixel without points of the plane nearby.
-    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``guard``: one of GUARDS.
+    ``plane`` [4] as :func:`_fit_planes` gives it for ``centre``; ``guards`` [guards, 2]: px and
+    spacings of each, the widest first.
     """
     first, (rows, cols) = points.first, points.shape
     parallax = points.parallax
@@ -287,8 +293,8 @@ def _clear_pixels(
         for k in range(first[y * cols + centre[0] - HALF], first[y * cols + centre[0] + HALF + 1]):
             on += points.firm[k] and abs(_above(points, plane, centre, k)) <= limit
     spacing = SIDE / np.sqrt(max(on, 1))
-    away, hole = guard.px + guard.spacings * spacing, HOLE_SPACINGS * spacing + 1.0
-    margin = int(max(away, hole)) + 1
+    away, hole = guards[:, 0] + guards[:, 1] * spacing, HOLE_SPACINGS * spacing + 1.0
+    margin = int(max(away[0], hole)) + 1
     wide = SIDE + 2 * margin
     off, held = np.zeros((wide, wide), np.bool_), np.zeros((wide, wide), np.bool_)
     middle = HALF + margin
@@ -329,5 +335,8 @@ def _clear_pixels(
                     _mark(off, x + t * parallax[0], v + t * parallax[1])
     for j in range(SIDE):
         for i in range(SIDE):
-            near_off = _near(off, j + margin, i + margin, away)
-            clear[j, i] = not near_off and _near(held, j + margin, i + margin, hole)
+            clear[:, j, i] = _near(held, j + margin, i + margin, hole)
+            for g in range(len(guards)):
+                if not clear[g, j, i] or not _near(off, j + margin, i + margin, away[g]):
+                    break  # narrower guards leave what a wider one leaves
+                clear[g, j, i] = False

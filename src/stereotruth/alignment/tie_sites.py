@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..epipolar.image_reader import Source
@@ -17,6 +18,7 @@ from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 Site = tuple[int, int, float, float]  # upper-left col, row px; lowest, highest point in m
 Picture = NDArray[np.float32]
 
@@ -43,7 +45,7 @@ class Places:
     ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone, by ``guard``.
     """
 
-    site: NDArray[np.int64]
+    site: Integers
     lon: Floats
     lat: Floats
     height: Floats
@@ -156,9 +158,10 @@ def _window_sums(values: Floats) -> Floats:
 
 
 def _candidates(
-    information: tuple[Floats, Floats, Floats], share: Floats, at: NDArray[np.int64]
-) -> list:
-    """For each of PER_SIDE² parts of a site, indices [≤ TRIED] of the most promising windows.
+    information: tuple[Floats, Floats, Floats], share: Floats, at: Integers
+) -> tuple[Integers, Integers]:
+    """Part of the site [n] and index [n] of the most promising windows, TRIED at most of each of
+    PER_SIDE² parts.
 
     By the information of their pixels, and by the share of the points that lie on the plane.
     ``share`` [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
@@ -167,7 +170,7 @@ def _candidates(
         _smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in information)), 0.0
     )
     score = score[np.ix_(at, at)] * share**4
-    found = []
+    parts, found = [], []
     edges = np.linspace(0, len(at), PER_SIDE + 1).astype(int)
     for top, bottom in pairwise(edges):
         for start, end in pairwise(edges):
@@ -175,8 +178,9 @@ def _candidates(
             best = np.argsort(-part, axis=None, kind="stable")[:TRIED]
             best = best[part.ravel()[best] > 0.0]
             rows, cols = np.unravel_index(best, part.shape)
-            found.append([(top + r) * len(at) + start + c for r, c in zip(rows, cols)])
-    return found
+            parts.append(np.full(best.size, len(parts)))
+            found.append((top + rows) * len(at) + start + cols)
+    return np.concatenate(parts), np.concatenate(found)
 
 
 def _parallax(left: SensorModel, right: SensorModel, col: float, row: float, h: float) -> Floats:
@@ -207,15 +211,10 @@ def _query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | No
     return np.concatenate([ground.min(axis=1), ground.max(axis=1)])
 
 
-def _places_of(
-    left: SensorModel,
-    right: SensorModel,
-    source: Source,
-    stores: Sequence[PointStore],
-    site: Site,
-    guard: Guard,
-) -> tuple[Floats, Floats, Bools] | None:
-    """The places of a site: (col, row) px of the left image [n, 2], planes [n, 3], clear pixels."""
+def _site_points(
+    left: SensorModel, right: SensorModel, stores: Sequence[PointStore], site: Site
+) -> SitePoints | None:
+    """The points of a site and MARGIN around it; None where there are none."""
     col0, row0 = site[:2]
     box = _query_box(left, right, site)
     if box is None:
@@ -231,33 +230,46 @@ def _places_of(
     middle = float(np.median(points.height))
     parallax = _parallax(left, right, col0 + SITE / 2, row0 + SITE / 2, middle)
     wide = SITE + 2 * MARGIN
-    cloud = SitePoints.sorted(
+    return SitePoints.sorted(
         col - col0 + MARGIN, row - row0 + MARGIN, points.height, firm, (wide, wide), parallax
     )
+
+
+def _places_of(points: SitePoints, picture: Picture) -> list[tuple[Integers, Floats, Bools]]:
+    """The places of a site by each of GUARDS: (col, row) px [n, 2] in its ``picture`` [SITE, SITE],
+    planes [n, 3], clear pixels [n, SIDE, SIDE]."""
     at = np.arange(HALF + 1, SITE - HALF - 1, STEP)
-    centres = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) + MARGIN
-    planes, share = cloud.fit_planes(centres)
-    flat = planes[:, 3] * np.hypot(*parallax) <= FLAT_PX
+    centres = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    planes, share = points.fit_planes(centres + MARGIN)
+    flat = planes[:, 3] * np.hypot(*points.parallax) <= FLAT_PX
     share = np.where(flat, share, 0.0)
-    information = _shift_information(source.read(col0, row0, SITE, SITE))
-    best, clear = [], []
-    for candidates in _candidates(information, share.reshape(len(at), len(at)), at):
-        scored = []
-        for k in candidates:
-            pixels = cloud.clear_pixels(centres[k], planes[k], guard)
-            i, j = centres[k] - MARGIN
-            own = [t[j - HALF : j + HALF + 1, i - HALF : i + HALF + 1] for t in information]
-            pixels &= np.isfinite(own[0])
-            if pixels.sum() >= MIN_CLEAR:
-                scored.append((_smaller_eigenvalue(*(o[pixels].sum() for o in own)), k, pixels))
-        if scored:
-            score, k, pixels = max(scored, key=lambda entry: entry[0])
-            if score >= MIN_INFORMATION:
-                best.append(k)
-                clear.append(pixels)
-    if not best:
-        return None
-    return centres[best] - MARGIN + np.array([col0, row0]), planes[best, :3], np.array(clear)
+    information = _shift_information(picture)
+    part, tried = _candidates(information, share.reshape(len(at), len(at)), at)
+    centres, planes = centres[tried], planes[tried]
+    col, row = centres.T - HALF
+    own = [sliding_window_view(values, (SIDE, SIDE))[row, col] for values in information]
+    found = []
+    for clear in points.clear_pixels(centres + MARGIN, planes):
+        clear &= np.isfinite(own[0])
+        score = np.where(clear.sum(axis=(1, 2)) >= MIN_CLEAR, _information_of(own, clear), 0.0)
+        best = _best_of_parts(part, score)
+        found.append((centres[best], planes[best, :3], clear[best]))
+    return found
+
+
+def _information_of(own: Sequence[Floats], pixels: Bools) -> Floats:
+    """Smaller eigenvalue [k] of the information xx, xy, yy [k, SIDE, SIDE] of some ``pixels`` of
+    windows."""
+    return _smaller_eigenvalue(*(np.where(pixels, values, 0.0).sum(axis=(1, 2)) for values in own))
+
+
+def _best_of_parts(part: Integers, score: Floats) -> list[int]:
+    """The candidate of each ``part`` [k] that has the greatest ``score`` [k], if that is enough."""
+    best: dict[int, int] = {}
+    for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
+        if score[k] > score[best.setdefault(int(part[k]), k)]:
+            best[int(part[k])] = k
+    return list(best.values())
 
 
 def find_places(
@@ -272,17 +284,20 @@ def find_places(
     With a wide guard around all that stands off their planes; where that leaves too few places
     (crowns in rows, dense woods), with the narrower ones.
     """
-    for guard in GUARDS:
-        found = []
-        for number, site in enumerate(sites):
-            there = _places_of(left, right, source, stores, site, guard)
-            if there is not None:
-                where, planes, clear = there
-                lon, lat = left.localize(where[:, 0], where[:, 1], planes[:, 0])
-                number_of = np.full(len(where), number)
-                found.append((number_of, lon, lat, planes[:, 0], planes[:, 1:], clear))
-        if sum(len(part[0]) for part in found) >= ENOUGH:
-            break
+    of_guards: list[list] = [[] for _ in GUARDS]
+    for number, site in enumerate(sites):
+        points = _site_points(left, right, stores, site)
+        if points is None:
+            continue
+        corner = site[:2]
+        for found, there in zip(of_guards, _places_of(points, source.read(*corner, SITE, SITE))):
+            at, planes, clear = there
+            lon, lat = left.localize(*(at + np.array(corner)).T, planes[:, 0])
+            number_of = np.full(len(at), number)
+            found.append((number_of, lon, lat, planes[:, 0], planes[:, 1:], clear))
+    enough = [sum(len(part[0]) for part in found) >= ENOUGH for found in of_guards]
+    chosen = enough.index(True) if any(enough) else -1
+    guard, found = GUARDS[chosen], of_guards[chosen]
     if not found:
         empty = np.empty(0)
         none = np.empty((0, SIDE, SIDE), bool)

@@ -54,13 +54,14 @@ def test_crowns_all_over_are_no_plane_to_match_on():
     assert not planes[0, 3] < 0.5
 
 
-@pytest.mark.parametrize("guard", GUARDS)
-def test_what_stands_off_the_plane_is_left_out_where_either_view_shows_it(guard):
+@pytest.mark.parametrize("number", range(len(GUARDS)))
+def test_what_stands_off_the_plane_is_left_out_where_either_view_shows_it(number):
+    guard = GUARDS[number]
     rng = np.random.default_rng(9)
     cloud = np.vstack([ground(rng, 2.0), [[60.0, 55.0, LEVEL + 5.0 - 5 * SLOPES[1]]]])
     points = points_of(cloud)
     planes, _ = points.fit_planes(CENTRE[None])
-    clear = points.clear_pixels(CENTRE, planes[0], guard)
+    clear = points.clear_pixels(CENTRE[None], planes)[number, 0]
     row, col = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
     # The point is 5 m high: at (0, -5) in the left image, at (-1, -0.5) in the right one.
     away = np.min(
@@ -78,7 +79,7 @@ def test_a_pulse_of_several_returns_and_a_hole_are_left_out():
     hole = np.hypot(*(cloud[:, :2] - (54.0, 54.0)).T) < 5.0
     points = points_of(cloud[~hole], ~several[~hole])
     planes, _ = points.fit_planes(CENTRE[None])
-    clear = points.clear_pixels(CENTRE, planes[0], GUARDS[0])
+    clear = points.clear_pixels(CENTRE[None], planes)[0, 0]
     row, col = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
     assert not clear[np.hypot(col - 5, row - 5) < 2.5].any()
     assert not clear[np.hypot(col + 6, row + 6) < 2.0].any()
@@ -92,6 +93,6 @@ def test_points_in_any_order_give_the_same_plane_and_pixels():
     for order in (np.arange(len(cloud)), rng.permutation(len(cloud))):
         points = points_of(cloud[order])
         planes.append(points.fit_planes(CENTRE[None])[0][0])
-        clear.append(points.clear_pixels(CENTRE, planes[-1], GUARDS[0]))
+        clear.append(points.clear_pixels(CENTRE[None], planes[-1:])[0, 0])
     assert (planes[0] == planes[1]).all()
     assert (clear[0] == clear[1]).all()
