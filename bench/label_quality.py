@@ -289,11 +289,32 @@ def draw_figure(figures: Mapping[str, Any], path: Path) -> None:
     plt.close(fig)
 
 
-def run(given: argparse.Namespace) -> dict[str, Any]:
-    """Make scenes, train and judge what is not kept already; returns all figures."""
+def show_labels(scenes: Sequence[Mapping[str, Labelled]]) -> None:
+    """Table of the labels of the kinds that have errors: means of the scenes, by the exact ones."""
+    rows = []
+    for kind in ("ours-4", "ours-1", "raster"):
+        figures = [_label_figures(of[kind].disparity, of["exact"].disparity) for of in scenes]
+        rows.append([kind, *(f"{value:.3f}" for value in np.mean(figures, axis=0))])
+    columns = "labels", "labelled, %", "mean absolute error, px", "over 1 px, %", "over 3 px, %"
+    print_table("Labels", [*columns, "on pixels not seen by both, % of all labels"], rows)
+
+
+def _label_figures(disparity: NDArray, exact: NDArray) -> list[float]:
+    """The columns of :func:`show_labels` of one scene; ``exact`` is NaN where not both see."""
+    labelled, seen = np.isfinite(disparity), np.isfinite(exact)
+    error = np.abs(disparity - exact)[labelled & seen]
+    return [
+        100.0 * error.size / seen.sum(),
+        error.mean(),
+        *(100.0 * (error > limit).mean() for limit in (1.0, 3.0)),
+        100.0 * (labelled & ~seen).sum() / labelled.sum(),
+    ]
+
+
+def run(given: argparse.Namespace, scenes: Sequence[Mapping[str, Labelled]]) -> dict[str, Any]:
+    """Train on scenes and judge what is not kept already; returns all figures."""
     folder: Path = given.folder
     model = SavedNetwork("stereonet", RANGE)
-    scenes = [training_pairs(k, given.side, folder) for k in range(given.scenes)]
     unseen = [unseen_pair(k, given.side, folder) for k in range(given.unseen)]
     print(f"{len(scenes)} training scenes, {len(unseen)} unseen ones", flush=True)
     kinds = [kind for kind in KINDS if kind in given.kind]
@@ -342,6 +363,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=6, help="to train on")
     parser.add_argument("--unseen", type=int, default=6, help="scenes that judge")
     parser.add_argument("--side", type=int, default=1000, help="of each image, px")
+    parser.add_argument("--labels", action="store_true", help="what they are like, no training")
     parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--initial", type=Path, help="weights to start from; default: random")
     parser.add_argument("--threads", type=int, default=2)
@@ -350,7 +372,11 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    record = run(given)
+    scenes = [training_pairs(k, given.side, given.folder) for k in range(given.scenes)]
+    show_labels(scenes)
+    if given.labels:
+        return
+    record = run(given, scenes)
     show(record["figures"])
     if given.json:
         write_json(given.json, record)
