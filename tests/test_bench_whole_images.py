@@ -41,6 +41,7 @@ def test_too_much_overlap_is_refused():
         Tiling(SHAPE, 64, 33)
 
 
+@pytest.mark.slow
 def test_sgm_in_tiles_is_sgm_at_once():
     y, x = np.mgrid[:400, :600]
     truth = 12 + 8 * np.sin(x / 90) + 6 * np.cos(y / 70)

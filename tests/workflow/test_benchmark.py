@@ -86,6 +86,7 @@ def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     assert jobs == {"match": 1, "score": 1, "benchmark_tables": 1, "benchmark": 1}
 
 
+@pytest.mark.slow
 def test_without_a_choice_what_needs_no_training_is_compared(project):
     """SGM, functions, folders and networks with weights; the others are named."""
     for name in ("far", "theirs"):

@@ -113,6 +113,7 @@ def test_a_module_of_another_workflow_makes_the_same(own):
     assert project.plan("report", "evaluate")["report_city"] == 1
 
 
+@pytest.mark.slow
 def test_a_module_without_settings_has_the_defaults(tmp_path):
     text = module().replace("Demo", "Qichun")
     (tmp_path / "Snakefile").write_text(text)
@@ -123,6 +124,7 @@ def test_a_module_without_settings_has_the_defaults(tmp_path):
     assert benchmark["match"] == benchmark["dataset"] == 1
 
 
+@pytest.mark.slow
 def test_snakemake_from_elsewhere_reads_the_defaults_and_the_folder(own, tmp_path):
     snakefile = ("--snakefile", str(ROOT / "Snakefile"))
     elsewhere = Project(tmp_path)

@@ -30,6 +30,7 @@ STARTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", STARTS)
 def test_a_job_imports_what_it_uses(script) -> None:
     words = f"import runpy, sys; runpy.run_path({str(FOLDER / f'scripts/{script}.py')!r})"

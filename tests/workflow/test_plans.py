@@ -20,6 +20,7 @@ def test_a_city_is_planned_from_nothing(project):
     assert jobs["ingest"] == jobs["simulate_lidar"] >= 4
 
 
+@pytest.mark.slow
 def test_all_cities_and_the_dataset_are_planned(project):
     assert project.plan()["export"] == 6
     assert project.plan("dataset")["dataset"] == 1
@@ -46,6 +47,7 @@ def test_training_cities_are_planned_for_who_trains_on_them(project):
     assert jobs == {"training_city": 6, "training_cities": 1, "train": 1}  # 5 to train on
 
 
+@pytest.mark.slow
 def test_real_scenes_are_evaluated_by_their_images(project):
     for name in ("left.tif", "right.tif", "points.laz", "gcps.csv"):
         (project.folder / name).touch()
@@ -91,6 +93,7 @@ def test_a_forgotten_configuration_is_thought_of(project):
     assert "FILE" not in run.text  # it was not forgotten
 
 
+@pytest.mark.slow
 def test_a_report_plans_no_city_that_nobody_asked_for(project):
     run = project.snakemake("--dry-run", "report")
     assert run.status != 0
@@ -158,6 +161,7 @@ benchmark:
 """
 
 
+@pytest.mark.slow
 def test_an_edit_behind_a_module_is_seen_and_a_missing_one_refused(project):
     (project.folder / "mine").mkdir()
     (project.folder / "pack").mkdir()

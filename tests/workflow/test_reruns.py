@@ -44,6 +44,7 @@ def cloned(made, tmp_path_factory) -> Project:
     return clone
 
 
+@pytest.mark.slow
 def test_a_touched_script_runs_nothing_and_an_edited_one_its_rule(made, tmp_path):
     other = made.copy(tmp_path / "other")
     for script in (other.folder / "workflow/scripts").iterdir():
@@ -59,6 +60,7 @@ def test_results_copied_into_a_clone_are_taken_as_they_are(cloned):
     assert plan(cloned) == {}
 
 
+@pytest.mark.slow
 def test_files_restored_without_their_times_run_nothing(made, tmp_path):
     other = made.copy(tmp_path / "other")
     mix_times(other.folder)
@@ -88,6 +90,7 @@ def test_what_changed_in_a_clone_runs_what_it_touches(cloned, tmp_path, file, ol
     assert set(plan(other)) == jobs
 
 
+@pytest.mark.slow
 def test_deleted_results_are_made_again(cloned, tmp_path):
     other = cloned.copy(tmp_path / "other")
     assert plan(other) == {}
@@ -140,6 +143,7 @@ DAMAGE = [
 ALONE = [file for file, _ in DAMAGE if not re.search(r"\*|\.(zarr|points|surface)/|^tiles/", file)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("file", "rule"), DAMAGE)
 def test_a_product_that_is_damaged_is_made_again_and_the_file_is_named(cloned, file, rule):
     """By a bit, or by a file that is gone from a folder; nobody takes it for an edit."""
@@ -214,6 +218,7 @@ def test_a_file_beside_an_image_that_comes_later_is_an_input(cloned):
     assert plan(cloned) == {}
 
 
+@pytest.mark.slow
 def test_what_costs_nothing_makes_nothing_again(cloned, tmp_path):
     """Absolute paths for relative ones, an order that says nothing, files of other programs."""
     other = cloned.copy(tmp_path / "other")
@@ -226,6 +231,7 @@ def test_what_costs_nothing_makes_nothing_again(cloned, tmp_path):
     assert plan(other) == {}
 
 
+@pytest.mark.slow
 def test_a_plan_writes_nothing(cloned):
     """But what Snakemake keeps of it, and checksums, in .snakemake."""
 
@@ -242,6 +248,7 @@ def test_a_plan_writes_nothing(cloned):
     assert state() == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts the folder again")
 def test_a_finished_project_that_is_read_only_is_planned(made, tmp_path):
     other = made.copy(tmp_path / "other")

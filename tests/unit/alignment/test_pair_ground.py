@@ -80,6 +80,7 @@ def test_points_elsewhere_choose_no_places_for_tie_points(stores):
     assert sites[0] == sites[1] and sites[0]
 
 
+@pytest.mark.slow
 def test_ground_that_was_left_out_is_told(stores, tmp_path, caplog):
     """A footprint that the aligned images reach out of."""
     scene = BoxScene(tmp_path, box=True)

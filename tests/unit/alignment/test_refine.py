@@ -127,6 +127,7 @@ def test_a_good_alignment_is_left_as_it_is(images, points):
         assert (before.affine == after.affine).all()
 
 
+@pytest.mark.slow
 def test_changed_ground_does_not_draw_the_result(images, points, tmp_path):
     """An eighth of the right image has moved, a tenth of the LiDAR is 1.5 m too high."""
     col, row = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
@@ -228,6 +229,7 @@ def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
     assert "+1.0" in refined.warnings[0] or "+0.9" in refined.warnings[0]
 
 
+@pytest.mark.slow
 def test_lidar_beside_its_place_is_doubted(images, tmp_path):
     """What the disparities do not see: the common part is told by the slopes."""
     cloud = lidar()
@@ -270,6 +272,7 @@ def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
     assert one.to_dict() == other.to_dict()
 
 
+@pytest.mark.slow
 def test_json_keeps_the_refinement(found, images, tmp_path):
     refined, observations = found
     files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]

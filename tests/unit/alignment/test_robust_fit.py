@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from stereotruth.alignment.robust_fit import System, find_blunders
 
 
+@pytest.mark.slow
 def test_good_points_with_noise_are_never_thrown_away():
     """300 random sets of 4 to 20 points with 0.25 px noise."""
     rng = np.random.default_rng(5)

@@ -133,6 +133,7 @@ def test_one_image_has_one_correction_in_all_of_its_pairs(tmp_path):
         assert np.abs(alignment.cross_covariance).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_order_of_the_pairs_plays_no_part(tmp_path):
     made = Site(tmp_path)
     assert adjust_site("Town", made.pairs) == adjust_site("Town", made.pairs[::-1])
@@ -146,6 +147,7 @@ def test_an_rpc_that_is_far_off_is_named_and_corrected(tmp_path):
     assert worst_error(site, made.truth, NAMES) < 0.25
 
 
+@pytest.mark.slow
 def test_an_image_that_nothing_places_is_refused_and_the_others_are_made(tmp_path):
     made = Site(tmp_path)
     clean = adjust_site("Town", made.pairs)

@@ -65,6 +65,7 @@ def test_folder_is_as_the_contract_says(exported: tuple[Path, dict]) -> None:
     assert any("labelled pairs" in line for line in summary_lines(summary, folder))
 
 
+@pytest.mark.slow
 def test_same_bytes_with_any_number_of_workers(
     exported: tuple[Path, dict], scene: SceneFiles
 ) -> None:

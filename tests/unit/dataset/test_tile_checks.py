@@ -133,6 +133,7 @@ def test_rows_that_are_off_are_flagged(made):
     assert all(row["quality"].startswith("max_y_parallax_px;min_sift_matches") for row in rows)
 
 
+@pytest.mark.slow
 def test_a_strict_run_ends_with_scene_tile_gate_value_and_limit(made, tmp_path):
     settings = {"size": SIZE, "quality": LIMITS, "strict": True}
     with pytest.raises(InputError) as caught:
@@ -154,6 +155,7 @@ def test_same_figures_and_matches_with_any_number_of_workers(made, tmp_path):
     assert (out / "manifest.csv").read_bytes() == (clean.out / "manifest.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_evaluation_of_a_city(made, tmp_path):
     clean = made["clean"]
     scene = clean.scene

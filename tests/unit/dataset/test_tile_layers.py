@@ -98,6 +98,7 @@ def dated(tmp_path_factory) -> SceneFiles:
     return make_scene(folder, lidar_days=(18_262, 18_628), acquired=("2020-01-11", None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("by_sheet", "days"),
     [

@@ -330,6 +330,7 @@ def test_blocks_can_go_to_other_processes(plane) -> None:
         assert np.array_equal(layer, second[0][name], equal_nan=True)
 
 
+@pytest.mark.slow
 def test_edge_margin_trades_labels_for_certainty(box) -> None:
     """Wider margins leave fewer labels and none of the wrong surface."""
     shares, wrong, edges = [], [], []

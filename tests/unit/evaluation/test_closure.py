@@ -118,6 +118,7 @@ def shares(closures: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
     return tuple(100 * float(np.mean(np.abs(closures) <= k * sigma)) for k in (1, 2))
 
 
+@pytest.mark.slow
 def test_exact_labels_close(tmp_path):
     closures, sigma = closure_of_labels(triplet_of(tmp_path))
     assert len(closures) > 20_000
@@ -126,6 +127,7 @@ def test_exact_labels_close(tmp_path):
     assert np.sqrt(np.mean(sigma**2)) < 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("higher", [0.0, 0.5])
 def test_errors_that_all_pairs_share_close(tmp_path, higher):
     """Of an image's correction, and of the heights: they have no part in the uncertainty."""

@@ -97,6 +97,7 @@ def test_intervals_become_standard_uncertainties(found):
     assert np.abs(px - np.rint(px)).max() < 1e-3 and px.min() == pytest.approx(2)
 
 
+@pytest.mark.slow
 def test_the_last_step_of_one_s_own_pipeline_tells_the_uncertainty(found, tmp_path):
     _, left, right = images()
     own = method(pipeline=with_confidence(tmp_path, "interval_bounds", "ambiguity"))
@@ -108,6 +109,7 @@ def test_the_last_step_of_one_s_own_pipeline_tells_the_uncertainty(found, tmp_pa
     assert none.with_uncertainty(left, right, RANGE)[1] is None
 
 
+@pytest.mark.slow
 def test_colour_is_matched_as_grey():
     _, left, right = images()
     eight = [(image >> 2).clip(1, 255).astype(np.uint8) for image in (left, right)]

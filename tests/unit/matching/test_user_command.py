@@ -97,6 +97,7 @@ def maps(folder):
     return {file.name: file.read_bytes() for file in sorted(Path(folder).glob("*.tiff"))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [{}, {"polarity": "positive", "outside": "invalid"}])
 @pytest.mark.parametrize("settings", [EACH, FILE], ids=["each", "file"])
 def test_a_program_around_sgm_gives_the_bytes_of_sgm(dataset, settings, moved):

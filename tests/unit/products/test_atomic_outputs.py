@@ -180,6 +180,7 @@ def test_a_block_of_an_input_that_was_replaced_has_no_record(here):
     assert not (here / "work/done").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_job_that_is_disturbed_at_random_moments_leaves_nothing_stale(here):
     root = Path(__file__).parents[3]

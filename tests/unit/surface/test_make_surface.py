@@ -86,6 +86,7 @@ def test_triangles_are_the_same_for_any_blocks(stores, tmp_path, monkeypatch):
         assert total == len(expected["facet"])  # each triangle once
 
 
+@pytest.mark.slow
 def test_bytes_are_the_same_for_any_groups_workers_and_order(stores, tmp_path):
     ways = {"a": (stores, 1, 1), "b": (stores[::-1], 3, 2), "c": (stores, 2, 16)}
     for name, (made_of, workers, at_once) in ways.items():
@@ -97,6 +98,7 @@ def test_bytes_are_the_same_for_any_groups_workers_and_order(stores, tmp_path):
     assert all(one["blocks"] == other["blocks"] for other in others)
 
 
+@pytest.mark.slow
 def test_finished_blocks_are_taken_over(stores, tmp_path, monkeypatch):
     def make(out, most):
         made, whole = [], module._Maker.make

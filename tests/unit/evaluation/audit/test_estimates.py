@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from stereotruth.evaluation.audit.estimates import Estimate, cells, location, ratio, robust_fit
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_promise():
     """Errors common to a cell: an interval that took the matches for independent would not hold."""
     rng = np.random.default_rng(5)

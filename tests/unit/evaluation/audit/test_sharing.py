@@ -33,6 +33,7 @@ def test_shared_ground(shift, angle):
         assert found.share == pytest.approx(1 - shift / 300, abs=0.02)
 
 
+@pytest.mark.slow
 def test_of_many_images_only_likely_pairs_are_compared(monkeypatch):
     monkeypatch.setattr(sharing, "ALL", 0)
     rng = np.random.default_rng(63)

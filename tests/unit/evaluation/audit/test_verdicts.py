@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from stereotruth.evaluation.audit.estimates import Estimate
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits, judge
@@ -26,6 +27,7 @@ def figures(bias, error, freedom=40):
     }
 
 
+@pytest.mark.slow
 def test_verdicts_have_the_error_rate_that_is_stated():
     """Biases at the very edge of what is tolerated, many datasets of 20 pairs."""
     rng = np.random.default_rng(62)

@@ -76,6 +76,7 @@ def test_an_exact_model_lies_where_it_is_and_has_the_points_noise(exact):
     assert exact["edges"]["missing_share"] == 0
 
 
+@pytest.mark.slow
 def test_a_shift_is_recovered_and_taken_out(judge, exact):
     found = judge(TOWN.heights(*SHIFT[:2]) + SHIFT[2], sigmas=True)
     for name, planted in zip(("east_m", "north_m", "up_m"), SHIFT):
@@ -101,6 +102,7 @@ def test_hills_without_roofs_tell_the_shift_too(judge):
         assert abs(found[name] - planted) < 5 * found[f"sigma_{name}"] + 0.01
 
 
+@pytest.mark.slow
 def test_a_blur_shows_at_the_edges_and_hardly_elsewhere(judge, exact):
     found = judge(gaussian_filter(TOWN.heights(), 1.0 / CELL_M))
     # of a sharp edge: the mean of |Φ⁻¹(p)| over p from 0.1 to 0.9; cells blur it a little more
@@ -111,6 +113,7 @@ def test_a_blur_shows_at_the_edges_and_hardly_elsewhere(judge, exact):
     assert abs(found["registration"]["east_m"]) < 0.05
 
 
+@pytest.mark.slow
 def test_wide_roofs_are_outward(judge):
     found = judge(TOWN.heights(wider_m=1.0))
     assert found["edges"]["outward_m"] == pytest.approx(1.0, abs=0.1)
@@ -128,6 +131,7 @@ def test_lost_roofs_are_missing_edges(judge, exact):
     assert edges["position_error_m"] == pytest.approx(exact["edges"]["position_error_m"], abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_tilt_is_told_and_stays(judge):
     x = (np.arange(round(SIDE / CELL_M)) + 0.5) * CELL_M
     found = judge(TOWN.heights() + 0.004 * (x - SIDE / 2))
@@ -136,6 +140,7 @@ def test_a_tilt_is_told_and_stays(judge):
     assert off(found) == pytest.approx(0.004 * SIDE / 4, abs=0.05)
 
 
+@pytest.mark.slow
 def test_holes_and_spikes_are_counted(judge):
     heights, rng = TOWN.heights(), np.random.default_rng(0)
     heights[100:220, 150:300] = np.nan
@@ -148,6 +153,7 @@ def test_holes_and_spikes_are_counted(judge):
     assert found["errors"][OPEN]["nmad_m"] < 0.05
 
 
+@pytest.mark.slow
 def test_trees_stand_apart(judge, exact):
     bare = Town().heights()  # as in winter
     found = judge(bare)
@@ -157,6 +163,7 @@ def test_trees_stand_apart(judge, exact):
     )
 
 
+@pytest.mark.slow
 def test_slopes_are_told(judge):
     steep = Town(boxes=0, hills_m=12.0)  # up to 12/17 of slope: 45 degrees and less
     errors = judge(steep.heights(), Points(steep))["errors"]
@@ -179,6 +186,7 @@ def test_a_geoid_left_out_is_a_shift_up(judge, tmp_path):
     assert abs(judge(orthometric, geoid=grid)["registration"]["up_m"]) < 0.01
 
 
+@pytest.mark.slow
 def test_a_reference_raster_serves_and_degrees_too(exact, tmp_path):
     """The model in degrees, by nearest neighbours; the reference in UTM, finer, unclassified."""
     n = round(SIDE / 0.4)

@@ -96,6 +96,7 @@ def test_an_interrupted_run_is_carried_on(dataset):
     assert read_disparity("out/KM_2.tiff")[1, 1] == 5 / 8
 
 
+@pytest.mark.slow
 def test_only_what_a_pair_is_made_of_has_it_matched_again(dataset):
     files = {"files": ["mine.py"]}
     run(dataset, **files)
@@ -190,6 +191,7 @@ def negative(left, right, disparity_range):
 """
 
 
+@pytest.mark.slow
 def test_uncertainties_are_kept_beside_the_disparities(dataset):
     Path("mine.py").write_text(UNCERTAIN)
     for moved in ({}, {"polarity": "positive"}):

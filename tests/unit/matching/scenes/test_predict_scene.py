@@ -129,6 +129,7 @@ def test_workers_of_a_dask_cluster_write_the_same_bytes(images, fresh, tmp_path)
     assert tree(tmp_path / "sgm.zarr") == tree(fresh)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop_after", [1, 4])
 def test_a_killed_job_goes_on_where_it_was(images, fresh, tmp_path, monkeypatch, stop_after):
     out = tmp_path / "sgm.zarr"

@@ -95,6 +95,7 @@ def test_every_program_opens_it(model, of_plane, tmp_path, program):
     assert np.abs(found - plane(*raster.ground(col, row)))[known].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_block_of_buildings_has_its_roofs_and_open_edges(model, tmp_path):
     """A flat roof of 40 m: heights of roof and ground right, nothing in between."""
 
