@@ -17,7 +17,7 @@ PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
-AT_ONCE := $(shell expr $(CORES) + 1)  # test processes: one of them waits for a server or a lock
+AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or a lock
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -58,7 +58,7 @@ test: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE) -m "not slow"
 
 test-all: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE)
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES)
 
 # Warnings are errors; links to what is not there are such.
 docs: $(READY)
@@ -68,7 +68,7 @@ networks: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
 
 test-s3: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py
