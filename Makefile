@@ -57,8 +57,8 @@ dataset verify: %: $(READY) FORCE
 test: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE) -m "not slow"
 
-test-all: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES)
+test-all: test
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) -m slow
 
 # Warnings are errors; links to what is not there are such.
 docs: $(READY)
