@@ -214,7 +214,7 @@ def _query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | No
 def _site_points(
     left: SensorModel, right: SensorModel, stores: Sequence[PointStore], site: Site
 ) -> SitePoints | None:
-    """The points of a site and MARGIN around it; None where there are none."""
+    """The points of a site and MARGIN around it; None where there are too few."""
     col0, row0 = site[:2]
     box = _query_box(left, right, site)
     if box is None:
