@@ -26,7 +26,7 @@ from .pixel_labels import Labels
 from .seen_surface import box_max
 from .shifted_agreement import SHIFTS_PX, shifted_agreement
 from .status import VEGETATION_CLASSES
-from .surface_means import apart_from_steps, left_and_warped, surface_mean
+from .surface_means import apart_from_steps, left_and_warped, surface_mean, surface_means
 from .young_crowns import beside_young_crowns
 
 Singles = NDArray[np.float32]
@@ -194,10 +194,8 @@ def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
     left, warped = compared.images
     known = (left != 0.0) & np.isfinite(warped)
     runs = wanted_runs(box_max(doubtful, NEAR_PX))
-    levels = [
-        surface_mean(np.where(known, image, np.nan), *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
-        for image in compared.images
-    ]
+    brightness = np.where(known, compared.images, np.nan)
+    levels = surface_means(brightness, *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
     down, across = np.gradient(left)
     variance = OFF_PX**2 * (down**2 + across**2) + OFF_SHARE**2 * left**2
     variance += sum(max(noise, ROUNDING) for noise in compared.noise)
@@ -214,20 +212,18 @@ def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
 def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
     """Contrast of both images, and how their ratio differs from that around [h, w]."""
     runs = wanted_runs(doubtful)
-
-    def mean(values: NDArray[np.floating], reach: int, every: int = 1) -> Singles:
-        return surface_mean(values, *compared.surface, reach, every, runs)
-
     left, warped = compared.images
     both = (left != 0.0) & (warped > 0.0)
     logarithms = [np.log(np.where(both, image, np.nan) / LEVEL) for image in (left, warped)]
-    levels = [mean(image, ALIKE_PX) for image in logarithms]
+    values = np.stack([*logarithms, *(image**2 for image in logarithms)])
+    means = surface_means(values, *compared.surface, ALIKE_PX, 1, runs)
     contrasts = []
-    for image, level, variance in zip(logarithms, levels, compared.noise):
-        spread = np.maximum(mean(image**2, ALIKE_PX) - level**2, 0.0)
+    for level, square, variance in zip(means[:2], means[2:], compared.noise):
+        spread = np.maximum(square - level**2, 0.0)
         contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
-    wide = mean(logarithms[0] - logarithms[1], GAIN_PX, GAIN_PX // 4)
-    return [*contrasts, np.abs(levels[0] - levels[1] - wide)]
+    ratio = logarithms[0] - logarithms[1]
+    wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
+    return [*contrasts, np.abs(means[0] - means[1] - wide)]
 
 
 def _from_step(clear: Bools) -> Singles:

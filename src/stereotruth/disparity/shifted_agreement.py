@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.surface_correlation import BLOCK, correlate, padded_columns, wanted_runs
 from ..epipolar.warping import value_in_row
-from ..kernels import kernel
+from ..kernels import inner, kernel
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
@@ -40,6 +40,7 @@ SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all sh
 INDEPENDENT_PX2 = 4.0
 Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
+AT_ONCE = 4  # shifts that are worked on together: which pixels count is the same for all
 TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
@@ -145,8 +146,8 @@ def _means(
         original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
         compared, wanted_runs(known), clear, level, slope,
     )  # fmt: skip
-    voters = Voters.of((rows, cols), reach, every)
-    of_shifts = np.array([*shifts, 0.0])
+    voters = Voters.of((AT_ONCE, rows, cols), reach, every)
+    of_shifts = np.array([0.0, *shifts])
     _means_at_shifts(
         part, window_px // 2, of_shifts, to_compare, voters, to_average, here, elsewhere, shifted
     )
@@ -175,28 +176,40 @@ class _Compared(NamedTuple):
     slope: Singles
 
 
+@inner
+def _right_values(part: _Compared, run: Steps, shift: float, at: Floats, value: Singles) -> None:
+    """Right image at the shifted disparity of a run, NaN for none, to ``value``; at columns
+    ``at``."""
+    y, x0, size = run[0], run[1], run[2] - run[1]
+    right, compared = part.right[:, : part.right_cols], part.compared[y, x0:]
+    for k in range(size):
+        at[k] = part.first[0] + (x0 + k) - (compared[k] + shift) - part.first[1]
+    for k in range(size):
+        value[k] = value_in_row(right, y, at[k])
+
+
 @kernel
 def _warp_shifted(
-    part: _Compared, shift: float, half: int, padded: Singles, known: Singles
+    part: _Compared, shifts: Floats, half: int, known: Singles, counted: Singles, warped: Singles
 ) -> None:
-    """Right image at the shifted disparity, and the disparities that count, to ``padded`` [3, h,
-    half + w or more] and ``known`` [h, w], as :func:`.correlate` takes them."""
-    none, right = np.float32(np.nan), part.right[:, : part.right_cols]
+    """Right image at the shifted disparities to ``warped`` [n, h, half + w or more], 0 for none.
+
+    Where the first of the ``shifts`` (px) is 0, the disparity of pixels with a match to ``known``
+    [h, w], and of those of them that count to ``counted`` [h, half + w or more].
+    """
+    none = np.float32(np.nan)
     at, value = np.empty(BLOCK), np.empty(BLOCK, np.float32)
     for run in part.runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
-        compared, level, clear = part.compared[y, x0:], part.level[y, x0:], part.clear[y, x0:]
-        for k in range(size):
-            at[k] = part.first[0] + (x0 + k) - (compared[k] + shift) - part.first[1]
-        for k in range(size):
-            value[k] = value_in_row(right, y, at[k])
-        warped, counted = padded[1, y, half + x0 :], padded[2, y, half + x0 :]
-        of_known = known[y, x0:]
-        for k in range(size):
-            has_value = np.isfinite(value[k])
-            of_known[k] = level[k] if has_value else none
-            warped[k] = value[k] if has_value else np.float32(0.0)
-            counted[k] = level[k] if has_value and clear[k] else none
+        for n in range(shifts.size):
+            _right_values(part, run, shifts[n], at, value)
+            if shifts[n] == 0.0:
+                for k in range(size):
+                    level = part.level[y, x0 + k] if np.isfinite(value[k]) else none
+                    known[y, x0 + k] = level
+                    counted[y, half + x0 + k] = level if part.clear[y, x0 + k] else none
+            for k in range(size):
+                warped[n, y, half + x0 + k] = value[k] if np.isfinite(value[k]) else 0.0
 
 
 @kernel
@@ -211,30 +224,39 @@ def _means_at_shifts(
     elsewhere: Singles,
     shifted: Singles,
 ) -> None:
-    """Mean correlation at the last of the ``shifts`` (px) to ``here``; the greatest at the others
-    to ``elsewhere``, and which one that is to ``shifted`` [h, w]."""
+    """Mean correlation at the first of the ``shifts``, which is 0 px, to ``here``; the greatest at
+    the others to ``elsewhere``, and which one that is to ``shifted`` [h, w].
+
+    What has a match counts at all shifts. Where the right image ends it has no detail.
+    """
     rows, cols = part.left.shape
-    padded = np.empty((3, rows, padded_columns(cols, half)), np.float32)
-    known, correlation, expected = np.empty((3, rows, cols), np.float32)
-    padded[0], padded[1], padded[2], known[:] = 0.0, 0.0, np.nan, np.nan
-    padded[0, :, half : half + cols] = part.left
-    last = shifts.size - 1
-    for n in range(last + 1):
-        _warp_shifted(part, shifts[n], half, padded, known)
+    wide = padded_columns(cols, half)
+    left, warped = np.zeros((rows, wide), np.float32), np.zeros((AT_ONCE, rows, wide), np.float32)
+    counted, known = np.empty((rows, wide), np.float32), np.empty((rows, cols), np.float32)
+    counted[:], known[:] = np.nan, np.nan
+    left[:, half : half + cols] = part.left
+    correlation, mean = np.empty((2, AT_ONCE, rows, cols), np.float32)
+    expected = np.empty((rows, cols), np.float32)
+    for first in range(0, shifts.size, AT_ONCE):
+        several = shifts[first : first + AT_ONCE]
+        n = several.size
+        _warp_shifted(part, several, half, known, counted, warped[:n])
         correlate(
-            padded[0], padded[1], known, padded[2], part.slope, half, (0.0, 0.0), to_compare,
-            correlation, expected,
+            left, warped[:n], known, counted, part.slope, half, (0.0, 0.0), to_compare,
+            correlation[:n], expected,
         )  # fmt: skip
-        fill_voters(correlation, part.level, voters)
-        mean_of_runs(part.level, part.slope, voters, to_average, here)
-        if n == last:
-            return
+        few = Voters(voters.value[:n], voters.disparity, voters.reach, voters.every)
+        fill_voters(correlation[:n], part.level, few)
+        mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
         for run in to_average:
             y = run[0]
-            for x in range(run[1], run[2]):
-                best = elsewhere[y, x]
-                if here[y, x] > best or (np.isnan(best) and not np.isnan(here[y, x])):
-                    elsewhere[y, x], shifted[y, x] = here[y, x], shifts[n]
+            for k in range(n):
+                for x in range(run[1], run[2]):
+                    if first + k == 0:
+                        here[y, x] = mean[k, y, x]
+                    elif np.isnan(elsewhere[y, x]) or mean[k, y, x] > elsewhere[y, x]:
+                        elsewhere[y, x] = mean[k, y, x]
+                        shifted[y, x] = np.nan if np.isnan(mean[k, y, x]) else several[k]
 
 
 def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:

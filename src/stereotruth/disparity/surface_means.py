@@ -62,10 +62,11 @@ def apart_from_steps(disparity: Floats) -> Bools:
 
 
 class Voters(NamedTuple):
-    """Pixels that have a say in the means of others: arrays [h, w] with ``reach`` columns more on
-    the left, and ``reach`` + 2 ``every`` on the right, in which none has.
+    """Pixels that have a say in the means of others, in several images.
 
-    ``value``: 0 for none; ``disparity`` of those that have one, else NaN.
+    Arrays with ``reach`` columns more on the left, and ``reach`` + 2 ``every`` on the right, in
+    which none has. ``value`` [n, h, w] in each image, 0 for none; ``disparity`` [h, w] of those
+    that have one, else NaN.
     """
 
     value: Singles
@@ -74,22 +75,24 @@ class Voters(NamedTuple):
     every: int
 
     @classmethod
-    def of(cls, shape: tuple[int, int], reach: int, every: int) -> Voters:
+    def of(cls, shape: tuple[int, int, int], reach: int, every: int) -> Voters:
         """None yet. Of pixels up to ``reach`` px off one of so many (``every``) votes."""
-        wide = shape[0], shape[1] + 2 * (reach + every)
-        return cls(np.zeros(wide, np.float32), np.full(wide, np.nan, np.float32), reach, every)
+        wide = shape[1], shape[2] + 2 * (reach + every)
+        value = np.zeros((shape[0], *wide), np.float32)
+        return cls(value, np.full(wide, np.nan, np.float32), reach, every)
 
 
 @kernel
 def fill_voters(values: NDArray, disparity: Singles, voters: Voters) -> None:
-    """Fills the ``voters`` with the ``values`` [h, w] of pixels and their disparity."""
+    """Fills the ``voters`` with the ``values`` [n, h, w] of pixels and their disparity. Who has a
+    value in one image has one in all."""
     reach = voters.reach
     for y in range(disparity.shape[0]):
         for x in range(disparity.shape[1]):
-            value = values[y, x]
-            has_value = np.isfinite(value)
-            voters.value[y, reach + x] = value if has_value else 0.0
+            has_value = np.isfinite(values[0, y, x])
             voters.disparity[y, reach + x] = disparity[y, x] if has_value else np.float32(np.nan)
+            for n in range(len(values)):
+                voters.value[n, y, reach + x] = values[n, y, x] if has_value else 0.0
 
 
 @inner
@@ -102,17 +105,19 @@ def _tolerance_up_to(down: int, across: int, reach: int) -> float:
 def mean_of_runs(
     disparity: Singles, slope: Singles, voters: Voters, runs: Steps, out: Singles
 ) -> None:
-    """Mean of the ``voters`` on the surface of each pixel of ``runs``; NaN outside of these."""
-    rows = len(disparity)
+    """Means [n, h, w] of the ``voters`` on the surface of each pixel of ``runs``; NaN outside of
+    these."""
+    rows, last = len(disparity), len(voters.value) - 1
     reach, every = voters.reach, voters.every
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
-    sums = np.empty(2 * BLOCK, np.float32)
+    sums = np.empty(5 * BLOCK, np.float32)  # of the first image, and then which voters count
+    others = np.empty((last, BLOCK), np.float32)
     zero = np.float32(0.0)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        sums[:] = zero
+        sums[: 2 * BLOCK], others[:] = zero, zero
         for step_down in range(-reach, reach + 1, every):
             b = y + step_down
             if b < 0 or b >= rows:
@@ -127,7 +132,7 @@ def mean_of_runs(
                     _tolerance_up_to(step_down, third, reach),
                 )
                 at = reach + x0 + step
-                d, v = voters.disparity[b, at:], voters.value[b, at:]
+                d, v = voters.disparity[b, at:], voters.value[0, b, at:]
                 dd, vv = d[every:], v[every:]
                 ddd, vvv = dd[every:], vv[every:]
                 p, s = surface, sums
@@ -138,8 +143,18 @@ def mean_of_runs(
                     g = is_near(ddd[k], level + across[2] * along + rise, limit[2])
                     s[k] = s[k] + e + f + g
                     s[BLOCK + k] = s[BLOCK + k] + e * v[k] + f * vv[k] + g * vvv[k]
+                    s[2 * BLOCK + k], s[3 * BLOCK + k], s[4 * BLOCK + k] = e, f, g
+                for n in range(last):
+                    o, v = others[n], voters.value[n + 1, b, at:]
+                    vv = v[every:]
+                    vvv = vv[every:]
+                    for k in range(size):
+                        e, f, g = s[2 * BLOCK + k], s[3 * BLOCK + k], s[4 * BLOCK + k]
+                        o[k] = o[k] + e * v[k] + f * vv[k] + g * vvv[k]
         for k in range(size):
-            out[y, x0 + k] = sums[BLOCK + k] / sums[k]
+            out[0, y, x0 + k] = sums[BLOCK + k] / sums[k]
+            for n in range(last):
+                out[n + 1, y, x0 + k] = others[n, k] / sums[k]
 
 
 def surface_mean(
@@ -156,9 +171,22 @@ def surface_mean(
     ``reach`` px off count, one of so many (``every``) along each axis, if they have a value. Of the
     pixels of ``runs`` (:func:`.wanted_runs`) alone where these are given.
     """
+    return surface_means(values[None], disparity, slope, reach, every, runs)[0]
+
+
+def surface_means(
+    values: NDArray[np.floating],
+    disparity: NDArray[np.floating],
+    slope: NDArray[np.floating],
+    reach: int,
+    every: int,
+    runs: Steps | None = None,
+) -> Singles:
+    """:func:`surface_mean` of several images' ``values`` [n, h, w]: NaN in all of them or in
+    none."""
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     slope = np.ascontiguousarray(slope, dtype=np.float32)
-    voters, out = Voters.of(disparity.shape, reach, every), np.empty(disparity.shape, np.float32)
+    voters, out = Voters.of(values.shape, reach, every), np.empty(values.shape, np.float32)
     fill_voters(values, disparity, voters)
     if runs is None:
         runs = wanted_runs(np.isfinite(disparity))

@@ -110,25 +110,30 @@ def correlate(
     out: Singles,
     expected: Singles,
 ) -> None:
-    """:func:`correlation_and_expected`, of the pixels of ``runs``; outside of these all is NaN.
+    """Correlation of the ``left`` image with each of several ``warped`` [n, h, w], to ``out`` [n,
+    h, w], of the pixels of ``runs``; outside of these all is NaN. ``expected`` [h, w]: of the
+    first, see :func:`correlation_and_expected`.
 
     ``counted``: disparity of the pixels that count, else NaN; ``noise``: variances of both images.
     ``left``, ``warped`` and ``counted`` have columns more in which nothing counts: ``half`` on the
     left, see :func:`padded_columns`.
     """
-    rows = len(left)
+    rows, last = len(left), len(warped) - 1
     out[:], expected[:] = np.nan, np.nan
     surface = np.empty(3 * BLOCK, np.float32)
-    centre = np.empty(2 * BLOCK, np.float32)
-    sums = np.empty(6 * BLOCK, np.float32)
+    centre = np.empty((last + 1, 2 * BLOCK), np.float32)
+    # of the first image, and then which neighbours count, and by how much they differ on the left
+    sums = np.empty(12 * BLOCK, np.float32)
+    others = np.empty((last, 6 * BLOCK), np.float32)
     zero = np.float32(0.0)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        centre[:size] = left[y, half + x0 : half + x0 + size]
-        centre[BLOCK : BLOCK + size] = warped[y, half + x0 : half + x0 + size]
+        for n in range(last + 1):
+            centre[n, :size] = left[y, half + x0 : half + x0 + size]
+            centre[n, BLOCK : BLOCK + size] = warped[n, y, half + x0 : half + x0 + size]
         whole = (size + REGISTER - 1) // REGISTER * REGISTER
-        sums[:] = zero
+        sums[: 6 * BLOCK], others[:] = zero, zero
         for b in range(max(y - half, 0), min(y + half + 1, rows)):
             down = np.float32(b - y)
             for step in range(-half, half + 1, TOGETHER):
@@ -139,8 +144,8 @@ def correlate(
                     _tolerance_within(b - y, step + 2, half),
                 )
                 at = half + x0 + step
-                d, uu, vv = counted[b, at:], left[b, at:], warped[b, at:]
-                p, c, s = surface, centre, sums
+                d, uu, vv = counted[b, at:], left[b, at:], warped[0, b, at:]
+                p, c, s = surface, centre[0], sums
                 for k in range(whole):
                     level, along, rise = p[k], p[BLOCK + k], down * p[2 * BLOCK + k]
                     e = is_near(d[k], level + across[0] * along + rise, limit[0])
@@ -155,22 +160,39 @@ def correlate(
                     s[3 * BLOCK + k] = s[3 * BLOCK + k] + ue * ue + uf * uf + ug * ug
                     s[4 * BLOCK + k] = s[4 * BLOCK + k] + ve * ve + vf * vf + vg * vg
                     s[5 * BLOCK + k] = s[5 * BLOCK + k] + ue * ve + uf * vf + ug * vg
+                    s[6 * BLOCK + k], s[7 * BLOCK + k], s[8 * BLOCK + k] = e, f, g
+                    s[9 * BLOCK + k], s[10 * BLOCK + k], s[11 * BLOCK + k] = ue, uf, ug
+                for n in range(last):
+                    vv, c, o = warped[n + 1, b, at:], centre[n + 1], others[n]
+                    for k in range(whole):
+                        ve = (vv[k] - c[BLOCK + k]) * s[6 * BLOCK + k]
+                        vf = (vv[k + 1] - c[BLOCK + k]) * s[7 * BLOCK + k]
+                        vg = (vv[k + 2] - c[BLOCK + k]) * s[8 * BLOCK + k]
+                        ue, uf, ug = s[9 * BLOCK + k], s[10 * BLOCK + k], s[11 * BLOCK + k]
+                        o[2 * BLOCK + k] = o[2 * BLOCK + k] + ve + vf + vg
+                        o[4 * BLOCK + k] = o[4 * BLOCK + k] + ve * ve + vf * vf + vg * vg
+                        o[5 * BLOCK + k] = o[5 * BLOCK + k] + ue * ve + uf * vf + ug * vg
         for k in range(size):
-            n = sums[k]
+            count = sums[k]
             # A few pixels correlate by chance: they neither agree nor disagree.
-            expected[y, x0 + k] = np.nan
-            if n < 2 * half + 1:
-                out[y, x0 + k] = np.nan
+            if count < 2 * half + 1:
                 continue
             suu, svv, suv = about_means(sums, k)
-            out[y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
-            here, there = noise[0] * (n - 1), noise[1] * (n - 1)
+            out[0, y, x0 + k] = suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
+            here, there = noise[0] * (count - 1), noise[1] * (count - 1)
             signal = max(suu * there, svv * here) - here * there  # of that with more texture
             share = signal / (signal + here * there) if signal > 0 else 0.0
             if here * there == 0.0:
                 share = 1.0
-            if share * np.sqrt(n) >= DECIDED:
+            if share * np.sqrt(count) >= DECIDED:
                 expected[y, x0 + k] = share
+            for n in range(last):
+                o = others[n]
+                o[k], o[BLOCK + k], o[3 * BLOCK + k] = count, sums[BLOCK + k], sums[3 * BLOCK + k]
+                suu, svv, suv = about_means(o, k)
+                out[n + 1, y, x0 + k] = (
+                    suv / np.sqrt(suu * svv) if suu > zero and svv > zero else zero
+                )
 
 
 @inner
@@ -246,13 +268,15 @@ def correlation_and_expected(
     if clear is None:
         clear = np.ones(left.shape, np.bool_)
     rows, cols = left.shape
-    known, out, expected = np.empty((3, rows, cols), np.float32)
+    known, expected = np.empty((2, rows, cols), np.float32)
+    out = np.empty((1, rows, cols), np.float32)
     half = window // 2
     padded = np.empty((3, rows, padded_columns(cols, half)), np.float32)
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     _as_compared(left, warped, disparity, clear, half, padded, known)
     correlate(
-        *padded[:2],
+        padded[0],
+        padded[1:2],
         known,
         padded[2],
         np.ascontiguousarray(slope, dtype=np.float32),
@@ -262,4 +286,4 @@ def correlation_and_expected(
         out,
         expected,
     )
-    return out, expected
+    return out[0], expected

@@ -8,8 +8,12 @@ import pytest
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
-from stereotruth.disparity.shifted_agreement import ShiftedAgreement, shifted_agreement
-from stereotruth.disparity.surface_means import surface_mean
+from stereotruth.disparity.shifted_agreement import (
+    SHIFTS_PX,
+    ShiftedAgreement,
+    shifted_agreement,
+)
+from stereotruth.disparity.surface_means import apart_from_steps, surface_mean, surface_means
 from stereotruth.epipolar.surface_correlation import BLOCK, surface_correlation, wanted_runs
 
 from ...synthetic.textured_fields import (
@@ -166,3 +170,31 @@ def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
     assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
     same = Comparison(9, (0.0, 0.0))
     assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0
+
+
+def test_means_of_images_together_are_those_of_each():
+    rng, shape = np.random.default_rng(4), (40, 300)
+    values = rng.normal(size=(5, *shape))
+    values[:, rng.uniform(size=shape) < 0.1] = np.nan
+    surface = rng.normal(scale=0.5, size=shape), rng.normal(scale=0.1, size=(2, *shape))
+    together = surface_means(values, *surface, 6, 2)
+    for one, image in zip(together, values):
+        assert np.array_equal(one, surface_mean(image, *surface, 6, 2), equal_nan=True)
+
+
+def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:
+    """Means over the surface of what :func:`surface_correlation` says of each shift by itself."""
+    window = grown(3)
+    left, right = (detail.patch for detail in window.details((0.0, 0.0)))
+    (top, side), (rows, cols) = window.first, SHAPE
+    own = left.pixels[top - left.row :, side - left.col :][:rows, :cols]
+    surface = LEVEL.disparity, LEVEL.slope
+    clear = apart_from_steps(LEVEL.disparity)
+    found, means = at(window), []
+    for shift in (0, *map(int, SHIFTS_PX)):
+        there = right.pixels[top - right.row :, side - 4 - shift - right.col :][:rows, :cols]
+        alone = surface_correlation(own, there, *surface, 9, clear)
+        means.append(surface_mean(alone, *surface, 8, 2))
+    inside = np.s_[30:-30, 30:-30]
+    assert np.allclose(found.here[inside], means[0][inside], atol=1e-5)
+    assert np.allclose(found.elsewhere[inside], np.max(means[1:], axis=0)[inside], atol=1e-5)
