@@ -96,10 +96,12 @@ def alone(folder: Path) -> Path:
 
 
 def label(folder: Path, city: str, scenes: Sequence[str]) -> None:
-    """Label pairs, with a record of the jobs that open LiDAR files, and of what each takes
-    (:data:`TRACE`)."""
+    """Label pairs, from nothing but the data, with a record of the jobs that open LiDAR files, and
+    of what each takes (:data:`TRACE`)."""
     trace = folder / "trace"
-    trace.mkdir(exist_ok=True)
+    for earlier in (trace, folder / "results"):
+        shutil.rmtree(earlier, ignore_errors=True)
+    trace.mkdir()
     files = {name: str(trace / f"{name}.txt") for name in ("opened", "spent")}
     (trace / "sitecustomize.py").write_text(TRACE.format(**files), "utf-8")
     paths = filter(None, [str(trace), os.environ.get("PYTHONPATH")])
