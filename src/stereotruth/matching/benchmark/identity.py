@@ -7,6 +7,7 @@ import platform
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import Distribution, distribution, packages_distributions
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ import psutil
 
 from ...errors import InputError
 from ...products.provenance import file_sha256
-from ..kinds import names_of, place_of
+from ..kinds import MCCNN, names_of, place_of
 
 GIB = 1 << 30
-INSTALLED = {"sgm": "cv2", "pandora": "pandora"}  # packages that kinds are made of
+INSTALLED = {"sgm": ["cv2"], "pandora": ["pandora"]}  # packages that kinds are made of,
+OF_PIPELINE = {MCCNN: ["mc_cnn"]}  # and pipelines of Pandora
+LICENCES = {"pandora": "Apache License 2.0"}  # of distributions whose files do not state it
 
 
 def identity(
@@ -26,16 +29,17 @@ def identity(
 ) -> dict[str, Any]:
     """Licence, version and checksums of a method, from its configuration entry.
 
-    ``licence`` and ``version``: as the entry states them, else those of the installed distribution
-    that holds SGM, Pandora or the user's function, else None. ``files``: SHA-256 of the method's
-    files by name (weights, the user's code). ``code``: digest of this package's code that runs it.
+    ``licence`` and ``version``: as the entry states them, else those of the installed distributions
+    that hold SGM, Pandora, MC-CNN or the user's function, else None. ``files``: SHA-256 of the
+    method's files by name (weights, the user's code). ``code``: digest of this package's code that
+    runs it.
     """
-    found = _distribution(settings)
-    licence = settings.get("licence") or (found and _licence(found))
-    version = settings.get("version") or (found and f"{found.name} {found.version}")
+    found = _distributions(settings)
+    licences = dict.fromkeys(filter(None, map(_licence, found)))
+    versions = (f"{one.name} {one.version}" for one in found)
     return {
-        "licence": licence or None,
-        "version": version or None,
+        "licence": settings.get("licence") or ", ".join(licences) or None,
+        "version": settings.get("version") or ", ".join(versions) or None,
         "files": {name: file_sha256(path) for name, path in names_of([*map(Path, files)]).items()},
         "code": code or None,
     }
@@ -63,27 +67,34 @@ def _processor() -> str:
     return named[1].strip() if named else platform.processor() or platform.machine()
 
 
-def _distribution(settings: Mapping[str, Any]) -> Distribution | None:
-    """The installed one that SGM, Pandora or the user's function comes from."""
+def _distributions(settings: Mapping[str, Any]) -> list[Distribution]:
+    """The installed ones that SGM, Pandora and its pipeline, or the user's function come from."""
+    tops: list[str] = []
     if settings["kind"] in INSTALLED:
-        top = INSTALLED[settings["kind"]]
+        tops = INSTALLED[settings["kind"]] + OF_PIPELINE.get(settings.get("pipeline") or "", [])
     elif settings["kind"] == "function":
-        try:
+        with suppress(InputError):
             place, _ = place_of(settings["function"])
-        except InputError:
-            return None
-        top = "" if place.endswith(".py") else place.partition(".")[0]
-    else:
-        return None
-    names = packages_distributions().get(top)
-    return distribution(names[0]) if names else None
+            tops = [] if place.endswith(".py") else [place.partition(".")[0]]
+    names = packages_distributions()
+    return [distribution(names[top][0]) for top in tops if top in names]
 
 
 def _licence(found: Distribution) -> str | None:
     about = found.metadata
-    for key in ("License-Expression", "License"):
-        # some put the whole text there
-        if (text := (about.get(key) or "").strip()) and "\n" not in text:
-            return text
-    named = [c for c in about.get_all("Classifier") or () if c.startswith("License ::")]
-    return named[0].rpartition(" :: ")[2] if named else None
+    stated = [about.get(key) or "" for key in ("License-Expression", "License")]
+    named = [
+        c.rpartition(" :: ")[2] for c in about.get_all("Classifier") or () if "License ::" in c
+    ]
+    names = [text.strip() for text in stated if "\n" not in text.strip()]
+    titles = [_title(text) for text in stated]  # some put the whole text there
+    return next(filter(None, [*names, *named, *titles]), LICENCES.get(found.name))
+
+
+def _title(text: str) -> str:
+    """Name of a licence, where its text begins with that."""
+    first, second, *_ = [*(line.strip() for line in text.splitlines() if line.strip()), "", ""]
+    if "license" not in first.casefold():
+        return ""
+    version = re.match(r"Version ([\d.]+)", second)
+    return f"{first} {version[1]}" if version else first

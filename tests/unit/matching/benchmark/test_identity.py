@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from importlib.metadata import version
+from email.message import Message
+from importlib.metadata import PathDistribution, version
 
 import psutil
 import pytest
 
-from stereotruth.matching.benchmark.identity import identity, machine
+from stereotruth.matching.benchmark.identity import _licence, identity, machine
 
 
 def test_sgm_is_that_of_opencv():
@@ -24,6 +25,33 @@ def test_a_function_is_of_its_distribution(tmp_path):
     assert found["version"] == f"scipy {version('scipy')}" and "BSD" in found["licence"]
     of_a_file = identity({"kind": "function", "function": "mine.py:f"})
     assert of_a_file["version"] is of_a_file["licence"] is of_a_file["code"] is None
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("MIT\n", "MIT"),
+        ("\n   Apache License\n  Version 2.0, January 2004\n\nTERMS", "Apache License 2.0"),
+        ("BSD 3-Clause License\n\nCopyright (c) somebody", "BSD 3-Clause License"),
+        ("Copyright (c) somebody\n\nRedistribution and use", None),
+        ("", None),
+    ],
+)
+def test_a_licence_has_the_name_that_its_text_begins_with(tmp_path, monkeypatch, text, name):
+    about = Message()
+    about["Name"], about["License"] = "theirs", text
+    monkeypatch.setattr(PathDistribution, "metadata", about)
+    assert _licence(PathDistribution(tmp_path)) == name
+
+
+@pytest.mark.parametrize("pipeline", [None, "mccnn"])
+def test_pandora_has_its_licence_and_that_of_its_weights(pipeline):
+    pytest.importorskip("pandora", reason="needs the extra pandora")
+    if pipeline:
+        pytest.importorskip("mc_cnn", reason="needs the extra mccnn")
+    found = identity({"kind": "pandora", "pipeline": pipeline})
+    assert found["version"].startswith("pandora ") and "Apache" in found["licence"]
+    assert ("mccnn" in found["version"].casefold()) == bool(pipeline)
 
 
 @pytest.mark.parametrize("kind", ["command", "stereonet", "sgm", "folder"])
