@@ -66,7 +66,7 @@ def labelled(
     model = EpipolarModel.load(rectified / "epipolar.json")
     block = Block(pair, rectified, *(slice(0, side) for side in model.shape))
     area = pixel_m2(model)
-    densities = [d for d in asked if d < block.density] + [block.density]
+    densities = [min(d, block.density) for d in asked]
     found: dict[str, list[float]] = {"points_per_px": [round(d * area, 3) for d in densities]}
     visible, took = block.truth.groups()["visible"], []
     for recipe in RECIPES:
@@ -146,15 +146,23 @@ def main() -> None:
     """Measure, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=PROJECT / "bench/out/estimates")
-    parser.add_argument("--city", type=int, default=1, help="number of the fresh city")
+    parser.add_argument(
+        "--cities",
+        type=int,
+        nargs="+",
+        default=[1, 2, 3],
+        help="numbers of the fresh cities; times are of the first, labels of all",
+    )
     parser.add_argument("--densities", type=float, nargs="+", default=DENSITIES)
     parser.add_argument("--out", type=Path, default=TABLE)
     arguments = parser.parse_args()
-    pair = fresh_pair(arguments.city, arguments.folder)
-    folder = arguments.folder / "made"
-    table = rounded(measured(pair, folder, arguments.densities)) | {
-        "measured_by": "python bench/estimates.py"
-    }
+    of_cities = []
+    for city in arguments.cities:
+        pair = fresh_pair(city, arguments.folder)
+        of_cities.append(measured(pair, arguments.folder / f"made_{city}", arguments.densities))
+    labels = [of["labelled"] for of in of_cities]
+    mean = {name: np.mean([of[name] for of in labels], axis=0).tolist() for name in labels[0]}
+    table = rounded(of_cities[0] | {"labelled": mean})
     arguments.out.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
     print(arguments.out.read_text())
 
