@@ -30,6 +30,7 @@ from stereotruth.dataset.windows import scan_scene
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import is_labelled
 from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.evaluation.labels_against_truth import WATER
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.grids import open_grid
@@ -63,7 +64,7 @@ def labelled(
     """Share of the visible pixels with a label by density and recipe, and what labels take.
 
     That is seconds for each pixel and for each point. In the middle of the grid, all of which both
-    images show and LiDAR covers.
+    images show and LiDAR covers; water, which has no labels, does not count.
     """
     model = EpipolarModel.load(rectified / "epipolar.json")
     starts = ((side - MIDDLE_PX) // 2 for side in model.shape)
@@ -71,7 +72,7 @@ def labelled(
     area = pixel_m2(model)
     densities = [min(d, block.density) for d in asked]
     found: dict[str, list[float]] = {"points_per_px": [round(d * area, 3) for d in densities]}
-    visible, took = block.truth.groups()["visible"], []
+    visible, took = block.truth.groups()["visible"] & (block.truth.kind != WATER), []
     for recipe in RECIPES:
         shares = []
         for density in densities:
