@@ -1,4 +1,4 @@
-"""What runs take and how many pixels get a label, as bench/estimates.py has measured it."""
+"""What runs take and how many pixels get a label, as benchmarks have measured it."""
 
 from __future__ import annotations
 
