@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -79,9 +78,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     local, slurm = (
         project_with_two_cities(folder / k, folder / "data") for k in ("local", "slurm")
     )
-    run = local.snakemake(*CALL)
-    assert run.status == 0, run.text[-4000:]
-
     slurm.edit(
         "profiles/slurm/config.yaml",
         "project:\n    mem_mb: 4300 * attempt",
@@ -90,10 +86,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     config = slurm.folder / "two.yaml"
     config.write_text(config.read_text() + "strips: {East-1: 2}\n")
     lost: list[Job] = []
-    killer = threading.Thread(target=lose_a_node, args=(slurm, lost))
-    killer.start()
-    run = slurm.snakemake(*CALL, *SLURM)
-    killer.join(60)
+    with ThreadPoolExecutor(2) as pool:  # while SLURM waits this machine works
+        locally = pool.submit(local.snakemake, *CALL)
+        killing = pool.submit(lose_a_node, slurm, lost)
+        run = slurm.snakemake(*CALL, *SLURM, as_users_do=True)
+        killing.result(60)
+        assert locally.result().status == 0, locally.result().text[-4000:]
     assert run.status == 0, run.text[-8000:]
     assert lost, "no strip of project was seen at work"
     start_node(lost[0].node)
@@ -176,7 +174,7 @@ def test_two_pairs_of_a_site_run_on_two_nodes_after_one_surface(runs: Runs, tmp_
     turned = {"left_image": one["right_image"], "right_image": one["left_image"], "gcps": ""}
     project.add_scene("site", [one, one | turned | {"scene": "Site-2"}], **SIZE)
     grids = [f"results/project/Site/Site-{k}.zarr" for k in (1, 2)]
-    run = project.snakemake(*grids, "--configfile", "site.yaml", *SLURM)
+    run = project.snakemake(*grids, "--configfile", "site.yaml", *SLURM, as_users_do=True)
     assert run.status == 0, run.text[-8000:]
 
     made = [job for job in jobs() if job.number not in earlier]

@@ -10,6 +10,7 @@ import atexit
 import json
 import os
 import selectors
+import signal
 import socket
 import subprocess
 import sys
@@ -37,7 +38,11 @@ class Fork:
         """Its exit status if it has ended; 1 if what forked it has ended before."""
         return self._end() if self.returncode is None and self._ready.select(0) else self.returncode
 
-    def wait(self) -> int:
+    def wait(self, seconds: float | None = None) -> int:
+        """Its exit status; raises TimeoutError, and ends its session, after so many seconds."""
+        if self.returncode is None and not self._ready.select(seconds):
+            os.killpg(self.pid, signal.SIGKILL)
+            raise TimeoutError(f"process {self.pid} is at work after {seconds:.0f} s")
         return self._end() if self.returncode is None else self.returncode
 
     def _end(self) -> int:
@@ -124,11 +129,25 @@ def _tell(told: int, number: int) -> None:
         os.write(told, f"{number}\n".encode())
 
 
+def _let_go_of_files() -> None:
+    """Put nothing in the place of all open files but the streams.
+
+    Their numbers stay taken: a library closes what it has opened (PROJ its database, as soon as it
+    sees the fork), and no other file may be meant by that.
+    """
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for number in map(int, os.listdir("/dev/fd")):
+        if number > 2:
+            with suppress(OSError):  # that of the list itself
+                os.fstat(number)
+                os.dup2(nothing, number)
+
+
 def _do(act: Act, call: bytes) -> None:
     """Do what a call says, as a program that begins would: with no files but its streams."""
     status = 1
     try:
-        os.closerange(3, 4096)
+        _let_go_of_files()
         act(json.loads(call))
         status = 0
     except SystemExit as end:

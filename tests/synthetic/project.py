@@ -15,7 +15,8 @@ from stereotruth.command.example_city import DEMO
 from stereotruth.simulate.__main__ import make_scene
 from stereotruth.simulate.cities import SceneSpec
 
-from .forked_snakemake import planner, start_snakemake
+from .forked_snakemake import planner, runner, start_snakemake
+from .forks import Forker
 
 ROOT = Path(__file__).parents[2]
 SHEET_COLUMNS = [
@@ -37,6 +38,7 @@ TINY = replace(
     ),
 )
 MADE = ("results", "tiles", "dataset", "logs", ".snakemake")  # of a run
+MOST_S = 900.0  # that a run takes
 SIZE = {"tiles": {"size": 128, "min_labelled": 0.5}}
 
 
@@ -67,37 +69,45 @@ class Project:
     folder: Path
     edited: bool = False
 
-    def snakemake(self, *arguments: str, cores: int = 2) -> Run:
+    def snakemake(self, *arguments: str, cores: int = 2, as_users_do: bool = False) -> Run:
+        """A call of Snakemake, whose jobs are forks.
+
+        ``as_users_do``: a program of its own, and one for each job, in this process' environment.
+        """
+        call = ["--cores", str(cores), *arguments]
         environment = dict(os.environ)
         if self.edited:
             environment["PYTHONPATH"] = str(self.folder / "src")
             environment.pop("NUMBA_CACHE_DIR", None)
         if {"--dry-run", "--touch"} & set(arguments):
-            return self._ask(["--cores", str(cores), *arguments], environment)
+            return self._ask(planner(), call, environment)
+        if not (as_users_do or self.edited):
+            return self._ask(runner(), call, environment)
         done = subprocess.run(
-            [sys.executable, "-m", "snakemake", "--cores", str(cores), *arguments],
+            [sys.executable, "-m", "snakemake", *call],
             cwd=self.folder,
             env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=900,
+            timeout=MOST_S,
         )
         return Run(done.returncode, done.stdout)
 
-    def _ask(self, arguments: list[str], environment: dict[str, str]) -> Run:
-        status = start_snakemake(planner(), self.folder, arguments, "plan.log", environment).wait()
-        return Run(status, (self.folder / "plan.log").read_text())
+    def _ask(self, forker: Forker, call: list[str], environment: dict[str, str]) -> Run:
+        run = start_snakemake(forker, self.folder, call, "said.log", environment)
+        status = run.wait(MOST_S)
+        return Run(status, (self.folder / "said.log").read_text())
 
     def rest(self, *arguments: str) -> Run:
         """A call for what is there already, which ends before any job."""
-        run = self._ask(["--cores", "2", *arguments], dict(os.environ))
+        run = self._ask(planner(), ["--cores", "2", *arguments], dict(os.environ))
         assert run.status == 0 and "Nothing to be done" in run.text, run.text
         return run
 
     def refuse(self, *arguments: str) -> Run:
         """A call for work that ends before any job."""
-        run = self._ask(["--cores", "2", *arguments], dict(os.environ))
+        run = self._ask(planner(), ["--cores", "2", *arguments], dict(os.environ))
         assert run.status != 0 and "Job stats" not in run.text, run.text
         return run
 

@@ -73,7 +73,7 @@ def made(data, once, tmp_path_factory) -> Project:
         shutil.copytree(data, project.folder / "in")
         project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
         with without_utf8():
-            run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
+            run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml", as_users_do=True)
         assert run.status == 0, run.text[-4000:]
         assert "Look at tiles/Tiny/manifest.csv" in run.text
         assert "UnicodeEncodeError" not in run.text
@@ -139,7 +139,7 @@ def later(tiled, once, tmp_path_factory) -> Project:
     def make(folder: Path) -> None:
         project, settings = tiled.copy(folder), ("--configfile", "tiny.yaml", "later.yaml")
         with without_utf8():
-            run = project.snakemake(*AFTER_THE_TILES, "verify", *settings)
+            run = project.snakemake(*AFTER_THE_TILES, "verify", *settings, as_users_do=True)
         assert run.status == 0, run.text[-4000:]
         assert "Traceback" not in run.text
         last = run.text[run.text.rindex("(100%) done") :]

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from ..synthetic.disturbed_stages import city_names, make_cities
+from ..synthetic.forked_snakemake import runner
 from .disturbing import Harness
 
 pytestmark = [
@@ -19,7 +20,7 @@ pytestmark = [
 def test_disturbed_jobs_leave_nothing_stale(data, tmp_path):
     """Rounds of two stages: a file that is read, and one deep in the folder of a dataset."""
     project = make_cities(tmp_path, 3, data)
-    harness = Harness(project, city_names(3), seed=11)
+    harness = Harness(project, city_names(3), seed=11, forker=runner())
     found = list(harness.rounds(["align", "match"], 6))
     assert len(found) >= 12
     assert [one for one in found if one["stale"]] == []
