@@ -136,7 +136,7 @@ def _let_go_of_files() -> None:
     sees the fork), and no other file may be meant by that.
     """
     nothing = os.open(os.devnull, os.O_RDWR)
-    for number in map(int, os.listdir("/dev/fd")):
+    for number in [int(file.name) for file in Path("/dev/fd").iterdir()]:
         if number > 2:
             with suppress(OSError):  # that of the list itself
                 os.fstat(number)
