@@ -130,10 +130,10 @@ def _tell(told: int, number: int) -> None:
 
 
 def _let_go_of_files() -> None:
-    """Put nothing in the place of all open files but the streams.
+    """Close all files but the streams; each descriptor leads to /dev/null from then on.
 
-    Their numbers stay taken: a library closes what it has opened (PROJ its database, as soon as it
-    sees the fork), and no other file may be meant by that.
+    PROJ closes the descriptor of its database as soon as it notices the fork. A descriptor that is
+    free by then would be that of a file opened since, such as the log of a job.
     """
     nothing = os.open(os.devnull, os.O_RDWR)
     for number in [int(file.name) for file in Path("/dev/fd").iterdir()]:
