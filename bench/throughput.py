@@ -582,9 +582,10 @@ def correlation(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         patches = [read_patch(image, rows, c, 9) for image, c in zip(images, (cols, reach))]
         origin = int(points.lon_q.min()), int(points.lat_q.min())
         collection = Collection((512, 1024), (rows.start, cols.start), origin, *patches)
-        lattice = (getattr(points, name)[inside] for name in ("lon_q", "lat_q", "h_q"))
-        place = np.ascontiguousarray(xy[:, inside])
-        collection.add(*lattice, points.classification[inside], place)
+        names = "lon_q", "lat_q", "h_q", "classification"
+        attributes = [getattr(points, name)[inside] for name in names]
+        day = np.zeros_like(attributes[-1])
+        collection.add(*attributes, day, np.ascontiguousarray(xy[:, inside]))
         found = collection.sorted()
         windows.append((found, np.ones(found.points.size, np.bool_), *patches, 9))
     count = sum(window[1].size for window in windows)

@@ -12,7 +12,8 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from datetime import date, datetime
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from .errors import InputError
+from .errors import InputError, in_number
 from .settings import (
     LONGEST_NAME,
     PATTERN,
@@ -152,6 +153,39 @@ class Image:
     no mask of its own"""
 
 
+class SheetError(InputError):
+    """Several rows of a sheet that cannot be used; the message tells the first.
+
+    ``each`` has one InputError for each such row, in the order of the sheet.
+    """
+
+    def __init__(self, each: Sequence[InputError]) -> None:
+        first, self.each = each[0], tuple(each)
+        others = in_number(len(each) - 1, "more mistake")
+        super().__init__(
+            f"{first.problem} (and {others}: stereotruth check tells all)",
+            file=first.file,
+            remedy=first.remedy,
+        )
+
+
+class _Mistakes(list[InputError]):
+    """What is wrong in the rows of a sheet, so that all of it is told at once."""
+
+    @contextmanager
+    def collect(self) -> Iterator[None]:
+        """In the block, an InputError is kept, after which the block ends."""
+        try:
+            yield
+        except InputError as error:
+            self.append(error)
+
+    def refuse(self) -> None:
+        """Raise InputError if there is any."""
+        if self:
+            raise self[0] if len(self) == 1 else SheetError(self)
+
+
 def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
     """(line number, cells) of each row of a tab-separated sheet; a cell is empty where none is."""
     columns = [f.name for f in fields(sheet)]
@@ -227,22 +261,30 @@ def _unique(values: Iterable[str], column: str, file: Path) -> None:
 def read_cities(path: str | Path) -> dict[str, City]:
     """The cities sheet by name of the city. Raises InputError as described in the module."""
     path = Path(path)
-    cities = {}
+    cities, wrong = {}, _Mistakes()
     rows = _read_table(path, City)
     for number, cells in rows:
-        values: dict[str, Any] = dict(cells)
-        for count in ("training", "validation", "testing"):
-            if not re.fullmatch(r"[0-9]{1,9}", cells[count]):
-                raise InputError(
-                    f"line {number}: {count} is {cells[count]!r}",
-                    file=path,
-                    remedy=f"{count} is a number of tiles: a whole number, 0 or more",
-                )
-            values[count] = int(cells[count])
-        cities[cells["city"]] = check(values, City, f"{path}, line {number}")
-    _unique([cells["city"] for _, cells in rows], "city", path)
-    _unique([cells["prefix"] for _, cells in rows], "prefix", path)
+        with wrong.collect():
+            cities[cells["city"]] = _city(cells, number, path)
+    for column in ("city", "prefix"):
+        with wrong.collect():
+            _unique([cells[column] for _, cells in rows], column, path)
+    wrong.refuse()
     return cities
+
+
+def _city(cells: Mapping[str, str], number: int, path: Path) -> City:
+    """A row of the cities sheet."""
+    values: dict[str, Any] = dict(cells)
+    for count in ("training", "validation", "testing"):
+        if not re.fullmatch(r"[0-9]{1,9}", cells[count]):
+            raise InputError(
+                f"line {number}: {count} is {cells[count]!r}",
+                file=path,
+                remedy=f"{count} is a number of tiles: a whole number, 0 or more",
+            )
+        values[count] = int(cells[count])
+    return check(values, City, f"{path}, line {number}")
 
 
 def read_images(
@@ -250,35 +292,47 @@ def read_images(
 ) -> dict[str, Image]:
     """The images sheet by name of the image. Raises InputError as described in the module."""
     path = Path(path)
+    rows = _read_table(path, Image)
     images: dict[str, Image] = {}
     first: dict[str, tuple[int, str]] = {}
-    for number, cells in _read_table(path, Image):
-        name, where = cells["image"], f"line {number}: image {cells['image']!r}"
-        values: dict[str, Any] = dict(cells)
-        values["sun_azimuth"], values["sun_elevation"] = _sun(cells, where, path)
-        image = check(values, Image, f"{path}, line {number}")
-        _known_city(cells["city"], where, cities, path, cities_sheet)
-        if name in images:
-            _unique([name, name], "image", path)
-        if image.acquired:
-            try:
-                acquisition_time(image.acquired)
-            except ValueError as error:
+    wrong = _Mistakes()
+    for number, cells in rows:
+        with wrong.collect():
+            image = _image(cells, number, path)
+            where = f"line {number}: image {image.image!r}"
+            _known_city(image.city, where, cities, path, cities_sheet)
+            before, other = first.setdefault(file_key(image.file), (number, image.image))
+            if before != number:
                 raise InputError(
-                    f"{where}: acquired {image.acquired!r} {error}",
+                    f"{where}: its file is that of image {other!r} in line {before}",
                     file=path,
-                    remedy="write the date, 2020-10-25, or the time with its zone, "
-                    "2020-10-25T03:12:45Z or 2020-10-25T11:12:45+08:00",
-                ) from None
-        before, other = first.setdefault(file_key(image.file), (number, name))
-        if before != number:
-            raise InputError(
-                f"{where}: its file is that of image {other!r} in line {before}",
-                file=path,
-                remedy="keep one of the two rows; scenes may name the image as often as they like",
-            )
-        images[name] = image
+                    remedy="keep one of the two rows; scenes may name the image as often as they "
+                    "like",
+                )
+            images[image.image] = image
+    with wrong.collect():
+        _unique([cells["image"] for _, cells in rows], "image", path)
+    wrong.refuse()
     return images
+
+
+def _image(cells: Mapping[str, str], number: int, path: Path) -> Image:
+    """A row of the images sheet."""
+    where = f"line {number}: image {cells['image']!r}"
+    values: dict[str, Any] = dict(cells)
+    values["sun_azimuth"], values["sun_elevation"] = _sun(cells, where, path)
+    image = check(values, Image, f"{path}, line {number}")
+    if image.acquired:
+        try:
+            acquisition_time(image.acquired)
+        except ValueError as error:
+            raise InputError(
+                f"{where}: acquired {image.acquired!r} {error}",
+                file=path,
+                remedy="write the date, 2020-10-25, or the time with its zone, "
+                "2020-10-25T03:12:45Z or 2020-10-25T11:12:45+08:00",
+            ) from None
+    return image
 
 
 def _sun(cells: Mapping[str, str], where: str, path: Path) -> tuple[float | None, float | None]:
@@ -380,7 +434,7 @@ def read_scenes(
     Images that rows name are replaced by their files and masks.
     """
     path = Path(path)
-    scenes = {}
+    scenes, wrong = {}, _Mistakes()
     rows = _read_table(path, Scene)
     if len(rows) > MOST_SCENES:
         raise InputError(
@@ -390,19 +444,22 @@ def read_scenes(
             "among several sheets that key scenes names in turn",
         )
     for number, cells in rows:
-        check(cells, Scene, f"{path}, line {number}")
-        where = f"line {number}: scene {cells['scene']!r}"
-        _known_city(cells["city"], where, cities, path, cities_sheet)
-        cells = with_images(cells, images or {}, where, path)
-        scene = check(cells, Scene, f"{path}, line {number}")
-        if file_key(scene.left_image) == file_key(scene.right_image):
-            raise InputError(
-                f"{where} names one image twice",
-                file=path,
-                remedy="left_image is the backward view, right_image the forward view",
-            )
-        scenes[scene.scene] = scene
-    _unique([cells["scene"] for _, cells in rows], "scene", path)
+        with wrong.collect():
+            check(cells, Scene, f"{path}, line {number}")
+            where = f"line {number}: scene {cells['scene']!r}"
+            _known_city(cells["city"], where, cities, path, cities_sheet)
+            completed = with_images(cells, images or {}, where, path)
+            scene = check(completed, Scene, f"{path}, line {number}")
+            if file_key(scene.left_image) == file_key(scene.right_image):
+                raise InputError(
+                    f"{where} names one image twice",
+                    file=path,
+                    remedy="left_image is the backward view, right_image the forward view",
+                )
+            scenes[scene.scene] = scene
+    with wrong.collect():
+        _unique([cells["scene"] for _, cells in rows], "scene", path)
+    wrong.refuse()
     return scenes
 
 

@@ -75,6 +75,17 @@ def test_a_wrong_scenes_sheet_is_refused_by_name(tmp_path, cities, text, words):
         assert word in str(refusal.value)
 
 
+def test_all_mistakes_of_a_sheet_are_told_at_once(tmp_path, cities):
+    rows = (with_cell("city", "Quichun"), ROW, with_cell("right_image", "l.tif"))
+    file = write(tmp_path / "scenes.tsv", scenes_text(*rows))
+    with pytest.raises(sheets.SheetError, match=r"line 2.*\(and 2 more mistakes: ") as refusal:
+        sheets.read_scenes(file, cities)
+    words = ("'Quichun'", "names one image twice", "stands in more than one row")
+    assert len(refusal.value.each) == len(words)
+    for word, each in zip(words, refusal.value.each):
+        assert word in str(each) and "scenes.tsv" in str(each)
+
+
 def test_a_count_that_is_no_number_is_refused(tmp_path):
     file = write(tmp_path / "cities.tsv", CITIES.replace("600", "many"))
     with pytest.raises(InputError, match="training is 'many'"):

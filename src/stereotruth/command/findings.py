@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ..errors import InputError, told_by_system
+from ..sheets import SheetError
 
 
 class Level(Enum):
@@ -43,9 +44,10 @@ class Findings(list[Finding]):
             self.append(Finding(self.scene, about, level, text, remedy))
 
     def error(self, about: str, error: InputError) -> None:
-        """Add what a stage refuses."""
-        where = f"{error.file}: " if error.file else ""
-        self.say(about, Level.ERROR, f"{where}{error.problem}", error.remedy)
+        """Add what a stage refuses; of a sheet all that is wrong in it."""
+        for each in error.each if isinstance(error, SheetError) else (error,):
+            where = f"{each.file}: " if each.file else ""
+            self.say(about, Level.ERROR, f"{where}{each.problem}", each.remedy)
 
     @contextmanager
     def of(self, about: str) -> Iterator[None]:

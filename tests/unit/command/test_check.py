@@ -131,6 +131,16 @@ def test_one_fault_hides_no_other(folder):
         assert fault.name not in names or fault.words in errors
 
 
+def test_each_wrong_row_of_a_sheet_is_an_error(folder):
+    sheet = folder / "scenes.tsv"
+    head, row = sheet.read_text().splitlines()[:2]
+    wrong = [row.replace("Good-1", f"Good-{k}").replace("\tGood\t", f"\tGod{k}\t") for k in (2, 3)]
+    sheet.write_text("\n".join((head, row, *wrong)) + "\n")
+    errors = texts(Level.ERROR)
+    assert [f"'God{k}', which is not in" in error for k, error in zip((2, 3), errors)] == 2 * [True]
+    assert len(errors) == 2
+
+
 def test_scenes_and_cities_are_chosen_by_name(folder):
     assert [f.scene for f in check_project(names=["Good"])] == ["project", "Good-1", "run"]
     errors = [f for findings in check_project(names=["Bad"]) for f in findings]
