@@ -6,22 +6,19 @@ the sheet, the row and the remedy.
 
 from __future__ import annotations
 
-import csv
 import difflib
 import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from collections.abc import Iterable, Mapping
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from .errors import InputError, in_number
+from .errors import InputError
 from .settings import (
     LONGEST_NAME,
     PATTERN,
@@ -35,9 +32,9 @@ from .settings import (
     settings,
 )
 from .settings_text import check
+from .sheet_rows import Mistakes, read_table, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
-MOST_BYTES = 20_000_000  # of a sheet
 LIDAR_SUFFIXES = (".las", ".laz")
 RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
 LIDAR_SEPARATOR = ";"
@@ -153,122 +150,17 @@ class Image:
     no mask of its own"""
 
 
-class SheetError(InputError):
-    """Several rows of a sheet that cannot be used; the message tells the first.
-
-    ``each`` has one InputError for each such row, in the order of the sheet.
-    """
-
-    def __init__(self, each: Sequence[InputError]) -> None:
-        first, self.each = each[0], tuple(each)
-        others = in_number(len(each) - 1, "more mistake")
-        super().__init__(
-            f"{first.problem} (and {others}: stereotruth check tells all)",
-            file=first.file,
-            remedy=first.remedy,
-        )
-
-
-class _Mistakes(list[InputError]):
-    """What is wrong in the rows of a sheet, so that all of it is told at once."""
-
-    @contextmanager
-    def collect(self) -> Iterator[None]:
-        """In the block, an InputError is kept, after which the block ends."""
-        try:
-            yield
-        except InputError as error:
-            self.append(error)
-
-    def refuse(self) -> None:
-        """Raise InputError if there is any."""
-        if self:
-            raise self[0] if len(self) == 1 else SheetError(self)
-
-
-def _read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
-    """(line number, cells) of each row of a tab-separated sheet; a cell is empty where none is."""
-    columns = [f.name for f in fields(sheet)]
-    needed = [f.name for f in fields(sheet) if f.default is MISSING]
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path.stat().st_size / 1e6:.0f} MB are no sheet",
-                file=path,
-                remedy=f"its columns are {', '.join(columns)}",
-            )
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(
-            "no such file", file=path, remedy="correct its path in the config, or write it"
-        ) from None
-    except (UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(str(error), file=path, remedy="save it as UTF-8 text") from None
-    lines = text.splitlines(keepends=True)
-    rows = csv.reader(lines, delimiter="\t")
-    try:
-        numbered = [(n, [c.strip() for c in row]) for n, row in enumerate(rows, 1) if any(row)]
-    except csv.Error as error:
-        raise InputError(
-            f"no sheet of text ({error})", file=path, remedy="save it as text with tabs"
-        ) from None
-    numbered = [(n, row) for n, row in numbered if not row[0].startswith("#")]
-    if not numbered:
-        raise InputError("empty sheet", file=path, remedy=f"its columns are {', '.join(columns)}")
-    header = numbered[0][1]
-    missing = [c for c in needed if c not in header]
-    unknown = [c for c in header if c not in columns]
-    if missing or unknown:
-        tabs = "" if len(header) > 1 else " (are the columns separated by tabs?)"
-        wrong = [f"column {c!r} is missing" for c in missing]
-        wrong += [f"column {c!r} is unknown" for c in unknown]
-        optional = [c for c in columns if c not in needed]
-        more = f"; {' and '.join(optional)} may be left out" if optional else ""
-        raise InputError(
-            "; ".join(wrong) + tabs,
-            file=path,
-            remedy=f"the columns are {', '.join(columns)}{more}",
-        )
-    table = []
-    for number, row in numbered[1:]:
-        if len(row) > len(header):
-            raise InputError(
-                f"line {number} has {len(row)} cells for {len(header)} columns",
-                file=path,
-                remedy="remove the surplus tab",
-            )
-        if len(row) < len(header) and number == len(lines) and not lines[-1].endswith("\n"):
-            raise InputError(
-                f"line {number} ends after {len(row)} of {len(header)} columns, and the file there",
-                file=path,
-                remedy="see that the file is whole, and end the line",
-            )
-        row += [""] * (len(header) - len(row))
-        table.append((number, dict.fromkeys(columns, "") | dict(zip(header, row))))
-    return table
-
-
-def _unique(values: Iterable[str], column: str, file: Path) -> None:
-    twice = [value for value, n in Counter(values).items() if n > 1]
-    if twice:
-        raise InputError(
-            f"{column} {twice[0]!r} stands in more than one row",
-            file=file,
-            remedy=f"give each row a {column} of its own",
-        )
-
-
 def read_cities(path: str | Path) -> dict[str, City]:
     """The cities sheet by name of the city. Raises InputError as described in the module."""
     path = Path(path)
-    cities, wrong = {}, _Mistakes()
-    rows = _read_table(path, City)
+    cities, wrong = {}, Mistakes()
+    rows = read_table(path, City)
     for number, cells in rows:
         with wrong.collect():
             cities[cells["city"]] = _city(cells, number, path)
     for column in ("city", "prefix"):
         with wrong.collect():
-            _unique([cells[column] for _, cells in rows], column, path)
+            require_unique([cells[column] for _, cells in rows], column, path)
     wrong.refuse()
     return cities
 
@@ -292,10 +184,10 @@ def read_images(
 ) -> dict[str, Image]:
     """The images sheet by name of the image. Raises InputError as described in the module."""
     path = Path(path)
-    rows = _read_table(path, Image)
+    rows = read_table(path, Image)
     images: dict[str, Image] = {}
     first: dict[str, tuple[int, str]] = {}
-    wrong = _Mistakes()
+    wrong = Mistakes()
     for number, cells in rows:
         with wrong.collect():
             image = _image(cells, number, path)
@@ -311,7 +203,7 @@ def read_images(
                 )
             images[image.image] = image
     with wrong.collect():
-        _unique([cells["image"] for _, cells in rows], "image", path)
+        require_unique([cells["image"] for _, cells in rows], "image", path)
     wrong.refuse()
     return images
 
@@ -434,8 +326,8 @@ def read_scenes(
     Images that rows name are replaced by their files and masks.
     """
     path = Path(path)
-    scenes, wrong = {}, _Mistakes()
-    rows = _read_table(path, Scene)
+    scenes, wrong = {}, Mistakes()
+    rows = read_table(path, Scene)
     if len(rows) > MOST_SCENES:
         raise InputError(
             f"{len(rows)} scenes; a project has at most {MOST_SCENES}",
@@ -458,7 +350,7 @@ def read_scenes(
                 )
             scenes[scene.scene] = scene
     with wrong.collect():
-        _unique([cells["scene"] for _, cells in rows], "scene", path)
+        require_unique([cells["scene"] for _, cells in rows], "scene", path)
     wrong.refuse()
     return scenes
 

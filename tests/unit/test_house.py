@@ -34,7 +34,7 @@ ORDER = (
     {"errors", "kernel_cache"},
     {"kernels"},
     {"job", "numerics", "settings"},
-    {"settings_text"},
+    {"settings_text", "sheet_rows"},
     {"sheets"},
     {"products"},
     {"lidar", "epipolar", "simulate"},

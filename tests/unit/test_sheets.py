@@ -10,6 +10,7 @@ from stereotruth import sheets
 from stereotruth.configuration import REPLACED, Configuration, defaults_text, with_tables
 from stereotruth.errors import InputError
 from stereotruth.settings import acquisition_time
+from stereotruth.sheet_rows import SheetError
 
 ROOT = Path(__file__).parents[2]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"
@@ -78,7 +79,7 @@ def test_a_wrong_scenes_sheet_is_refused_by_name(tmp_path, cities, text, words):
 def test_all_mistakes_of_a_sheet_are_told_at_once(tmp_path, cities):
     rows = (with_cell("city", "Quichun"), ROW, with_cell("right_image", "l.tif"))
     file = write(tmp_path / "scenes.tsv", scenes_text(*rows))
-    with pytest.raises(sheets.SheetError, match=r"line 2.*\(and 2 more mistakes: ") as refusal:
+    with pytest.raises(SheetError, match=r"line 2.*\(and 2 more mistakes: ") as refusal:
         sheets.read_scenes(file, cities)
     words = ("'Quichun'", "names one image twice", "stands in more than one row")
     assert len(refusal.value.each) == len(words)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ..errors import InputError, told_by_system
-from ..sheets import SheetError
+from ..sheet_rows import SheetError
 
 
 class Level(Enum):
