@@ -12,12 +12,13 @@ from pathlib import Path
 from .errors import InputError, in_number
 
 MOST_BYTES = 20_000_000  # of a sheet
+MOST_MISTAKES = 100  # that are told
 
 
 class SheetError(InputError):
-    """Several rows of a sheet that cannot be used; the message tells the first.
+    """Several mistakes in a sheet, of which the message tells the first.
 
-    ``each`` has one InputError for each such row, in the order of the sheet.
+    ``each`` has an InputError for each wrong row, then one for each column that repeats a value.
     """
 
     def __init__(self, each: Sequence[InputError]) -> None:
@@ -35,16 +36,21 @@ class Mistakes(list[InputError]):
 
     @contextmanager
     def collect(self) -> Iterator[None]:
-        """In the block, an InputError is kept, after which the block ends."""
+        """In the block, an InputError is kept, after which the block ends.
+
+        Raises SheetError where they are :data:`MOST_MISTAKES`.
+        """
         try:
             yield
         except InputError as error:
             self.append(error)
+            if len(self) == MOST_MISTAKES:
+                self.refuse()
 
     def refuse(self) -> None:
         """Raise InputError if there is any."""
         if self:
-            raise self[0] if len(self) == 1 else SheetError(self)
+            raise (self[0] if len(self) == 1 else SheetError(self)) from None
 
 
 def read_table(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:

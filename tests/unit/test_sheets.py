@@ -87,6 +87,14 @@ def test_all_mistakes_of_a_sheet_are_told_at_once(tmp_path, cities):
         assert word in str(each) and "scenes.tsv" in str(each)
 
 
+def test_mistakes_are_told_up_to_a_hundred(tmp_path, cities):
+    rows = [with_cell("city", f"Quichun{k}") for k in range(1000)]
+    file = write(tmp_path / "scenes.tsv", scenes_text(*rows))
+    with pytest.raises(SheetError, match="and 99 more mistakes") as refusal:
+        sheets.read_scenes(file, cities)
+    assert len(refusal.value.each) == 100
+
+
 def test_a_count_that_is_no_number_is_refused(tmp_path):
     file = write(tmp_path / "cities.tsv", CITIES.replace("600", "many"))
     with pytest.raises(InputError, match="training is 'many'"):
