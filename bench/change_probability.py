@@ -31,7 +31,7 @@ from stereotruth.disparity.change_probability import (
     trees,
     with_surroundings,
 )
-from stereotruth.disparity.crowns import merged_with
+from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window
@@ -100,24 +100,19 @@ def sample(case: Case, folder: Path, around: bool) -> Sample:
     moved[window.inner] = changes["reason"] == MOVED
     rare = texture & kept if case.apart else moved & changed
     changed |= hidden
-    parts = []
-    for shown, labelled in (
-        (labels, is_labelled(labels.status) & (labels.surface_class != WATER_CLASS)),
-        merged_with(labels, by_lidar.rough, window),
-    ):
-        noise = by_lidar.comparison.noise
-        of = LabelledWindow(window, shown.labels, labelled, shown.surface_class, noise)
-        doubtful, evidence = change_evidence(of)
-        features = [*evidence]
-        if around:
-            own = by_itself(evidence, doubtful, case.apart)
-            features += with_surroundings(own, doubtful, of)
-        chosen = (changed | kept)[doubtful]
-        agreed = [int((labelled & ~doubtful & pixels).sum()) for pixels in (changed, kept)]
-        of_chosen = (pixels[doubtful][chosen] for pixels in (changed, texture & kept, rare))
-        parts.append((np.stack(features)[:, chosen], *of_chosen, np.array(agreed)))
-    *arrays, agreed = zip(*parts)
-    return Sample(*(np.concatenate(of_parts, axis=-1) for of_parts in arrays), sum(agreed))
+    labels = with_crowns(labels, by_lidar.rough, window)
+    labelled = is_labelled(labels.status) & (labels.surface_class != WATER_CLASS)
+    noise = by_lidar.comparison.noise
+    of = LabelledWindow(window, labels.labels, labelled, labels.surface_class, noise)
+    doubtful, evidence = change_evidence(of)
+    features = [*evidence]
+    if around:
+        own = by_itself(evidence, doubtful, case.apart)
+        features += with_surroundings(own, doubtful, of)
+    chosen = (changed | kept)[doubtful]
+    agreed = [int((labelled & ~doubtful & pixels).sum()) for pixels in (changed, kept)]
+    of_chosen = (pixels[doubtful][chosen] for pixels in (changed, texture & kept, rare))
+    return Sample(np.stack(features)[:, chosen], *of_chosen, np.array(agreed))
 
 
 def fit(of: list[Sample]) -> DecisionTrees:

@@ -68,6 +68,11 @@ class LabelledWindow:
         """Disparity (px) [h, w] and its slope [2, h, w], which decide what belongs to a surface."""
         return self.labels.disparity, self.labels.slope
 
+    @property
+    def first_row(self) -> int:
+        """Number in the grid of the first of the rows."""
+        return self.window.rows.start
+
     @cached_property
     def images(self) -> tuple[Singles, NDArray[np.float64]]:
         """Left image, 0 where it has no value, and the right one brought to it, NaN there."""
@@ -195,7 +200,9 @@ def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
     known = (left != 0.0) & np.isfinite(warped)
     runs = wanted_runs(box_max(doubtful, NEAR_PX))
     brightness = np.where(known, compared.images, np.nan)
-    levels = surface_means(brightness, *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
+    levels = surface_means(
+        brightness, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row
+    )
     down, across = np.gradient(left)
     variance = OFF_PX**2 * (down**2 + across**2) + OFF_SHARE**2 * left**2
     variance += sum(max(noise, ROUNDING) for noise in compared.noise)
@@ -222,7 +229,7 @@ def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singl
         spread = np.maximum(square - level**2, 0.0)
         contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
     ratio = logarithms[0] - logarithms[1]
-    wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs)
+    wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row)
     return [*contrasts, np.abs(means[0] - means[1] - wide)]
 
 

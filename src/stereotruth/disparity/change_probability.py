@@ -29,7 +29,7 @@ Bools = NDArray[np.bool_]
 
 MEANS_PX = 12  # pixels up to here have a say in the probability of one
 AROUND = (2, 1), (4, 1), (8, 2), (MEANS_PX, 3)  # px up to which, one of so many, it is averaged;
-ALIKE_AROUND = (4, 1), (8, 1), (MEANS_PX, 2)  # and over pixels that are alike
+ALIKE_AROUND = (4, 1), (8, 2), (MEANS_PX, 3)  # and over pixels that are alike
 SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
@@ -45,7 +45,10 @@ def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) ->
     the labelled surface around them, see AROUND, and over its pixels that are alike, see
     ALIKE_AROUND."""
     runs, known = wanted_runs(doubtful), np.where(compared.labelled, own, np.nan)
-    means = [surface_mean(known, *compared.surface, *around, runs) for around in AROUND]
+    means = [
+        surface_mean(known, *compared.surface, *around, runs, compared.first_row)
+        for around in AROUND
+    ]
     means += [
         alike_mean(known, compared.brightness, *compared.surface, *around, runs)
         for around in ALIKE_AROUND

@@ -28,7 +28,7 @@ from ..numerics.summed_area import window_sums
 from .change_evidence import WINDOW_PX
 from .image_agreement import Comparison
 from .pair_window import PairWindow, WindowLabels
-from .pixel_labels import Pixels
+from .pixel_labels import OwnPoints
 from .reason import Reason
 from .seen_surface import box_max
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
@@ -86,7 +86,7 @@ class ChangedSurface:
     height: Floats
     surface_class: Bytes
     is_rough: Bools
-    own: Pixels
+    own: OwnPoints
 
     @cached_property
     def classes(self) -> Bytes:
@@ -172,7 +172,7 @@ def by_votes(reasons: Bytes, is_strong: Bools, evidence: Evidence) -> Bytes:
 def with_reasons(
     labels: WindowLabels,
     is_rough: Bools,
-    own: Pixels,
+    own: OwnPoints,
     window: PairWindow,
     comparison: Comparison,
     px_per_m: float,

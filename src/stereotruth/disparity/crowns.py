@@ -34,7 +34,6 @@ from .facet_raster import (
     raster_facets,
     right_pixels,
 )
-from .image_agreement import Comparison, contradicted
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .pixel_scale import PixelScale
@@ -217,45 +216,25 @@ def _variance(
     return sum(part**2 for part in parts) * scale.spacing_px ** (2.0 * GROWTH)
 
 
-def with_crowns(
-    labels: WindowLabels, crowns: Crowns, window: PairWindow, comparison: Comparison
-) -> WindowLabels:
-    """Labels with those of rough surfaces, as far as both images agree with these.
+def with_crowns(labels: WindowLabels, crowns: Crowns, window: PairWindow) -> WindowLabels:
+    """Labels with those of rough surfaces where these are seen and an edge in the pixel left none.
 
     Labels of other statuses stay as they are.
     """
-    merged, new = merged_with(labels, crowns, window)
-    status, correlation, of_all = labels.status.copy(), labels.correlation, merged.labels
-    if new.any():
-        by_images = contradicted(of_all, window, comparison, new, merged.surface_class)
-        correlation = np.where(new, by_images.correlation, correlation)
-        variance = np.where(new, of_all.variance + by_images.variance, of_all.variance)
-        of_all = replace(of_all, variance=variance)
-        status[by_images.changed] = Status.CHANGED
-        new &= ~by_images.changed
-    status[new] = Status.LABELLED_CROWN
-    return replace(merged, status=status, labels=of_all, correlation=correlation)
-
-
-def merged_with(
-    labels: WindowLabels, crowns: Crowns, window: PairWindow
-) -> tuple[WindowLabels, Bools]:
-    """What labels, crowns where these are seen, and other labels elsewhere, show; and which pixels
-    [h, w] have a crown's. The status is that of the ``labels``."""
     row, col = np.nonzero(crowns.visible & (labels.status == Status.EDGE_IN_PIXEL))
     inside, _ = window.usable(row, col, crowns.labels.disparity[row, col])
     new = np.zeros(labels.status.shape, np.bool_)
     new[row[inside], col[inside]] = True
     of_crowns, others = crowns.labels, labels.labels
-    merged = Labels(
-        np.where(new, of_crowns.disparity, others.disparity),
-        np.where(new, of_crowns.slope, others.slope),
-        np.where(new, of_crowns.variance, others.variance),
-    )
     return replace(
         labels,
-        labels=merged,
+        status=np.where(new, np.uint8(Status.LABELLED_CROWN), labels.status),
+        labels=Labels(
+            np.where(new, of_crowns.disparity, others.disparity),
+            np.where(new, of_crowns.slope, others.slope),
+            np.where(new, of_crowns.variance, others.variance),
+        ),
         height=np.where(new, crowns.height, labels.height),
         surface_class=np.where(new, crowns.surface_class, labels.surface_class),
         day=np.where(new, crowns.day, labels.day),
-    ), new
+    )

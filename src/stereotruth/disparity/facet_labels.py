@@ -44,14 +44,14 @@ def facet_labels(
     status[(status == Status.NO_POINTS) & has_points] = Status.EDGE_IN_PIXEL
     status[is_labelled(status) & own.on_edge] = Status.EDGE_IN_PIXEL
     measured &= status == Status.LABELLED
-    pixels = own.pixels
+    points = own.points
     return WindowLabels(
         status=status,
         labels=labels,
-        height=np.where(measured, pixels.highest, visible.height),
-        surface_class=np.where(measured, pixels.surface_class, visible.surface_class),
+        height=np.where(measured, points.highest, visible.height),
+        surface_class=np.where(measured, points.surface_class, visible.surface_class),
         day=visible.day,
-        point_count=np.where(measured, pixels.count, 0),
+        point_count=np.where(measured, points.count, 0),
         correlation=np.full(status.shape, np.nan),
         change=np.zeros(status.shape, np.uint8),
     )

@@ -301,13 +301,23 @@ def noise_variance(pixels: Pixels, valid: Bools, slope: Floats, px_per_m: float)
 
 
 @dataclass(frozen=True, eq=False)
+class OwnPoints:
+    """The points of each pixel on the surface that its centre sees, arrays [h, w]: their ``count``,
+    height of the ``highest`` (m, NaN for none) and its ``surface_class`` (ASPRS)."""
+
+    count: NDArray[np.int64]
+    highest: Floats
+    surface_class: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
 class OwnLabels:
-    """What each pixel's own points say, arrays [h, w]: ``labels`` at the centres, and ``pixels``
+    """What each pixel's own points say, arrays [h, w]: ``labels`` at the centres, and ``points``
     that they follow from; ``on_edge``: an edge passes within the margin of the centre;
     ``in_frames``: number of points in both frames."""
 
     labels: Labels
-    pixels: Pixels
+    points: OwnPoints
     on_edge: Bools
     in_frames: NDArray[np.int32]
 
@@ -329,4 +339,6 @@ def own_labels(
     labels = at_centres(pixels, pixels.count >= min_points, points.first, px_per_m)
     if edge_margin_px == 0.0:
         on_edge = np.zeros(points.shape, np.bool_)
-    return OwnLabels(labels, pixels, on_edge, points.count)
+    # a copy: that of all sums would stay as long
+    own = OwnPoints(pixels.count.copy(), pixels.highest, pixels.surface_class)
+    return OwnLabels(labels, own, on_edge, points.count)

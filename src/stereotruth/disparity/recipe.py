@@ -10,10 +10,10 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
 3. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
    and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
    has the label of its nearest facet if nothing may hide it in either view; if its own points are
-   the surer ones, theirs (:mod:`.facet_labels`).
+   the surer ones, theirs (:mod:`.facet_labels`). Rough surfaces, of which no triangle is a facet,
+   get labels of their own (:mod:`.crowns`).
 4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
-   (:mod:`.image_agreement`). Rough surfaces, of which no triangle is a facet, get labels of their
-   own, which the images confirm (:mod:`.crowns`).
+   (:mod:`.image_agreement`).
 5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
    (:mod:`.change_reasons`).
 6. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
@@ -38,7 +38,7 @@ from .image_agreement import Comparison, without_changes
 from .layers import layers_of
 from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
-from .pixel_labels import Pixels, own_labels
+from .pixel_labels import OwnPoints, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
 from .status import Status
@@ -72,7 +72,7 @@ class LidarLabels(NamedTuple):
 
     labels: WindowLabels
     rough: Crowns
-    own: Pixels
+    own: OwnPoints
     window: PairWindow
     comparison: Comparison
 
@@ -109,7 +109,7 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     rough = crowns(visible, scale)
     labels = without_contours(labels, rough, visible, scale)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
-    return LidarLabels(labels, rough, own.pixels, window, comparison)
+    return LidarLabels(labels, rough, own.points, window, comparison)
 
 
 def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
@@ -118,8 +118,8 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     # changes count up to REASON_PX off; labels without a say in these need no images
     labels = labels.around(window.grown(REASON_PX + MEANS_PX))
     is_rough = labels.status == Status.EDGE_IN_PIXEL
+    labels = with_crowns(labels, rough, window)
     labels = without_changes(labels, window, comparison)
-    labels = with_crowns(labels, rough, window, comparison)
     return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)
 
 

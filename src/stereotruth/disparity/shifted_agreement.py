@@ -133,11 +133,13 @@ def _means(
     row, col = window.rows.start + around[0].start, window.cols.start + around[1].start
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
     clear = apart_from_steps(disparity) if apart else np.isfinite(disparity)
-    every = max(reach // 4, 1)
+    every = max(reach // 2, 1)
     averaged = box_max(wanted, reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
     known = np.isfinite(compared)
+    voters = Voters.of((AT_ONCE, rows, cols), reach, every, row)
+    averaged[np.arange(rows) % every != voters.first] = False
     to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
     level, slope = surface
@@ -146,13 +148,12 @@ def _means(
         original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
         compared, wanted_runs(known), clear, level, slope,
     )  # fmt: skip
-    voters = Voters.of((AT_ONCE, rows, cols), reach, every)
     of_shifts = np.array([0.0, *shifts])
     _means_at_shifts(
         part, window_px // 2, of_shifts, to_compare, voters, to_average, here, elsewhere, shifted
     )
     signal = _signal(images, row, col, disparity)
-    around_it = surface_mean(signal, level, slope, reach, every, to_average)
+    around_it = surface_mean(signal, level, slope, reach, every, to_average, row)
     return here, elsewhere, shifted, np.fmin(signal, around_it)
 
 
@@ -245,7 +246,7 @@ def _means_at_shifts(
             left, warped[:n], known, counted, part.slope, half, (0.0, 0.0), to_compare,
             correlation[:n], expected,
         )  # fmt: skip
-        few = Voters(voters.value[:n], voters.disparity, voters.reach, voters.every)
+        few = Voters(voters.value[:n], voters.disparity, voters.reach, voters.every, voters.first)
         fill_voters(correlation[:n], part.level, few)
         mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
         for run in to_average:

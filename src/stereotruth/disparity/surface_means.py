@@ -66,20 +66,23 @@ class Voters(NamedTuple):
 
     Arrays with ``reach`` columns more on the left, and ``reach`` + 2 ``every`` on the right, in
     which none has. ``value`` [n, h, w] in each image, 0 for none; ``disparity`` [h, w] of those
-    that have one, else NaN.
+    that have one, else NaN. Of pixels up to ``reach`` px off one of so many (``every``) votes: of a
+    row those so far off, and of the rows those from ``first`` on.
     """
 
     value: Singles
     disparity: Singles
     reach: int
     every: int
+    first: int
 
     @classmethod
-    def of(cls, shape: tuple[int, int, int], reach: int, every: int) -> Voters:
-        """None yet. Of pixels up to ``reach`` px off one of so many (``every``) votes."""
+    def of(cls, shape: tuple[int, int, int], reach: int, every: int, first_row: int) -> Voters:
+        """None yet; ``first_row``: number in the grid of the first of the rows. Those whose number
+        is a multiple of ``every`` vote, whatever the window."""
         wide = shape[1], shape[2] + 2 * (reach + every)
         value = np.zeros((shape[0], *wide), np.float32)
-        return cls(value, np.full(wide, np.nan, np.float32), reach, every)
+        return cls(value, np.full(wide, np.nan, np.float32), reach, every, -first_row % every)
 
 
 @kernel
@@ -87,7 +90,7 @@ def fill_voters(values: NDArray, disparity: Singles, voters: Voters) -> None:
     """Fills the ``voters`` with the ``values`` [n, h, w] of pixels and their disparity. Who has a
     value in one image has one in all."""
     reach = voters.reach
-    for y in range(disparity.shape[0]):
+    for y in range(voters.first, disparity.shape[0], voters.every):
         for x in range(disparity.shape[1]):
             has_value = np.isfinite(values[0, y, x])
             voters.disparity[y, reach + x] = disparity[y, x] if has_value else np.float32(np.nan)
@@ -108,7 +111,7 @@ def mean_of_runs(
     """Means [n, h, w] of the ``voters`` on the surface of each pixel of ``runs``; NaN outside of
     these."""
     rows, last = len(disparity), len(voters.value) - 1
-    reach, every = voters.reach, voters.every
+    reach, every, first = voters.reach, voters.every, voters.first
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
     sums = np.empty(5 * BLOCK, np.float32)  # of the first image, and then which voters count
@@ -118,10 +121,10 @@ def mean_of_runs(
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
         sums[: 2 * BLOCK], others[:] = zero, zero
-        for step_down in range(-reach, reach + 1, every):
-            b = y + step_down
-            if b < 0 or b >= rows:
-                continue
+        above = max(y - reach - first, 0)
+        top = first + (above + every - 1) // every * every
+        for b in range(top, min(y + reach + 1, rows), every):
+            step_down = b - y
             down = np.float32(step_down)
             for step in range(-reach, reach + 1, TOGETHER * every):
                 second, third = step + every, step + 2 * every
@@ -164,14 +167,16 @@ def surface_mean(
     reach: int,
     every: int,
     runs: Steps | None = None,
+    first_row: int = 0,
 ) -> Singles:
     """Mean over the pixels of each pixel's surface around it of ``values`` [h, w]; NaN for none.
 
     ``disparity`` (px) and its ``slope`` [2, h, w] decide what belongs to a surface. Pixels up to
-    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value. Of the
-    pixels of ``runs`` (:func:`.wanted_runs`) alone where these are given.
+    ``reach`` px off count, one of so many (``every``) along each axis, if they have a value; see
+    :class:`Voters` for ``first_row``. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone where
+    these are given.
     """
-    return surface_means(values[None], disparity, slope, reach, every, runs)[0]
+    return surface_means(values[None], disparity, slope, reach, every, runs, first_row)[0]
 
 
 def surface_means(
@@ -181,12 +186,14 @@ def surface_means(
     reach: int,
     every: int,
     runs: Steps | None = None,
+    first_row: int = 0,
 ) -> Singles:
     """:func:`surface_mean` of several images' ``values`` [n, h, w]: NaN in all of them or in
     none."""
     disparity = np.ascontiguousarray(disparity, dtype=np.float32)
     slope = np.ascontiguousarray(slope, dtype=np.float32)
-    voters, out = Voters.of(values.shape, reach, every), np.empty(values.shape, np.float32)
+    voters = Voters.of(values.shape, reach, every, first_row)
+    out = np.empty(values.shape, np.float32)
     fill_voters(values, disparity, voters)
     if runs is None:
         runs = wanted_runs(np.isfinite(disparity))

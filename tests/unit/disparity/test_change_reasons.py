@@ -11,7 +11,7 @@ from stereotruth.disparity.change_reasons import REASON_PX, VEHICLE_M, with_reas
 from stereotruth.disparity.image_agreement import Comparison
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
-from stereotruth.disparity.pixel_labels import Labels, Pixels
+from stereotruth.disparity.pixel_labels import Labels, OwnPoints
 from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.status import Status
 from stereotruth.simulate.changes import REASONS
@@ -46,7 +46,7 @@ def images(patch: tuple[slice, slice], rise_px: int | None) -> PairWindow:
 
 def lidar(
     patch: tuple[slice, slice], surface_class: int, above_m: float
-) -> tuple[WindowLabels, Pixels]:
+) -> tuple[WindowLabels, OwnPoints]:
     """Labels and points of a level ground on which the patch is of a class, so high above it, and
     has changed."""
     zeros, level = np.zeros(SHAPE), np.zeros((2, *SHAPE))
@@ -59,8 +59,7 @@ def lidar(
     count = np.ones(SHAPE, np.int64)
     nothing = np.zeros(SHAPE, np.uint8)
     found = WindowLabels(status, labels, height, classes, zeros, count, zeros, nothing)
-    moments = np.zeros((*SHAPE, 6))
-    return found, Pixels(count, zeros, zeros, disparity, height, zeros, classes, nothing, moments)
+    return found, OwnPoints(count, height, classes)
 
 
 def reasons(
@@ -73,7 +72,7 @@ def reasons(
 
 
 def at(
-    labels: WindowLabels, points: Pixels, window: PairWindow, *, rough: bool = False
+    labels: WindowLabels, points: OwnPoints, window: PairWindow, *, rough: bool = False
 ) -> np.ndarray:
     is_rough = np.full(labels.status.shape, rough)
     return with_reasons(labels, is_rough, points, window, COMPARISON, PX_PER_M).change
@@ -138,14 +137,14 @@ def test_reasons_follow_from_what_is_near() -> None:
     window = images(LARGE, 6)
     whole = at(labels, points, window)
     part, margin = np.s_[30:150, 40:180], REASON_PX + 10
-    cut = {name: getattr(points, name)[part] for name in Pixels.__dataclass_fields__}
+    cut = {name: getattr(points, name)[part] for name in OwnPoints.__dataclass_fields__}
     small = replace(
         window,
         rows=slice(ROWS.start + 30, ROWS.start + 150),
         cols=slice(COLS.start + 40, COLS.start + 180),
     )
     inner = np.s_[margin:-margin, margin:-margin]
-    change = at(labels.within(part), Pixels(**cut), small)[inner]
+    change = at(labels.within(part), OwnPoints(**cut), small)[inner]
     assert change.any() and np.array_equal(change, whole[part][inner])
 
 

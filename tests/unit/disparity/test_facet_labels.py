@@ -8,7 +8,7 @@ import pytest
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
-from stereotruth.disparity.pixel_labels import Labels, OwnLabels, Pixels
+from stereotruth.disparity.pixel_labels import Labels, OwnLabels, OwnPoints
 from stereotruth.disparity.status import Status
 from stereotruth.disparity.visibility import VISIBLE, VisibleSurface
 
@@ -34,7 +34,7 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
     points[2, 2:6] = 10.2, 4.0, 16.0, 10.2  # on the surface, behind, before it; where it bulges
     own = OwnLabels(
         Labels(points, np.zeros((2, *shape)), zeros),
-        Pixels(zeros, points, points, points, points, points, nothing, nothing, zeros),
+        OwnPoints(zeros, points, nothing),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.int32),
     )

@@ -182,6 +182,20 @@ def test_means_of_images_together_are_those_of_each():
         assert np.array_equal(one, surface_mean(image, *surface, 6, 2), equal_nan=True)
 
 
+def test_the_rows_that_vote_are_those_of_the_grid() -> None:
+    """By their number, whatever row a window begins with; on a plane, so that all are near."""
+    values = np.random.default_rng(5).normal(size=(60, 80))
+    flat, first, reach, every = (np.zeros((60, 80)), np.zeros((2, 60, 80))), 7, 8, 4
+    found = surface_mean(values, *flat, reach, every, None, first)
+    row, col = 30, 40  # 37 of the grid, around which 32, 36, 40 and 44 vote
+    voters = values[[25, 29, 33, 37]][:, col - reach : col + reach + 1 : every]
+    assert np.isclose(found[row, col], voters.mean(), atol=1e-6)
+    for cut in (1, 2, 3, 4):
+        of_part = (values[cut:], flat[0][cut:], flat[1][:, cut:])
+        part = surface_mean(*of_part, reach, every, None, first + cut)
+        assert np.array_equal(part[reach:], found[cut + reach :])
+
+
 def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:
     """Means over the surface of what :func:`surface_correlation` says of each shift by itself."""
     window = grown(3)
@@ -194,7 +208,7 @@ def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:
     for shift in (0, *map(int, SHIFTS_PX)):
         there = right.pixels[top - right.row :, side - 4 - shift - right.col :][:rows, :cols]
         alone = surface_correlation(own, there, *surface, 9, clear)
-        means.append(surface_mean(alone, *surface, 8, 2))
+        means.append(surface_mean(alone, *surface, 8, 4, None, top))
     inside = np.s_[30:-30, 30:-30]
     assert np.allclose(found.here[inside], means[0][inside], atol=1e-5)
     assert np.allclose(found.elsewhere[inside], np.max(means[1:], axis=0)[inside], atol=1e-5)
