@@ -36,7 +36,7 @@ from ..products.provenance import describe, digest
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround
 from .surface import Core, GroundSurface, Parts, ground_surface
-from .surface_store import ARRAYS, ATTRIBUTES, BLOCKS, FORMAT, write_block
+from .surface_store import ATTRIBUTES, BLOCKS, CONTENTS, FORMAT, write_block
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
@@ -249,7 +249,7 @@ def make_surface(
             "format": FORMAT,
             "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice of "
             f"{LATTICE_DEG:g} degree and {LATTICE_M:g} m",
-            "arrays": ARRAYS,
+            "arrays": CONTENTS,
             "scale": asdict(scale),
             "side": side,
             "points_per_m2": round(density, 6),

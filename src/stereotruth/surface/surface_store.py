@@ -4,7 +4,7 @@ A folder:
 
 =================  =========================================================================
 ``blocks/R_C.npz`` triangles whose first vertex lies in block (R, C) of ``side`` ground cells:
-                   arrays of :data:`ARRAYS`, not compressed, each with a checksum
+                   records of :data:`ARRAYS`, not compressed, each array with a checksum
 ``surface.json``   ``scale`` of the surface, ``side``, ``blocks``: of each that has triangles its
                    number, the box of its vertices and the SHA-256 of its file; and a digest
 =================  =========================================================================
@@ -16,7 +16,7 @@ boxes it sees (:meth:`SurfaceStore.blocks`), taken in their order.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,24 +34,30 @@ from .scale import PART, SurfaceScale
 from .surface import GroundSurface
 from .vertices import Vertices
 
-FORMAT = 2
+FORMAT = 3
 ATTRIBUTES, BLOCKS = "surface.json", "blocks"
-ARRAYS = {
-    "lon": "int32[n], longitude of the vertices from the block's south-west corner, 1e-9 degree",
-    "lat": "int32[n], latitude, likewise",
-    "height": "int32[n], above the WGS 84 ellipsoid, 1e-4 m",
-    "surface_class": "uint8[n], ASPRS class of the highest point of the vertex",
-    "count": "uint16[n], points that it is the mean of; 65535 stands for more, too",
-    "day": "uint16[n], of its highest point, since 1970-01-01, 0 not known; [1] if all have one",
-    "facet": "int32[m, 3], vertices of the facets",
-    "variance": "float32[m], of a point's height there, (1e-4 m)²",
-    "bulge": "float32[m], of the surface above the facet, 1e-4 m",
-    "whole": "int32[k, 3], vertices of the undecided triangles",
-    "strip": "int32[s, 3], vertices of the strips along breaklines",
-    "strip_range": "int32[s, 2], lowest and highest surface in each, 1e-4 m",
-    "top": "int32[t, 3], vertices of the triangles of rough surfaces' tops",
-    "top_residual": "float32[t], rms of the tops to the planes beside, 1e-4 m; NaN for none",
-    "is_gentle": "bool[t], neither steep nor alone",
+CORNER = ("corner", "<i4", 3)
+ARRAYS = {  # of records
+    "vertices": np.dtype(
+        [("lon", "<i4"), ("lat", "<i4"), ("height", "<i4"),
+         ("count", "<u2"), ("day", "<u2"), ("surface_class", "u1")]
+    ),
+    "facets": np.dtype([CORNER, ("variance", "<f4"), ("bulge", "<f4")]),
+    "whole": np.dtype([CORNER]),
+    "strips": np.dtype([CORNER, ("height_range", "<i4", 2)]),
+    "tops": np.dtype([CORNER, ("residual", "<f4"), ("is_gentle", "?")]),
+}  # fmt: skip
+CONTENTS = {
+    "vertices": "lon, lat from the block's south-west corner, 1e-9 degree; height above the WGS 84 "
+    "ellipsoid, 1e-4 m; count of points that it is the mean of, 65535 stands for more, too; day "
+    "since 1970-01-01 (0 not known) and surface_class (ASPRS) of the highest of these",
+    "facets": "corner: vertices; variance of a point's height there, (1e-4 m)²; bulge of the "
+    "surface above it, 1e-4 m",
+    "whole": "undecided triangles; corner: vertices",
+    "strips": "triangles along breaklines; corner: vertices; height_range: lowest and highest "
+    "surface in each, 1e-4 m",
+    "tops": "triangles of rough surfaces' tops; corner: vertices; residual: rms of the tops to the "
+    "planes beside, 1e-4 m, NaN for none; is_gentle: neither steep nor alone",
 }
 Box = tuple[float, float, float, float]
 
@@ -86,27 +92,36 @@ def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> 
     number[taken] = np.arange(taken.size, dtype=np.int32)
     facet, whole, strip, top = (number[corners] for corners in triangles)
     vertices = surface.vertices.taken(taken)
-    np.savez(
-        path,
-        lon=(vertices.lon_q - corner[0]).astype(np.int32),
-        lat=(vertices.lat_q - corner[1]).astype(np.int32),
-        height=vertices.h_q.astype(np.int32),
-        surface_class=vertices.surface_class,
-        count=np.minimum(vertices.count, 65535).astype(np.uint16),
-        day=vertices.day[:1] if np.ptp(vertices.day) == 0 else vertices.day,
-        facet=facet,
-        variance=surface.variance.astype(np.float32),
-        bulge=surface.bulge.astype(np.float32),
-        whole=whole,
-        strip=strip,
-        strip_range=surface.height_range[surface.strips].astype(np.int32),
-        top=top,
-        top_residual=surface.tops.residual.astype(np.float32),
-        is_gentle=surface.tops.is_gentle,
-    )
+    values = {
+        "vertices": {
+            "lon": vertices.lon_q - corner[0],
+            "lat": vertices.lat_q - corner[1],
+            "height": vertices.h_q,
+            "count": np.minimum(vertices.count, 65535),
+            "day": vertices.day,
+            "surface_class": vertices.surface_class,
+        },
+        "facets": {"corner": facet, "variance": surface.variance, "bulge": surface.bulge},
+        "whole": {"corner": whole},
+        "strips": {"corner": strip, "height_range": surface.height_range[surface.strips]},
+        "tops": {
+            "corner": top,
+            "residual": surface.tops.residual,
+            "is_gentle": surface.tops.is_gentle,
+        },
+    }
+    np.savez(path, **{name: _records(ARRAYS[name], of) for name, of in values.items()})
     lon, lat, h = vertices.lon_q, vertices.lat_q, vertices.h_q
     box = [int(value) for value in (lon.min(), lat.min(), lon.max(), lat.max())]
     return {"box": box, "heights": [int(h.min()), int(h.max())]}
+
+
+def _records(kind: np.dtype, values: Mapping[str, NDArray]) -> NDArray[np.void]:
+    """Records [n] of a ``kind`` with the ``values`` [n] of its fields."""
+    out = np.empty(len(next(iter(values.values()))), kind)
+    for name, of_field in values.items():
+        out[name] = of_field
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,31 +136,17 @@ class WindowSurface:
 
     def surface(self, region: Region) -> GroundSurface:
         """The triangles that touch a ``region``, with all vertices."""
-        parts, start = [], 0
+        names = list(ARRAYS)[1:]
+        parts: dict[str, list[NDArray[np.void]]] = {name: [] for name in names}
+        start = 0
         for block in self.blocks:
-            arrays = self.store.arrays(block, list(ARRAYS)[6:])
-            parts.append(self._touching(arrays, start, region))
+            for name, triangles in self.store.arrays(block, names).items():
+                triangles["corner"] += np.int32(start)
+                corner = np.ascontiguousarray(triangles["corner"])
+                touching = np.flatnonzero(region.touching(self.vertices, corner))
+                parts[name].append(triangles.take(touching))  # a fourth of the time of a mask's
             start += self.store.sizes[block.name]
-        every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return _surface(self.vertices, every)
-
-    def _touching(
-        self, arrays: dict[str, NDArray], start: int, region: Region
-    ) -> dict[str, NDArray]:
-        """Of a block whose vertices begin at ``start``."""
-        out = {}
-        for name, beside in (
-            ("facet", ("variance", "bulge")),
-            ("whole", ()),
-            ("strip", ("strip_range",)),
-            ("top", ("top_residual", "is_gentle")),
-        ):
-            corner = arrays[name] + np.int32(start)
-            touching = np.flatnonzero(region.touching(self.vertices, corner))
-            out[name] = corner.take(touching, axis=0)  # a fourth of the time of a mask's
-            for values in beside:
-                out[values] = arrays[values].take(touching, axis=0)
-        return out
+        return _surface(self.vertices, {name: np.concatenate(of) for name, of in parts.items()})
 
 
 @kernel
@@ -158,22 +159,33 @@ def _height_range(h: NDArray[np.int64], corner: NDArray[np.int32]) -> NDArray[np
     return out
 
 
-def _surface(vertices: Vertices, arrays: dict[str, NDArray]) -> GroundSurface:
-    whole, top = arrays["whole"], arrays["top"]
-    whole_range = _height_range(vertices.h_q, whole)
-    top_range = _height_range(vertices.h_q, top)
-    residual = arrays["top_residual"].astype(np.float64)
-    undecided = np.concatenate([whole, arrays["strip"]])
+def _surface(vertices: Vertices, triangles: Mapping[str, NDArray[np.void]]) -> GroundSurface:
+    """Of records by the names of ARRAYS."""
+
+    def field(name: str, of: str) -> NDArray:
+        return np.ascontiguousarray(triangles[name][of])
+
+    facet, whole, strip, top = (
+        field(name, "corner") for name in ("facets", "whole", "strips", "tops")
+    )
+    top_range, residual = _height_range(vertices.h_q, top), field("tops", "residual")
+    heights = _height_range(vertices.h_q, whole), field("strips", "height_range").astype(np.int64)
+    undecided = np.concatenate([whole, strip])
     return GroundSurface(
         vertices=vertices,
-        facet=arrays["facet"],
-        variance=arrays["variance"],
-        bulge=arrays["bulge"],
+        facet=facet,
+        variance=field("facets", "variance"),
+        bulge=field("facets", "bulge"),
         undecided=undecided,
-        height_range=np.concatenate([whole_range, arrays["strip_range"].astype(np.int64)]),
+        height_range=np.concatenate(heights),
         whole=len(whole),
-        tops=RoughTops(top, residual, top_range[:, 1] - top_range[:, 0], arrays["is_gentle"]),
-        facet_origin=arrays["facet"][:, 0],
+        tops=RoughTops(
+            top,
+            residual.astype(np.float64),
+            top_range[:, 1] - top_range[:, 0],
+            field("tops", "is_gentle"),
+        ),
+        facet_origin=facet[:, 0],
         undecided_origin=undecided[:, 0],
     )
 
@@ -221,8 +233,9 @@ class SurfaceStore:
             and block.box[3] >= south
         )
 
-    def arrays(self, block: Block, names: Sequence[str]) -> dict[str, NDArray]:
-        """Arrays of a block by name. Raises InputError if they are not what was written."""
+    def arrays(self, block: Block, names: Sequence[str]) -> dict[str, NDArray[np.void]]:
+        """Records of a block by the names of their arrays. Raises InputError if they are not what
+        was written."""
         file = self.path / BLOCKS / f"{block.name}.npz"
         try:
             with np.load(file) as arrays:
@@ -234,12 +247,12 @@ class SurfaceStore:
                 remedy=f"delete {self.path} and run the workflow again",
             ) from error
 
-    def positions(self, block: Block, arrays: dict[str, NDArray]) -> tuple[NDArray[np.int64], ...]:
-        """Longitude, latitude and height (lattice steps) of a block's vertices, by its arrays."""
+    def positions(self, block: Block, vertices: NDArray[np.void]) -> tuple[NDArray[np.int64], ...]:
+        """Longitude, latitude and height (lattice steps) of a block's vertices."""
         col, row = (number * self.side for number in (block.col, block.row))
-        lon = arrays["lon"] + np.int64(col * self.scale.cell[0])
-        lat = arrays["lat"] + np.int64(row * self.scale.cell[1])
-        return lon, lat, arrays["height"].astype(np.int64)
+        lon = vertices["lon"] + np.int64(col * self.scale.cell[0])
+        lat = vertices["lat"] + np.int64(row * self.scale.cell[1])
+        return lon, lat, vertices["height"].astype(np.int64)
 
     def window(self, blocks: Sequence[Block]) -> WindowSurface:
         """Of some blocks, one at least."""
@@ -248,13 +261,12 @@ class SurfaceStore:
         first = tuple(int(q) // side for q, side in zip(corners, cell))
         parts = []
         for block in blocks:
-            a = self.arrays(block, list(ARRAYS)[:6])
+            a = self.arrays(block, ["vertices"])["vertices"]
             lon, lat, h = self.positions(block, a)
             x = (lon - first[0] * cell[0]) * PART // cell[0]
             y = (lat - first[1] * cell[1]) * PART // cell[1]
             count = a["count"].astype(np.int32)
-            day = np.broadcast_to(a["day"], lon.shape)
-            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count, day))
+            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count, a["day"]))
             self.sizes[block.name] = lon.size
         vertices = Vertices(*(np.concatenate(values) for values in zip(*parts)))
         return WindowSurface(self, tuple(blocks), vertices, first)

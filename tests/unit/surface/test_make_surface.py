@@ -53,20 +53,17 @@ class East:
 
 def triangles(store: SurfaceStore) -> dict[str, set]:
     """All triangles of a surface by the lattice positions of their vertices, with their values."""
-    found = {name: set() for name in ("facet", "whole", "strip", "top")}
-    beside = {"facet": ("variance", "bulge"), "strip": ("strip_range",), "top": ("top_residual",)}
+    found = {name: set() for name in list(ARRAYS)[1:]}
     for block in store.every:
         a = store.arrays(block, list(ARRAYS))
-        lon, lat = (
-            a[name] + np.int64(number * store.side * size)
-            for name, number, size in zip(("lon", "lat"), (block.col, block.row), store.scale.cell)
-        )
-        corners = np.stack([lon, lat, a["height"], a["count"]], axis=1).astype(np.int64)
+        vertices = a["vertices"]
+        positions = store.positions(block, vertices)
+        corners = np.stack([*positions, vertices["count"]], axis=1).astype(np.int64)
         for name, into in found.items():
-            values = [a[other] for other in beside.get(name, ())]
-            for k, corner in enumerate(a[name]):
-                told = tuple(value[k].tobytes() for value in values)
-                into.add((corners[corner].tobytes(), *told))
+            beside = ARRAYS[name].names[1:]
+            for triangle in a[name]:
+                told = tuple(triangle[field].tobytes() for field in beside)
+                into.add((corners[triangle["corner"]].tobytes(), *told))
     return found
 
 
@@ -82,8 +79,8 @@ def test_triangles_are_the_same_for_any_blocks(stores, tmp_path, monkeypatch):
         other = SurfaceStore(tmp_path / f"{side}")
         assert len(other.every) > 3 * len(one.every) or len(other.every) <= 4
         assert triangles(other) == expected
-        total = sum(len(other.arrays(block, ["facet"])["facet"]) for block in other.every)
-        assert total == len(expected["facet"])  # each triangle once
+        total = sum(len(other.arrays(block, ["facets"])["facets"]) for block in other.every)
+        assert total == len(expected["facets"])  # each triangle once
 
 
 @pytest.mark.slow
@@ -162,11 +159,10 @@ def facets_of(store: SurfaceStore) -> set[tuple]:
     found = set()
     for block in store.every:
         a = store.arrays(block, list(ARRAYS))
-        lon = (a["lon"] + np.int64(block.col * store.side * CELL[0])) * LATTICE_DEG
-        lat = (a["lat"] + np.int64(block.row * store.side * CELL[1])) * LATTICE_DEG
-        vertices = np.stack([lon, lat, a["height"]], axis=1)
-        for corner, *figures in zip(a["facet"], a["variance"], a["bulge"]):
-            found.add((*map(tuple, vertices[corner].tolist()), *map(float, figures)))
+        lon, lat, height = store.positions(block, a["vertices"])
+        vertices = np.stack([lon * LATTICE_DEG, lat * LATTICE_DEG, height], axis=1)
+        for corner, *figures in a["facets"].tolist():
+            found.add((*map(tuple, vertices[list(corner)].tolist()), *figures))
     return found
 
 
