@@ -4,7 +4,8 @@
 # make dataset        set up, then make the tiles of all cities in the layout of the published dataset
 # make verify         hold all tiles against the checksums of their manifests
 # make test           set up, then pass the tests that every change needs
-# make test-all       set up, then pass all: whole runs, kills, draws, browsers, benchmarks, real scenes too
+# make test-slow      set up, then pass the others: whole runs, kills, draws, browsers, benchmarks, real scenes
+# make test-all       set up, then pass both
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 # make test-s3        set up, then pass the tests with object storage (a server of its own)
@@ -21,7 +22,7 @@ AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or 
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup first-run first-city first-labels help docs networks test test-all test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup first-run first-city first-labels help docs networks test test-all test-slow test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -57,7 +58,9 @@ dataset verify: %: $(READY) FORCE
 test: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE) -m "not slow"
 
-test-all: test
+test-all: test test-slow
+
+test-slow: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) -m slow
 
 # Warnings are errors; links to what is not there are such.

@@ -110,10 +110,9 @@ def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
 class Crowns:
     """What rough surfaces show at the centres of pixels; arrays [h, w].
 
-    ``visible``: from both cameras. ``labels``: disparity px, slope, variance px² (of the points and
-    of what is between them); ``height`` m, ``surface_class`` (ASPRS) and ``day`` of the nearest
-    point: NaN (0) where there is none. ``tops`` px: disparity of the nearest triangle of tops,
-    steep ones too.
+    ``visible``: from both cameras. Of these ``labels``: disparity px, slope, variance px² (of the
+    points and of what is between them); ``height`` m, ``surface_class`` (ASPRS) and ``day`` of the
+    nearest point. ``tops`` px: disparity of the nearest triangle of tops, steep ones too.
     """
 
     visible: Bools
@@ -150,12 +149,15 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     labelled &= _clearance(disparity, all_around, spacing_rows) >= CLEARANCE_PX
     labelled &= ~_hidden_in_right(visible, rough, xy, labelled, disparity)
 
+    index[~labelled] = -1
     values = PixelValues.none(shape)
     none = np.zeros(len(corner), np.float32)
     of_vertices = tops.h_q, tops.surface_class, tops.day, tops.count
     facets = FacetValues(xy, corner, *of_vertices, none, none)
     interpolate(facets, index, first, values)
-    variance = _variance(rough, index, all_around, scale)
+    variance = np.full(shape, np.nan)
+    higher = _higher(all_around, 1)[labelled]
+    variance[labelled] = _variance(rough, index[labelled], higher, scale)
     labelled &= values.surface_class != WATER_CLASS
     labels = Labels(disparity, values.slope, variance)
     of_pixels = values.height * LATTICE_M, values.surface_class, values.day
@@ -202,16 +204,16 @@ def _hidden_in_right(
 
 
 def _variance(
-    rough: RoughTops, index: NDArray[np.int32], all_around: Floats, scale: PixelScale
+    rough: RoughTops, index: NDArray[np.int32], higher: Floats, scale: PixelScale
 ) -> Floats:
-    """Variance px² [h, w] of what the triangle ``index`` of tops shows (eq. 12 of
-    docs/explanation/surface.md)."""
+    """Variance px² [n] of what the triangle ``index`` of tops shows, of pixels beside which others
+    are ``higher`` by so much, px (eq. 12 of docs/explanation/surface.md)."""
     step_px = scale.px_per_m * LATTICE_M
     parts = (
         np.full(index.shape, OWN),
-        RESIDUAL * np.append((rough.residual * step_px)[rough.is_gentle], np.nan)[index],
-        RISE * np.append((rough.rise * step_px)[rough.is_gentle], np.nan)[index],
-        HIGHER * _higher(all_around, 1),
+        RESIDUAL * (rough.residual * step_px)[rough.is_gentle][index],
+        RISE * (rough.rise * step_px)[rough.is_gentle][index],
+        HIGHER * higher,
     )
     return sum(part**2 for part in parts) * scale.spacing_px ** (2.0 * GROWTH)
 

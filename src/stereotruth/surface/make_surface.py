@@ -116,6 +116,7 @@ class _Maker:
         touched = [store for store in self.stores if store.height_range(*box) is not None]
         return digest(
             {
+                "format": FORMAT,
                 "scale": asdict(self.scale),
                 "side": self.side,
                 "blocks": list(parts.items()),
