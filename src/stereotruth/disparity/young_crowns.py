@@ -15,9 +15,9 @@ from .status import VEGETATION_CLASSES
 Bools = NDArray[np.bool_]
 
 # A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
-# 2.6 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by
+# 2.4 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by
 # one.
-YOUNG_REACH_PX, YOUNG_PIXELS = 3, 16
+YOUNG_REACH_PX, YOUNG_PIXELS = 3, 14
 
 
 def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:

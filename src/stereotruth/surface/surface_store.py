@@ -110,7 +110,7 @@ def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> 
             "is_gentle": surface.tops.is_gentle,
         },
     }
-    np.savez(path, **{name: _records(ARRAYS[name], of) for name, of in values.items()})
+    np.savez(path, **{name: _records(kind, values[name]) for name, kind in ARRAYS.items()})
     lon, lat, h = vertices.lon_q, vertices.lat_q, vertices.h_q
     box = [int(value) for value in (lon.min(), lat.min(), lon.max(), lat.max())]
     return {"box": box, "heights": [int(h.min()), int(h.max())]}
@@ -146,7 +146,7 @@ class WindowSurface:
                 touching = np.flatnonzero(region.touching(self.vertices, corner))
                 parts[name].append(triangles.take(touching))  # a fourth of the time of a mask's
             start += self.store.sizes[block.name]
-        return _surface(self.vertices, {name: np.concatenate(of) for name, of in parts.items()})
+        return _surface(self.vertices, {name: np.concatenate(part) for name, part in parts.items()})
 
 
 @kernel
@@ -162,8 +162,8 @@ def _height_range(h: NDArray[np.int64], corner: NDArray[np.int32]) -> NDArray[np
 def _surface(vertices: Vertices, triangles: Mapping[str, NDArray[np.void]]) -> GroundSurface:
     """Of records by the names of ARRAYS."""
 
-    def field(name: str, of: str) -> NDArray:
-        return np.ascontiguousarray(triangles[name][of])
+    def field(name: str, value: str) -> NDArray:
+        return np.ascontiguousarray(triangles[name][value])
 
     facet, whole, strip, top = (
         field(name, "corner") for name in ("facets", "whole", "strips", "tops")
