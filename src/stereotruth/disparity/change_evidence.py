@@ -156,7 +156,9 @@ class Evidence(NamedTuple):
 def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     """Which labelled pixels [h, w] of a window do not agree closely, and the evidence of these."""
     with_noise, expected = compared.correlation(CLOSE_PX)
-    close = np.minimum(with_noise / expected, np.float32(1.0))
+    # others have a value where they lie between labelled ones, or none, as windows begin
+    close = np.where(compared.labelled, with_noise / expected, np.float32(np.nan))
+    close = np.minimum(close, np.float32(1.0))
     close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
     doubtful = compared.labelled & ~(close_mean > AGREED)
     detail = shifted_agreement(

@@ -52,6 +52,7 @@ HIGHER_PX, HIGHER_REACH = 4.0, 3
 # image. The next BESIDE_PX of a row can do so. Contours of crowns lie beyond their last points, by
 # about a spacing of points. Six drawn scenes: bench/README.md, refinement.py.
 CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
+CROWN_REACH_PX = BESIDE_PX + 1  # pixels around one that its label follows from
 # Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
 # the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
 # to the power of GROWTH.

@@ -115,10 +115,10 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
 def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
     """The labels of a window by the surface of the points around it, as far as images agree."""
     labels, rough, own, window, comparison = lidar_labels(scene, window, points)
-    # changes count up to REASON_PX off; labels without a say in these need no images
-    labels = labels.around(window.grown(REASON_PX + MEANS_PX))
     is_rough = labels.status == Status.EDGE_IN_PIXEL
     labels = with_crowns(labels, rough, window)
+    # changes count up to REASON_PX off; labels without a say in these need no images
+    labels = labels.around(window.grown(REASON_PX + MEANS_PX + 1))
     labels = without_changes(labels, window, comparison)
     return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)
 

@@ -77,10 +77,11 @@ class Settings:
         from .change_evidence import EVIDENCE_PX
         from .change_probability import MEANS_PX
         from .change_reasons import REASON_PX
+        from .crowns import CROWN_REACH_PX
         from .seen_surface import OUTER_RINGS
 
-        # one for each ring of neighbours: planes, their pooled noise, support
-        reach = OUTER_RINGS + 3
+        # a ring for each of planes, their pooled noise, support; or what may hide crowns
+        reach = max(OUTER_RINGS + 3, CROWN_REACH_PX)
         # what the images tell of a pixel, and of those around
         reach += MEANS_PX + max(EVIDENCE_PX, self.window // 2 + 1)
         return reach + REASON_PX  # of changes

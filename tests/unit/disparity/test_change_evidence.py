@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import (
+    EVIDENCE_PX,
     FAR_PX,
     OFF_SHARE,
     Evidence,
     LabelledWindow,
     change_evidence,
 )
+from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
+from stereotruth.epipolar.surface_correlation import BLOCK
 
 from ...synthetic.textured_fields import (
     ALL,
@@ -67,6 +70,42 @@ def test_gain_is_what_brightness_differs_by_from_that_around() -> None:
     at[doubtful] = evidence.gain
     share = 64 / 81  # of the means of 9 x 9 px, and of those up to 16 px off one in 81 every 4 px
     assert at[59, 74] == pytest.approx(np.log(2.0) * (share - 4 / 81), abs=0.05)
+
+
+def test_evidence_is_the_same_in_any_window() -> None:
+    """Labels with gaps, which the runs of a wide window end in or bridge as it begins."""
+    rng, shape = np.random.default_rng(6), (60, 3 * BLOCK)
+    left, other = rng.uniform(450.0, 550.0, (2, shape[0], shape[1] + 160)).round()
+    right = np.roll(left, -4, axis=1)
+    right[20:40] = other[20:40]
+    labelled, every = rng.uniform(size=shape) < 0.7, slice(0, left.shape[1])
+
+    def within(rows: slice, cols: slice) -> np.ndarray:
+        """All evidence [k, h, w] of a part, NaN for none."""
+        level = np.full((rows.stop - rows.start, cols.stop - cols.start), 4.0)
+        there = slice(cols.start + 80, cols.stop + 80)
+        patches = read_patch(left, rows, there, 1), read_patch(right, rows, every, 1)
+        labels = Labels(level, np.zeros((2, *level.shape)), np.zeros_like(level))
+        doubtful, evidence = change_evidence(
+            LabelledWindow(
+                PairWindow(rows, there, 0, *patches),
+                labels,
+                labelled[rows, cols],
+                np.full(level.shape, 2, np.uint8),
+                (0.0, 0.0),
+            )
+        )
+        out = np.full((len(evidence), *doubtful.shape), np.nan, np.float32)
+        out[:, doubtful] = evidence
+        return out
+
+    inner = slice(EVIDENCE_PX, -EVIDENCE_PX)
+    whole = within(slice(0, shape[0]), slice(0, shape[1]))
+    for first in range(1, 40, 3):
+        part = slice(0, shape[0]), slice(first, shape[1])
+        found = within(*part)[:, inner, inner]
+        assert np.isfinite(found).any()
+        assert np.array_equal(found, whole[:, *part][:, inner, inner], equal_nan=True)
 
 
 def test_steps_of_the_surface_are_told_by_their_distance() -> None:
