@@ -4,8 +4,8 @@
 # make dataset        set up, then make the tiles of all cities in the layout of the published dataset
 # make verify         hold all tiles against the checksums of their manifests
 # make test           set up, then pass the tests that every change needs
-# make test-slow      set up, then pass the others: whole runs, kills, draws, browsers, benchmarks, real scenes
-# make test-all       set up, then pass both
+# make test-slow      set up, then pass the slow tests: whole runs, kills, draws, browsers, benchmarks, real scenes
+# make test-all       test and test-slow
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 # make test-s3        set up, then pass the tests with object storage (a server of its own)

@@ -101,11 +101,15 @@ class LabelledWindow:
 
     def correlation(self, window_px: int) -> tuple[Singles, Singles]:
         """Of both images over each pixel's surface, and the one expected of the same ground, see
-        :func:`.correlation_and_expected`; of the labelled pixels."""
+        :func:`.correlation_and_expected`; NaN where a pixel is not labelled."""
         runs = wanted_runs(self.labelled)
-        return correlation_and_expected(
+        of_runs = correlation_and_expected(
             *self.images, *self.surface, window_px, self.noise, self.clear, runs
         )
+        # runs hold other pixels, too; which ones follows from the window's first column
+        none = np.float32(np.nan)
+        correlation, expected = (np.where(self.labelled, values, none) for values in of_runs)
+        return correlation, expected
 
 
 class Evidence(NamedTuple):
@@ -156,9 +160,7 @@ class Evidence(NamedTuple):
 def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     """Which labelled pixels [h, w] of a window do not agree closely, and the evidence of these."""
     with_noise, expected = compared.correlation(CLOSE_PX)
-    # others have a value where they lie between labelled ones, or none, as windows begin
-    close = np.where(compared.labelled, with_noise / expected, np.float32(np.nan))
-    close = np.minimum(close, np.float32(1.0))
+    close = np.minimum(with_noise / expected, np.float32(1.0))
     close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
     doubtful = compared.labelled & ~(close_mean > AGREED)
     detail = shifted_agreement(

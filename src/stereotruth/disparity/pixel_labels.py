@@ -339,6 +339,6 @@ def own_labels(
     labels = at_centres(pixels, pixels.count >= min_points, points.first, px_per_m)
     if edge_margin_px == 0.0:
         on_edge = np.zeros(points.shape, np.bool_)
-    # a copy: that of all sums would stay as long
+    # copied, so that the sums of all pixels, which the counts are a part of, are freed
     own = OwnPoints(pixels.count.copy(), pixels.highest, pixels.surface_class)
     return OwnLabels(labels, own, on_edge, points.count)

@@ -117,7 +117,8 @@ def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints)
     labels, rough, own, window, comparison = lidar_labels(scene, window, points)
     is_rough = labels.status == Status.EDGE_IN_PIXEL
     labels = with_crowns(labels, rough, window)
-    # changes count up to REASON_PX off; labels without a say in these need no images
+    # Reasons follow from changes up to REASON_PX off, these from probabilities up to MEANS_PX off,
+    # and these from the agreement of the pixels beside. Labels farther off need no images.
     labels = labels.around(window.grown(REASON_PX + MEANS_PX + 1))
     labels = without_changes(labels, window, comparison)
     return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)

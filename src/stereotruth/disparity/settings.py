@@ -80,7 +80,8 @@ class Settings:
         from .crowns import CROWN_REACH_PX
         from .seen_surface import OUTER_RINGS
 
-        # a ring for each of planes, their pooled noise, support; or what may hide crowns
+        # the rings of neighbours of a pixel's own points, and of their plane, its pooled noise and
+        # its support; or what may hide a crown
         reach = max(OUTER_RINGS + 3, CROWN_REACH_PX)
         # what the images tell of a pixel, and of those around
         reach += MEANS_PX + max(EVIDENCE_PX, self.window // 2 + 1)

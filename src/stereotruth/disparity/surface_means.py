@@ -66,8 +66,8 @@ class Voters(NamedTuple):
 
     Arrays with ``reach`` columns more on the left, and ``reach`` + 2 ``every`` on the right, in
     which none has. ``value`` [n, h, w] in each image, 0 for none; ``disparity`` [h, w] of those
-    that have one, else NaN. Of pixels up to ``reach`` px off one of so many (``every``) votes: of a
-    row those so far off, and of the rows those from ``first`` on.
+    that have one, else NaN. Of the columns and rows up to ``reach`` px off one in ``every``
+    votes: columns are counted from the pixel itself, rows from the row ``first`` of the arrays.
     """
 
     value: Singles

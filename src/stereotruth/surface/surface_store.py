@@ -47,6 +47,7 @@ ARRAYS = {  # of records
     "strips": np.dtype([CORNER, ("height_range", "<i4", 2)]),
     "tops": np.dtype([CORNER, ("residual", "<f4"), ("is_gentle", "?")]),
 }  # fmt: skip
+TRIANGLES = "facets", "whole", "strips", "tops"  # the arrays whose records have corners
 CONTENTS = {
     "vertices": "lon, lat from the block's south-west corner, 1e-9 degree; height above the WGS 84 "
     "ellipsoid, 1e-4 m; count of points that it is the mean of, 65535 stands for more, too; day "
@@ -136,11 +137,10 @@ class WindowSurface:
 
     def surface(self, region: Region) -> GroundSurface:
         """The triangles that touch a ``region``, with all vertices."""
-        names = list(ARRAYS)[1:]
-        parts: dict[str, list[NDArray[np.void]]] = {name: [] for name in names}
+        parts: dict[str, list[NDArray[np.void]]] = {name: [] for name in TRIANGLES}
         start = 0
         for block in self.blocks:
-            for name, triangles in self.store.arrays(block, names).items():
+            for name, triangles in self.store.arrays(block, TRIANGLES).items():
                 triangles["corner"] += np.int32(start)
                 corner = np.ascontiguousarray(triangles["corner"])
                 touching = np.flatnonzero(region.touching(self.vertices, corner))
@@ -165,9 +165,7 @@ def _surface(vertices: Vertices, triangles: Mapping[str, NDArray[np.void]]) -> G
     def field(name: str, value: str) -> NDArray:
         return np.ascontiguousarray(triangles[name][value])
 
-    facet, whole, strip, top = (
-        field(name, "corner") for name in ("facets", "whole", "strips", "tops")
-    )
+    facet, whole, strip, top = (field(name, "corner") for name in TRIANGLES)
     top_range, residual = _height_range(vertices.h_q, top), field("tops", "residual")
     heights = _height_range(vertices.h_q, whole), field("strips", "height_range").astype(np.int64)
     undecided = np.concatenate([whole, strip])

@@ -13,7 +13,7 @@ from stereotruth.surface import make_surface as module
 from stereotruth.surface.delaunay import MAX_PARTS
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import PART, SurfaceScale
-from stereotruth.surface.surface_store import ARRAYS, SurfaceStore
+from stereotruth.surface.surface_store import ARRAYS, TRIANGLES, SurfaceStore
 
 from ...synthetic.box_scene import points_on, write_points
 from ...synthetic.stores import tree_digest
@@ -53,7 +53,7 @@ class East:
 
 def triangles(store: SurfaceStore) -> dict[str, set]:
     """All triangles of a surface by the lattice positions of their vertices, with their values."""
-    found = {name: set() for name in list(ARRAYS)[1:]}
+    found = {name: set() for name in TRIANGLES}
     for block in store.every:
         a = store.arrays(block, list(ARRAYS))
         vertices = a["vertices"]
