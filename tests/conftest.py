@@ -23,18 +23,25 @@ FIRST = (
 
 def pytest_collection_modifyitems(items):
     """Whole runs before short tests, so that no process is left with one at the end; those that
-    need the stages after the tiles are slow."""
+    need the stages after the tiles are slow, and come when these stages have run."""
+    waiting = {_file(item) for item in items if "later" in item.fixturenames}
 
     def place(item: pytest.Item) -> int:
-        file = PurePosixPath(item.nodeid.partition("::")[0])
+        file = _file(item)
         if file.parent.name != "workflow":
-            return len(FIRST) + 1
-        return FIRST.index(file.stem) if file.stem in FIRST else len(FIRST)
+            return len(FIRST) + 2
+        if file.stem in FIRST:
+            return FIRST.index(file.stem)
+        return len(FIRST) + (file in waiting)
 
     items.sort(key=place)
     for item in items:
         if "later" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
+
+
+def _file(item: pytest.Item) -> PurePosixPath:
+    return PurePosixPath(item.nodeid.partition("::")[0])
 
 
 @pytest.hookimpl(optionalhook=True)

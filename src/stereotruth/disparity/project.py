@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import dask
+import dask.threaded
 import numpy as np
 from numpy.typing import NDArray
 
@@ -216,7 +217,7 @@ def project_scene(
     code: str,
     scene: str = "",
     workers: int = 1,
-    scheduler: Any = "threads",
+    scheduler: Any = dask.threaded.get,
     max_points: int = MAX_POINTS,
     strip: Strip | None = None,
 ) -> dict[str, Any] | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import dask.threaded
 import numpy as np
 from numpy.typing import NDArray
 
@@ -166,7 +167,7 @@ def rectify_image(
         for i, (_, rows, cols) in enumerate(todo)
     ]
     with block_progress(len(tasks), what):
-        dask.compute(*tasks, scheduler="threads", num_workers=workers)
+        dask.compute(*tasks, scheduler=dask.threaded.get, num_workers=workers)
     if strip is not None:
         return {}
     valid = int(sum(target.results(every)))

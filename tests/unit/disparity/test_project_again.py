@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import dask.threaded
 import numpy as np
 import pytest
 import zarr
@@ -153,4 +154,4 @@ def test_a_scheduler_that_is_not_there_is_named():
     ):
         pass
     with dask_scheduler(None) as scheduler:
-        assert scheduler == "threads"
+        assert scheduler is dask.threaded.get

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import dask.threaded
 import numpy as np
 import zarr
 from numpy.typing import NDArray
@@ -175,7 +176,7 @@ def predict_scene(
     entry: Mapping[str, Any],
     settings: Settings,
     workers: int = 1,
-    scheduler: Any = "threads",
+    scheduler: Any = dask.threaded.get,
     code: str = "",
     scene: str = "",
 ) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import dask.threaded
 import numpy as np
 import pyproj
 import zarr
@@ -309,7 +310,7 @@ def write_dsm(
     *,
     resolution_m: float | None = Settings.resolution_m,
     workers: int = 1,
-    scheduler: Any = "threads",
+    scheduler: Any = dask.threaded.get,
     code: str = "",
     scene: str = "",
 ) -> dict[str, Any]:

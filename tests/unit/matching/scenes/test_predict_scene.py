@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import dask.threaded
 import numpy as np
 import pytest
 import zarr
@@ -33,7 +34,9 @@ GIVEN = {
 }
 
 
-def predict(left, right, out, *, method, entry, code, workers=1, scheduler="threads", **settings):
+def predict(
+    left, right, out, *, method, entry, code, workers=1, scheduler=dask.threaded.get, **settings
+):
     how = {"method": method, "entry": entry, "code": code, "settings": Settings(**settings)}
     return predict_scene(left, right, out, **how, workers=workers, scheduler=scheduler)
 
