@@ -26,6 +26,7 @@ from .view_geometry import ViewGeometry
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 
 CUBE_BITS = CELL_BITS - 1  # lattice steps along a cube's side
@@ -89,7 +90,7 @@ def _fit(
     terms: Ints,
     tolerance: float,
     out: Floats,
-    good: NDArray[np.bool_],
+    good: Bools,
 ) -> None:
     """``values`` [4, cubes, 64] at nodes, ``checks`` [4, cubes, 9] at ``positions``; ``out``
     [cubes, 80]."""
@@ -129,15 +130,16 @@ def _at_points(
     low: Ints,
     shape: Ints,
     coefficients: Floats,
-    good: NDArray[np.bool_],
+    good: Bools,
     lon_q: Ints,
     lat_q: Ints,
     h_q: Ints,
     out: Floats,
+    lifted: Bools,
     rise: Singles,
 ) -> int:
-    """Returns how many points lie in cubes that are not ``good``: of these out[0] is NaN; ``rise``
-    [4, n or 0].
+    """Returns how many points lie in cubes that are not ``good``: of these out[0] is NaN; fills
+    ``rise`` [4, n] of those that are ``lifted`` [n or 0].
 
     By runs of points in one cube, and blocks of these through small arrays: vectorised.
     """
@@ -145,6 +147,7 @@ def _at_points(
     mask = (1 << CUBE_BITS) - 1
     position = np.empty(3 * _RUN)
     values = np.empty(4 * _RUN)
+    chosen = np.empty(_RUN, np.int64)
     c = np.empty(80)
     n = lon_q.size
     start = 0
@@ -179,15 +182,24 @@ def _at_points(
             out[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
         if not good[cube]:
             out[0, start:end] = np.nan
-        if rise.size:
+        if lifted.size:
+            count = 0
             for m in range(size):
-                x, y, z = position[m], position[_RUN + m], position[2 * _RUN + m]
-                values[m] = _rise(c, 0, x, y, z) * _SCALE
-                values[_RUN + m] = _rise(c, 20, x, y, z) * _SCALE
-                values[2 * _RUN + m] = _rise(c, 40, x, y, z) * _SCALE
-                values[3 * _RUN + m] = _rise(c, 60, x, y, z) * _SCALE
+                chosen[count] = m
+                count += lifted[start + m]
+            for q in range(count):
+                m = chosen[q]
+                for axis in range(3):
+                    position[axis * _RUN + q] = position[axis * _RUN + m]
+            for q in range(count):
+                x, y, z = position[q], position[_RUN + q], position[2 * _RUN + q]
+                values[q] = _rise(c, 0, x, y, z) * _SCALE
+                values[_RUN + q] = _rise(c, 20, x, y, z) * _SCALE
+                values[2 * _RUN + q] = _rise(c, 40, x, y, z) * _SCALE
+                values[3 * _RUN + q] = _rise(c, 60, x, y, z) * _SCALE
             for axis in range(4):
-                rise[axis, start:end] = values[axis * _RUN : axis * _RUN + size]
+                for q in range(count):
+                    rise[axis, start + chosen[q]] = values[axis * _RUN + q]
         start = end
     return bad
 
@@ -197,7 +209,7 @@ def _at_means(
     low: Ints,
     shape: Ints,
     coefficients: Floats,
-    good: NDArray[np.bool_],
+    good: Bools,
     sums: Ints,
     out: Floats,
 ) -> int:
@@ -240,7 +252,7 @@ class LocalProjection:
     low: Ints
     shape: Ints
     coefficients: Floats
-    good: NDArray[np.bool_]
+    good: Bools
 
     @classmethod
     def of(cls, model: ViewGeometry, low: ArrayLike, high: ArrayLike) -> LocalProjection:
@@ -277,21 +289,25 @@ class LocalProjection:
 
     def at_points(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
         """float64[4, n] = x_left, y_left, x_right, y_right (px) of lattice points in the box."""
-        return self._at(lon_q, lat_q, h_q, np.empty((4, 0), np.float32))
+        none = np.empty(0, np.bool_), np.empty((4, 0), np.float32)
+        return self._at((lon_q, lat_q, h_q), *none)
 
-    def with_rise(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> tuple[Floats, Singles]:
-        """:meth:`at_points`, and by how much a lattice step of height changes it, float32[4, n]."""
+    def with_rise(
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, lifted: Bools
+    ) -> tuple[Floats, Singles]:
+        """:meth:`at_points`, and by how much a lattice step of height changes it, float32[4, n]: of
+        the points that are ``lifted`` [n], undefined of the others."""
         rise = np.empty((4, lon_q.size), np.float32)
-        return self._at(lon_q, lat_q, h_q, rise), rise
+        return self._at((lon_q, lat_q, h_q), lifted, rise), rise
 
-    def _at(self, lon_q: Ints, lat_q: Ints, h_q: Ints, rise: Singles) -> Floats:
-        """:meth:`at_points`; fills ``rise`` unless it is empty."""
-        out, lattice = np.empty((4, lon_q.size)), (lon_q, lat_q, h_q)
-        if _at_points(self.low, self.shape, self.coefficients, self.good, *lattice, out, rise):
+    def _at(self, lattice: tuple[Ints, Ints, Ints], lifted: Bools, rise: Singles) -> Floats:
+        """:meth:`at_points`; fills ``rise`` where points are ``lifted``, unless that is empty."""
+        out, cubes = np.empty((4, lattice[0].size)), (self.low, self.shape, self.coefficients)
+        if _at_points(*cubes, self.good, *lattice, out, lifted, rise):
             bad = np.isnan(out[0])
             lon, lat, h = (q[bad] / per for q, per in zip(lattice, (_PER_DEG, _PER_DEG, _PER_M)))
             out[:, bad] = self.model.ground_to_epipolar(lon, lat, h)
-            if rise.size:
+            if lifted.size:
                 higher = self.model.ground_to_epipolar(lon, lat, h + _RISE_M)
                 rise[:, bad] = (higher - out[:, bad]) / (_RISE_M * _PER_M)
         return out

@@ -48,8 +48,8 @@ NO_FACET, VISIBLE, PRISM_IN_LEFT, PRISM_IN_RIGHT, FACET_IN_RIGHT = range(5)
 @dataclass(frozen=True, eq=False)
 class ProjectedSurface:
     """A surface in both images: ``xy`` [4, n] of its vertices (px), in a window of the left grid
-    whose first pixel is (row, col) ``first``; ``rise`` [4, n] of these by a lattice step of
-    height."""
+    whose first pixel is (row, col) ``first``; ``rise`` [4, n] of those of undecided triangles by a
+    lattice step of height."""
 
     surface: GroundSurface
     xy: Floats
@@ -62,7 +62,9 @@ class ProjectedSurface:
     ) -> ProjectedSurface:
         """``projection`` holds all that lies in the box of the vertices."""
         vertices = surface.vertices
-        xy, rise = projection.with_rise(vertices.lon_q, vertices.lat_q, vertices.h_q)
+        lifted = np.zeros(vertices.x.size, np.bool_)
+        lifted[surface.undecided.reshape(-1)] = True
+        xy, rise = projection.with_rise(vertices.lon_q, vertices.lat_q, vertices.h_q, lifted)
         return cls(surface, xy, rise, first)
 
     def raster_prisms(self, undecided: slice, z_buffer: Floats) -> None:

@@ -48,11 +48,11 @@ def greatest_around(values: Ints, reach: int) -> Ints:
 
 
 @kernel
-def _touching(x: Ints, y: Ints, corner: Steps, squares: Bools) -> Bools:
+def _touching(x: Ints, y: Ints, corner: Steps, start: int, squares: Bools) -> Bools:
     """Which triangles' bounding boxes touch one of the ``squares``."""
     out = np.zeros(len(corner), np.bool_)
     for t in range(len(corner)):
-        a, b, c = corner[t]
+        a, b, c = start + corner[t, 0], start + corner[t, 1], start + corner[t, 2]
         west, east = min(x[a], x[b], x[c]) >> SQUARE_BITS, max(x[a], x[b], x[c]) >> SQUARE_BITS
         south, north = min(y[a], y[b], y[c]) >> SQUARE_BITS, max(y[a], y[b], y[c]) >> SQUARE_BITS
         for j in range(south, north + 1):
@@ -67,6 +67,7 @@ class Region:
 
     squares: Bools
 
-    def touching(self, vertices: Vertices, corner: Steps) -> Bools:
-        """Which triangles [m, 3] lie in the region at least in part."""
-        return _touching(vertices.x, vertices.y, corner, self.squares)
+    def touching(self, vertices: Vertices, corner: Steps, start: int) -> Bools:
+        """Which triangles [m, 3] lie in the region at least in part; their corners count from the
+        vertex ``start``."""
+        return _touching(vertices.x, vertices.y, corner, start, self.squares)

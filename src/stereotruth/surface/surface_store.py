@@ -15,6 +15,7 @@ boxes it sees (:meth:`SurfaceStore.blocks`), taken in their order.
 
 from __future__ import annotations
 
+import io
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.format import read_array_header_1_0, read_magic
 from numpy.typing import NDArray
 
 from ..errors import InputError
@@ -125,6 +127,15 @@ def _records(kind: np.dtype, values: Mapping[str, NDArray]) -> NDArray[np.void]:
     return out
 
 
+def _array(file: bytes) -> NDArray[np.void]:
+    """The records of an array's ``file``, where they are: NumPy would copy them piece by piece."""
+    stream = io.BytesIO(file)
+    if read_magic(stream) != (1, 0):
+        raise ValueError("another version of NumPy's format")
+    shape, _, kind = read_array_header_1_0(stream)
+    return np.frombuffer(file, kind, offset=stream.tell()).reshape(shape)
+
+
 @dataclass(frozen=True, eq=False)
 class WindowSurface:
     """What a window may see of a surface: the ``blocks`` of a ``store``, and all their
@@ -141,10 +152,10 @@ class WindowSurface:
         start = 0
         for block in self.blocks:
             for name, triangles in self.store.arrays(block, TRIANGLES).items():
-                triangles["corner"] += np.int32(start)
-                corner = np.ascontiguousarray(triangles["corner"])
-                touching = np.flatnonzero(region.touching(self.vertices, corner))
-                parts[name].append(triangles.take(touching))  # a fourth of the time of a mask's
+                touching = region.touching(self.vertices, triangles["corner"], start)
+                taken = triangles.take(np.flatnonzero(touching))  # a fourth of a mask's time
+                taken["corner"] += np.int32(start)
+                parts[name].append(taken)
             start += self.store.sizes[block.name]
         return _surface(self.vertices, {name: np.concatenate(part) for name, part in parts.items()})
 
@@ -236,9 +247,9 @@ class SurfaceStore:
         was written."""
         file = self.path / BLOCKS / f"{block.name}.npz"
         try:
-            with np.load(file) as arrays:
-                return {name: arrays[name] for name in names}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            with zipfile.ZipFile(file) as archive:
+                return {name: _array(archive.read(f"{name}.npy")) for name in names}
+        except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
             raise InputError(
                 "damaged: it is not what was written",
                 file=file,

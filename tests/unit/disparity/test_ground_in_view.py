@@ -65,10 +65,10 @@ def test_triangles_that_touch_stay() -> None:
     view = Region(squares)
     corner = np.array([[400 * j + i, 400 * j + i + 1, 400 * (j + 1) + i]
                        for j, i in ((160, 159), (160, 158), (175, 175), (176, 170))])  # fmt: skip
-    touching = view.touching(found, corner.astype(np.int32))
+    touching = view.touching(found, corner.astype(np.int32) - 100, 100)
     assert touching.tolist() == [True, False, True, False]
     across = np.array([[400 * 150 + 150, 400 * 150 + 190, 400 * 190 + 150]], np.int32)
-    assert view.touching(found, across).all()
+    assert view.touching(found, across, 0).all()
 
 
 @pytest.mark.parametrize("view", ["left", "right"])

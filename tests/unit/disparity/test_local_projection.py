@@ -52,6 +52,20 @@ def test_points_and_means_are_where_the_model_has_them(model) -> None:
     assert np.abs(found - expected)[:, known].max() < 1e-5
 
 
+@pytest.mark.parametrize("rough", [False, True])
+def test_the_rise_is_what_a_metre_of_height_changes(model, rough) -> None:
+    model = Rough() if rough else model
+    lattice = points(5000)
+    lifted = np.random.default_rng(1).random(5000) < 0.4
+    local = LocalProjection.of(model, lattice.min(axis=1), lattice.max(axis=1))
+    xy, rise = local.with_rise(*lattice, lifted)
+    assert np.array_equal(xy, local.at_points(*lattice))
+    metre = np.array([[0], [0], [10_000]])
+    by_metre = (exact(model, lattice + metre) - exact(model, lattice - metre)) / 2
+    assert np.abs(rise[:, lifted] * 10_000 - by_metre[:, lifted]).max() < 1e-4
+    assert np.abs(by_metre).max() > 0.3
+
+
 class Rough:
     """A model with a kink, which no polynomial follows."""
 
