@@ -14,6 +14,7 @@ Floats = NDArray[np.float64]
 
 
 MIN_CONVERGENCE = 1.0  # degrees
+LEAST_BASE = 1e-5  # difference of unit rays: below, both images are of one place, neither ahead
 
 
 def find_overlap(
@@ -103,7 +104,8 @@ def view_order(left: SensorModel, right: SensorModel, overlap: Floats, height: f
     ]
     lon, lat = left.localize([col, col], [row - 50.0, row + 50.0], height)
     flight = np.array([(lon[1] - lon[0]) * np.cos(np.radians(lat[0])), lat[1] - lat[0]])
-    along = float(base @ flight / np.linalg.norm(base) / np.linalg.norm(flight))
+    length = float(np.linalg.norm(base))
+    along = float(base @ flight / np.linalg.norm(flight)) / max(length, LEAST_BASE)
     if abs(along) < 0.7:
         return "across track"
     return "left looks backward" if along > 0 else "left looks forward"
