@@ -180,7 +180,7 @@ def dask_scheduler(address: str | None, seconds: float = 30.0) -> Iterator[Any]:
     Raises InputError if nothing answers there, or if `distributed` is not installed.
     """
     if not address:
-        from dask.threaded import get  # its name would have Dask import `distributed`, 0.2 s
+        from dask.threaded import get  # by name, Dask would import `distributed` first: 0.2 s
 
         yield get
         return

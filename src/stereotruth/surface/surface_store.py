@@ -128,7 +128,7 @@ def _records(kind: np.dtype, values: Mapping[str, NDArray]) -> NDArray[np.void]:
 
 
 def _array(file: bytes) -> NDArray[np.void]:
-    """The records of an array's ``file``, where they are: NumPy would copy them piece by piece."""
+    """The records in an array's ``file``, as a view: NumPy's own reader would copy them."""
     stream = io.BytesIO(file)
     if read_magic(stream) != (1, 0):
         raise ValueError("another version of NumPy's format")
