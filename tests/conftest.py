@@ -22,17 +22,18 @@ FIRST = (
 
 
 def pytest_collection_modifyitems(items):
-    """Whole runs before short tests, so that no process is left with one at the end; those that
-    need the stages after the tiles are slow, and come when these stages have run."""
-    waiting = {_file(item) for item in items if "later" in item.fixturenames}
+    """Whole runs before short tests, so that no process is left with one at the end. Those that
+    need the stages after the tiles are slow, and come last of the whole runs: one process makes
+    these stages, and no other waits for them."""
+    waiting = {_file(item.nodeid) for item in items if "later" in item.fixturenames}
 
     def place(item: pytest.Item) -> int:
-        file = _file(item)
+        file = PurePosixPath(_file(item.nodeid))
         if file.parent.name != "workflow":
             return len(FIRST) + 2
         if file.stem in FIRST:
             return FIRST.index(file.stem)
-        return len(FIRST) + (file in waiting)
+        return len(FIRST) + (str(file) in waiting)
 
     items.sort(key=place)
     for item in items:
@@ -40,8 +41,9 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.slow)
 
 
-def _file(item: pytest.Item) -> PurePosixPath:
-    return PurePosixPath(item.nodeid.partition("::")[0])
+def _file(nodeid: str) -> str:
+    """The file of a test, by pytest's name of the test."""
+    return nodeid.partition("::")[0]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -51,7 +53,7 @@ def pytest_xdist_make_scheduler(config, log):
 
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return nodeid.partition("::")[0]
+            return _file(nodeid)
 
     config.option.loadscopereorder = False  # by the number of tests
     return ByFile(config, log)

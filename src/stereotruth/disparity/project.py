@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-import dask
 import dask.threaded
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 MIN_CONVERGENCE = 1.0  # degrees
-LEAST_BASE = 1e-5  # difference of unit rays: below, both images are of one place, neither ahead
+LEAST_BASE = 1e-5  # difference of two unit rays; with less, both images look from one place
 
 
 def find_overlap(

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import dask
 import dask.threaded
 import numpy as np
 from numpy.typing import NDArray

@@ -18,7 +18,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import dask
 import dask.threaded
 import numpy as np
 import zarr

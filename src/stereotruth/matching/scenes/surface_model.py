@@ -26,7 +26,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import dask
 import dask.threaded
 import numpy as np
 import pyproj
