@@ -8,7 +8,7 @@ from stereotruth.errors import InputError
 from stereotruth.products.names import path_below, plain_name
 from stereotruth.settings import LONGEST_NAME
 
-OUTSIDE = ("/home/u/x", "../../../../x", "..", ".", ".x", "a\\b", "C:\\x", "a\0b", "a\nb")
+OUTSIDE = ("/etc/x", "../../../../x", "..", ".", ".x", "a\\b", "C:\\x", "a\0b", "a\nb")
 NO_NAMES = (*OUTSIDE, "a/b", "", "x" * (LONGEST_NAME + 1), "é" * 51, "a\udce9", 7)
 
 

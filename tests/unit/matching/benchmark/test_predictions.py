@@ -245,7 +245,7 @@ def test_a_dataset_of_somebody_else_overwrites_nothing(dataset):
 
 @pytest.mark.parametrize(
     "text",
-    ['{"pairs": {"../../x": {}}}', '{"pairs": {"/home/u/x": {}}}', '{"pairs": []}', "[]", "{"],
+    ['{"pairs": {"../../x": {}}}', '{"pairs": {"/etc/x": {}}}', '{"pairs": []}', "[]", "{"],
 )
 def test_a_folder_of_predictions_of_somebody_else_names_no_other_place(tmp_path, text):
     (tmp_path / "predictions.json").write_text(text)
