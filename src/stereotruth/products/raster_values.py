@@ -58,6 +58,7 @@ HEIGHT = Quantity(
     9500.0,
     "give a raster of one band of heights (gdal_translate -b N takes one out)",
 )
+MASK = Quantity("pixel of a mask", "mask", 0.0, np.inf, "give a mask of one band")
 
 
 def refuse_bands(dataset: Any, file: Path, quantity: Quantity) -> None:
