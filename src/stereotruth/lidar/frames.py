@@ -85,6 +85,7 @@ class Realisation(NamedTuple):
     remark: str = ""
 
 
+_ETRS89 = Realisation(10570, spread_m=0.1)  # ETRF2020, which PROJ takes ETRS89 for, too
 _ETRF2000 = Realisation(7931)
 _NAD83 = Realisation(
     6319,
@@ -106,7 +107,8 @@ REALISATIONS = {
     1209: Realisation(7907, 1998.121),  # Hong Kong Geodetic: ITRF96
     6148: Realisation(7903, 1994.0),  # Hartebeesthoek94: ITRF91
     1159: Realisation(7911, 2011.0),  # GSK-2011: ITRF2008
-    ETRS89_ENSEMBLE: Realisation(10570, spread_m=0.1),  # ETRF2020, which PROJ takes it for, too
+    ETRS89_ENSEMBLE: _ETRS89,
+    6171: _ETRS89,  # RGF93 v1
     6140: Realisation(10413),  # NAD83(CSRS), of which versions 6 to 8 are the same
     6269: _NAD83,  # NAD83
     6152: _NAD83,  # NAD83(HARN)

@@ -112,12 +112,12 @@ def _to_geocentric() -> pyproj.Transformer:
 
 
 def _velocity(lon: Floats, lat: Floats, xyz: Floats, plate: str) -> Floats:
-    """Horizontal velocity [3, n], geocentric, m a year."""
+    """Velocity [3, n] of the rotation and of what the bias is horizontally, geocentric, m a year."""
     spin = np.array(ROTATION[plate])[:, None] * MAS
-    velocity = np.cross(spin, xyz, axis=0) + np.array(ORIGIN_RATE_BIAS)[:, None]
+    bias = np.array(ORIGIN_RATE_BIAS)[:, None]
     lon, lat = np.radians(lon), np.radians(lat)
     up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    return velocity - (velocity * up).sum(axis=0) * up
+    return np.cross(spin, xyz, axis=0) + bias - (bias * up).sum(axis=0) * up
 
 
 def speed(lon: float, lat: float, plate: str) -> float:
