@@ -7,7 +7,9 @@ from pathlib import Path
 
 from ..configuration import Configuration
 from ..dataset.windows import cell_step
+from ..epochs import epoch_of_city
 from ..errors import InputError
+from ..lidar.frames import Epoch
 from ..project import (
     adjusted_scenes,
     check_fixed,
@@ -92,13 +94,19 @@ def check_project(
     in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
     adjusted = adjusted_scenes(settings, every_scene, in_sheet)
     every, facts = [project], []
+    epochs: dict[str, Epoch] = {}
     for name, scene in scenes.items():
         found = Findings(name)
         if is_synthetic(scene):
             found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
         else:
             alone = name not in adjusted
-            facts.append(check_scene(scene, settings, found, in_sheet[name], alone=alone))
+            epoch = epochs.get(scene.city)
+            if epoch is None:
+                epoch = epochs[scene.city] = epoch_of_city(cities[scene.city], every_scene, images)
+            facts.append(
+                check_scene(scene, settings, found, in_sheet[name], alone=alone, epoch=epoch)
+            )
         every.append(found)
     if settings.images:
         towns = sorted({scene.city for scene in scenes.values()})

@@ -19,7 +19,8 @@ import numpy as np
 from ..alignment.control_points import COLUMNS, read_gcps
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
-from ..lidar.declared_crs import parse_crs
+from ..lidar.declared_crs import LidarCRS, parse_crs
+from ..lidar.frames import is_known
 from ..lidar.height_raster import HeightRaster
 from ..lidar.to_wgs84 import check_area, transformation
 from ..numerics.degrees import metres_per_degree, turn
@@ -69,8 +70,12 @@ def import_gcps(
     geoid: Path | None = None,
     left: str = "",
     right: str = "",
+    epoch: str = "",
 ) -> list[str]:
     """Write ``to`` from the files of another program; returns what was done, line by line.
+
+    Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
+    lines, as ``epoch`` of the coordinates where it is given (:mod:`..alignment.control_points`).
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -95,6 +100,7 @@ def import_gcps(
         ground, _ = to_wgs84(points, crs, None, files[0], places_only=True)
         points, raster = with_heights(points, ground, heights), None
     points, notes = to_wgs84(points, crs, geoid, files[0])
+    frame = _own_frame(parse_crs(crs)) if crs else ""
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
         lon, lat = (np.array([getattr(p, axis) for p in without]) for axis in "xy")
         surface = HeightRaster.open(raster, geoid, whole=False)
@@ -107,7 +113,7 @@ def import_gcps(
             file=files[0],
             remedy="give --heights: a CSV with id and height (or lon, lat, height), or a raster",
         )
-    _write(points, to)
+    _write(points, to, frame, epoch)
     try:
         read = read_gcps(to)
     except InputError:
@@ -121,6 +127,8 @@ def to_wgs84(
     points: Sequence[Point], crs: str, geoid: Path | None, file: Path, *, places_only: bool = False
 ) -> tuple[list[Point], list[str]]:
     """Points in longitude, latitude and ellipsoidal m, and remarks.
+
+    In their own frame where that is known to centimetres, else in WGS 84.
 
     ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``places_only``: heights are
     left as they are. Raises InputError as for LiDAR: see :func:`.to_wgs84.transformation`.
@@ -141,7 +149,8 @@ def to_wgs84(
         system = replace(system, vertical_datum=None, ellipsoidal=True)
         geoid = None
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
-    transform = transformation(system, file, ends, geoid=geoid)
+    keep_frame = bool(_own_frame(system))
+    transform = transformation(system, file, ends, geoid=geoid, keep_frame=keep_frame)
     lon, lat, lifted = transform(x, y, np.where(known, height, 0.0))
     bad = ~(np.isfinite(lon) & np.isfinite(lat))
     if bad.any():
@@ -161,9 +170,21 @@ def to_wgs84(
     return found, [note for note in notes if note]
 
 
-def _write(points: Sequence[Point], to: Path) -> None:
+def _own_frame(system: LidarCRS) -> str:
+    """EPSG code of the geographic system that points keep; empty: WGS 84."""
+    geodetic = system.horizontal.geodetic_crs
+    if geodetic is None or not is_known(geodetic):
+        return ""
+    code = geodetic.to_2d().to_epsg(min_confidence=20)
+    return f"EPSG:{code}" if code else ""
+
+
+def _write(points: Sequence[Point], to: Path, frame: str, epoch: str) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     with to.open("w", newline="", encoding="utf-8") as stream:
+        for name, value in (("frame", frame), ("epoch", epoch)):
+            if value:
+                stream.write(f"# {name}: {value}\n")
         writer = csv.writer(stream)
         writer.writerow(COLUMNS)
         for p in points:

@@ -25,7 +25,8 @@ CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
 Names = tuple[str, str]  # of a pair's left and right image
 INGESTED = Path("results/ingest")
-OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
+# What a pair takes from its city's other rows.
+OF_CITY = ("lidar", "lidar_crs", "lidar_epoch", "geoid", "gcps")
 
 
 @dataclass(frozen=True)
