@@ -25,6 +25,7 @@ from stereotruth.errors import InputError
 from stereotruth.evaluation.surface_models import score
 from stereotruth.evaluation.surface_models.reference import RasterReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
+from stereotruth.lidar.geoid import GeoidGrid
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 
@@ -277,3 +278,98 @@ def test_each_kind_at_each_door_is_right_or_refused(door, kind, folder, tmp_path
         DOORS[door](file, geoid)
     assert kind.right in str(error.value) and "a.tif" in str(error.value)
     assert "Remedy: " in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------ geoids
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A way to write undulations of some 11 m; ``right``: words of the refusal, empty if none."""
+
+    name: str
+    right: str = ""
+    unit: float = 1.0
+    scale: float = 1.0
+    offset: float = 0.0
+    dtype: str = "float32"
+    fill: float | None = None
+    nodata: float | None = None
+    crs: str = "EPSG:4326"
+    west: float = 115.0
+    what: str = "geoid"
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+GRIDS = [
+    Grid("GTX", what="gtx"),
+    Grid("GeoTIFF"),
+    Grid("hundredths", scale=0.01, dtype="int16"),
+    Grid("offset", scale=0.01, offset=5.0, dtype="uint16"),
+    Grid("feet", unit=FT, more={"units": "ft"}),
+    Grid("centimetres", unit=0.01, more={"units": "cm"}),
+    Grid("fathoms", "no known unit", unit=1.8288, more={"units": "fathom"}),
+    Grid("across the line of 180 degrees", west=175.0),
+    Grid("from 0 to 360", west=180.2),
+    Grid("declared fill", fill=-9999, nodata=-9999),
+    Grid("NaN fill", fill=np.nan),
+    *(Grid(f"fill {v:g}, undeclared", "which", fill=v) for v in (-9999, -999, 0, 1e20, -32768)),
+    Grid("fill -32768 scaled", "which", fill=-32768, scale=0.01, dtype="int16"),
+    Grid("shifts in plan", "horizontal offset", more={"tags": {"TYPE": "HORIZONTAL_OFFSET"}}),
+    Grid("shifts in plan, two bands", "2 bands", more={"bands": 2}),
+    Grid("shifts between datums", "vertical offset vertical to vertical",
+         more={"tags": {"TYPE": "VERTICAL_OFFSET_VERTICAL_TO_VERTICAL"}}),
+    Grid("shifts between datums, GTX", "shifts between two datums", what="shifts"),
+    Grid("heights of mountains", "which is no undulation", what="mountains"),
+    Grid("heights of a plain", "rougher than a geoid", what="plain"),
+    Grid("RGB", "3 bands of uint8", dtype="uint8", more={"bands": 3}),
+    Grid("complex", "complex", dtype="complex64"),
+    Grid("in metres", "longitude and latitude", crs="EPSG:32650"),
+    Grid("turned", "north-up", more={"turned": True}),
+    Grid("south up", "north-up", more={"south_up": True}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", GRIDS, ids=lambda kind: kind.name)
+def test_each_kind_of_geoid_is_right_or_refused(kind, tmp_path):
+    n, step = 121, 0.05
+    lon, lat = kind.west + step * np.arange(n), 32.0 - step * np.arange(n)
+
+    def undulation(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        return 11.0 + 0.5 * np.sin(np.radians(40 * lon)) + 0.3 * np.cos(np.radians(30 * lat))
+
+    values = undulation(lon[None, :], lat[:, None])
+    rng = np.random.default_rng(0)
+    values = {"shifts": 0.1 * values, "mountains": 40 * values,
+              "plain": values + rng.normal(0, 20, values.shape)}.get(kind.what, values)  # fmt: skip
+    missing = np.zeros(values.shape, bool)
+    missing[:9, 40:70] = kind.fill is not None
+    path = tmp_path / ("g.gtx" if kind.what in ("gtx", "shifts") else "g.tif")
+    if path.suffix == ".gtx":
+        write_gtx(path, values[::-1], kind.west, 32.0 - step * (n - 1), step)
+    else:
+        at = Affine(step, 0, kind.west - step / 2, 0, -step, 32.0 + step / 2)
+        at = at * Affine.rotation(10.0) if kind.more.get("turned") else at
+        at = at * Affine.scale(1, -1) if kind.more.get("south_up") else at
+        stored = (values / kind.unit - kind.offset) / kind.scale
+        stored = np.rint(stored) if np.dtype(kind.dtype).kind in "iu" else stored
+        stored = np.where(missing, kind.fill or 0, stored)
+        bands = kind.more.get("bands", 1)
+        with rasterio.open(
+            path, "w", driver="GTiff", width=n, height=n, count=bands, dtype=kind.dtype,
+            crs=kind.crs, transform=at, nodata=kind.nodata,
+        ) as grid:  # fmt: skip
+            grid.units = (kind.more.get("units", ""),) * bands
+            grid.scales, grid.offsets = (kind.scale,) * bands, (kind.offset,) * bands
+            grid.update_tags(**kind.more.get("tags", {}))
+            for band in range(1, bands + 1):
+                grid.write(stored.astype(kind.dtype), band)
+    places = kind.west + rng.uniform(0.1, 5.9, 500), rng.uniform(26.1, 31.0, 500)
+    if kind.right:
+        with pytest.raises(InputError) as error:
+            GeoidGrid(path)(places[0], np.append(places[1][1:], 31.9))
+        assert kind.right in str(error.value) and path.name in str(error.value)
+        assert "Remedy: " in str(error.value)
+        return
+    found = GeoidGrid(path)((places[0] + 180) % 360 - 180, places[1])
+    np.testing.assert_allclose(found, undulation(*places), atol=0.006)
