@@ -91,9 +91,10 @@ def init(
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     from .new_project import begin, with_example
 
-    folder = folder or Path(example)
-    next_step = with_example(folder, example) if example else begin(folder)
-    typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
+    to = example if folder is None else folder
+    next_step = with_example(to, example) if example else begin(to)
+    go = "" if Path(to) == Path() else f"cd {to}, then "
+    typer.echo(f"{to}: a project. Next: {go}{next_step}")
 
 
 @scene_app.command(
