@@ -11,13 +11,13 @@ from pathlib import Path
 
 from .. import sheets
 from ..configuration import Configuration
+from ..epipolar.pair_light import DIACHRONIC_DAYS
 from ..epipolar.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
 from ..epipolar.site_pairs import SitePair
 from ..errors import InputError
 from ..lidar.point_store import PointStore
 from ..lidar.roughness import roughness_m
 from ..project import configured, names_in_pair, read_images, sheet
-from ..sheets import DIACHRONIC_DAYS
 from .add_scene import append_row
 from .site import images_of
 

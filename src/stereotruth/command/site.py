@@ -9,10 +9,11 @@ from itertools import combinations
 from pathlib import Path
 
 from ..alignment.control_points import images_measured
-from ..alignment.site_images import GivenImage, near, open_image
+from ..alignment.site_images import GivenImage, open_image
 from ..configuration import Configuration
-from ..epipolar.acquisition import Acquisition
-from ..epipolar.site_pairs import SiteImage, between_suns, pair_of
+from ..epipolar.acquisition import Acquisition, near
+from ..epipolar.site_pairs import SiteImage, pair_of
+from ..epipolar.sun import between_suns
 from ..errors import InputError
 from ..products.remote_files import bring_image, is_remote
 from ..project import sheet
