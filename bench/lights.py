@@ -1,5 +1,5 @@
-"""What two suns within one day cost: unchanged pixels called `changed`, by the evidence of one light
-and of two, and which of these a pair gets.
+"""What two suns within one day cost: unchanged pixels called `changed`, by the evidence of one
+light and of two, and which of these a pair gets.
 
 python bench/lights.py [--seeds 51] [--kinds mixed nothing] [--folder FOLDER]
 

@@ -24,7 +24,7 @@ from .check_scene import SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
 from .run_workflow import duration
-from .site import check_images
+from .site import check_images, check_links, scene_pairs
 
 MANY = 10  # scenes whose check takes more than a moment
 SCENE_SECONDS = 2.5  # of one core: images of 100 MB, control points, headers of the LiDAR
@@ -102,7 +102,10 @@ def check_project(
         every.append(found)
     if settings.images:
         towns = sorted({scene.city for scene in scenes.values()})
-        every.insert(1, check_images(settings, images, scenes.values(), towns))
+        of_images = check_images(settings, images, scenes.values(), towns)
+        for town in towns:
+            check_links(town, images, scene_pairs(town, every_scene, images), of_images)
+        every.insert(1, of_images)
     every.append(_run(facts, settings))
     return every
 
