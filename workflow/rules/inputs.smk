@@ -253,7 +253,14 @@ def cities_of_report():
     )
 
 
-def diachronic_of(scene):
-    """Whether a scene's images share no light, by its row if that says."""
+def light_of(scene):
+    """What the sheets tell of the light of a scene's images (see SceneInputs.in_light)."""
     cell = SCENES[scene].diachronic
-    return {"diachronic": cell == "true" if cell else SETTINGS.project.diachronic}
+    cells = {view: cells_of(name) for view, name in zip(VIEWS, IMAGE_NAMES[scene])}
+    return {"diachronic": cell == "true" if cell else None, "cells": cells}
+
+
+def cells_of(name):
+    """When and by which sun an image was taken, by its row of the images sheet, if it has one."""
+    row = IMAGES.get(name)
+    return (row.acquired, row.sun_azimuth, row.sun_elevation) if row else ("", None, None)
