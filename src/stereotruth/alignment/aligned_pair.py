@@ -30,6 +30,13 @@ UNITS = {
     "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",
     "cross_covariance": "px^2, of the left image's parameters (rows) with the right's",
 }
+OF_MISFITS = {
+    "lines_covariance": "px^2, at equal steps of the left image from its first line to its last: "
+    "of the corrections by line (col, row) of the left image's line, and (col, row) of the right "
+    "image's that shows the same ground",
+    "shared_px": "px, standard deviation of disparity by errors that near tie points share and no "
+    "correction fits",
+}
 
 
 @dataclass(frozen=True)
@@ -125,7 +132,8 @@ class Alignment:
     ``reference_height``: mean of the GCPs that are used in either view (without any: of the RPCs,
     after refinement of the tie points), ellipsoidal m.
     ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
-    ``refinement``: what `refine` observed and changed, empty before.
+    ``refinement``: what `refine` observed and changed, empty before. ``lines_covariance`` [k, 4, 4]
+    and ``shared_px``: see OF_MISFITS; None and 0 without any.
     """
 
     scene: str
@@ -139,6 +147,8 @@ class Alignment:
     provenance: dict[str, Any]
     cross_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     refinement: dict[str, Any] = field(default_factory=dict)
+    lines_covariance: Floats | None = None
+    shared_px: float = 0.0
 
     @property
     def covariance(self) -> Floats:
@@ -160,14 +170,20 @@ class Alignment:
                 ("right", self.right, self.right_fit),
             )
         }
+        misfits: dict[str, Any] = {}
+        if self.lines_covariance is not None:
+            misfits["lines_covariance"] = self.lines_covariance.tolist()
+        if self.shared_px:
+            misfits["shared_px"] = self.shared_px
         return {
             "what": "RPCs of a stereo pair, corrected by ground control points",
-            "units": UNITS,
+            "units": UNITS | {name: OF_MISFITS[name] for name in misfits},
             "scene": self.scene,
             "model": self.model,
             "reference_height": self.reference_height,
             **views,
             "cross_covariance": self.cross_covariance.tolist(),
+            **misfits,
             "refinement": self.refinement,
             "warnings": list(self.warnings),
             "provenance": self.provenance,
@@ -188,6 +204,10 @@ class Alignment:
             provenance=values["provenance"],
             cross_covariance=np.array(values["cross_covariance"]),
             refinement=values["refinement"],
+            lines_covariance=(
+                np.array(values["lines_covariance"]) if "lines_covariance" in values else None
+            ),
+            shared_px=values.get("shared_px", 0.0),
         )
 
     def save(self, path: str | Path) -> None:

@@ -34,15 +34,31 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class Jitter:
+    """Roll and pitch that swing while an image is taken; no RPC follows.
+
+    ``rms_px``: of the image's movement by either; ``periods`` of its waves, in an image.
+    """
+
+    rms_px: float
+    periods: tuple[float, ...] = (1.3, 2.1, 3.0)
+
+
+@dataclass(frozen=True)
 class ViewSpec:
     """What one image of a pair has of its own.
 
     ``sun_deg``: azimuth and elevation of the sun, degrees; None is the city's. ``bare``: the crowns
-    of the canopy have no leaves, so that most rays pass them.
+    of the canopy have no leaves, so that most rays pass them. ``jitter`` of the attitude.
+    ``psf_px``: standard deviation of the point spread, px. ``saturates``: the reflectance that has
+    the greatest of 8 bits; None: 11 bits, which nothing saturates.
     """
 
     sun_deg: tuple[float, float] | None = None
     bare: bool = False
+    jitter: Jitter | None = None
+    psf_px: float = 0.42
+    saturates: float | None = None
 
 
 @dataclass(frozen=True)
