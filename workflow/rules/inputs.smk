@@ -19,6 +19,18 @@ def with_files_beside(scene, view):
     return [given(file) for file in (image, *dict.fromkeys(beside))]
 
 
+def file_of_city(wildcards):
+    """The file of a synthetic city of the project's own; none of the six has one."""
+    file = city_files.file_of(wildcards.city)
+    return [given(file)] if file.is_file() else []
+
+
+def files_of_place(wildcards):
+    """The files of the real place that a synthetic city is the twin of."""
+    city = city_files.synthetic_city(wildcards.city)
+    return [given(file) for file in city.twin.files] if city and city.twin else []
+
+
 def left_image(wildcards):
     return with_files_beside(SCENES[wildcards.scene], "left")
 
@@ -32,6 +44,8 @@ def given_in(column):
 
     def file_of(wildcards):
         path = getattr(SCENES[wildcards.scene], column)
+        if is_made(path):
+            return path
         return given(path) if path else []
 
     return file_of

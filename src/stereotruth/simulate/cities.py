@@ -144,6 +144,26 @@ class Character:
 
 
 @dataclass(frozen=True)
+class Twin:
+    """The real place that a city is the twin of.
+
+    ``file``: LAS or LAZ; ``crs``: of its points, if it declares none. ``half_m``: half the ground
+    that the file covers, along its axes east and north; ``turned_rad``: counter-clockwise turn of
+    these axes in the city's frame.
+    """
+
+    file: str
+    crs: str
+    half_m: tuple[float, float]
+    turned_rad: float
+
+    @property
+    def files(self) -> list[str]:
+        """The files of the place."""
+        return [self.file]
+
+
+@dataclass(frozen=True)
 class CitySpec:
     """A synthetic city: where it lies, what it looks like, and its scenes.
 
@@ -151,7 +171,8 @@ class CitySpec:
     height of its lowest ground; ``world_seed`` draws everything that is built.
     ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
     the images have of their own. ``dates``: of images and LiDAR, each of which has a world of its
-    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone.
+    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone, but in
+    a twin. ``twin``: the real place whose ground, roofs and crowns the city has; None: it is drawn.
     """
 
     name: str
@@ -170,6 +191,7 @@ class CitySpec:
     left: ViewSpec = ViewSpec()
     right: ViewSpec = ViewSpec()
     dates: Dates | None = None
+    twin: Twin | None = None
 
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""

@@ -157,6 +157,8 @@ def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
         near = scene_coordinates(city, scene, surfaces.boxes[:, :2])
         inside = (np.abs(near) < half_size(scene) + 100).all(axis=1)
         objects = objects[np.append(True, inside)]
+    if surfaces.patches.size:
+        objects = np.append(objects, surfaces.cell_top.max())
     return Relief(low, (low + high) / 2, float(objects.max()))
 
 
