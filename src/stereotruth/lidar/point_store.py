@@ -315,17 +315,27 @@ class PointStore:
         """What tells the strips of its points."""
         return str(self.attrs["strips"]["by"])
 
+    @property
+    def strip_counts(self) -> dict[int, int]:
+        """Points by the code of their strip."""
+        return {int(code): count for code, count in self.attrs["strips"]["points"].items()}
+
     def strips_of(self, cell: int) -> NDArray[np.uint16]:
         """Codes of the strips of a cell's points, in stored order. InputError if damaged."""
         told, count = self.attrs["strips"], int(self.cell_counts[cell])
-        if len(told["points"]) == 1:
-            return np.full(count, int(next(iter(told["points"]))), np.uint16)
+        if len(self.strip_counts) == 1:
+            return np.full(count, next(iter(self.strip_counts)), np.uint16)
         with (self.path / STRIPS).open("rb") as file:
             file.seek(self._strips_offset + 2 * int(self._start[cell]))
             codes = np.frombuffer(file.read(2 * count), "<u2")
         if codes.size != count or zlib.crc32(codes) != told["crc32"][cell]:
             raise self._damaged(STRIPS)
         return codes
+
+    def words_of(self, cell: int) -> Words:
+        """The points of a cell as they are stored, [n, 3]. InputError if damaged."""
+        parts = [stored.copy() for stored, _, _ in self._stored([(cell, cell + 1)])]
+        return np.concatenate([np.empty((0, WORDS), np.uint32), *parts])
 
     @cached_property
     def _strips_offset(self) -> int:

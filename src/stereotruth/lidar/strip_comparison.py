@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +22,9 @@ from ..numerics.degrees import DEGREE_M
 from .gps_times import day_of
 from .lattice import CELL_BITS, LATTICE_DEG, PER_DEG
 from .point_store import SQUARES, Points, PointStore
-from .strip_codes import BIN_S, EDGES, SOURCE, runs_of
-from .strip_network import Compared, adjusted_offsets
-from .strip_offsets import SHARE, StripOffsets
+from .strip_codes import BIN_S, EDGES, SOURCE, TIME, runs_of
+from .strip_network import Compared, Flown, adjusted_offsets
+from .strip_offsets import SHARE, StripKey, StripOffsets
 from .strip_planes import (
     LEAST_POINTS,
     Differences,
@@ -38,7 +37,6 @@ from .strip_planes import (
 )
 
 Codes = NDArray[np.int64]
-Key = tuple[str, int, str]  # what tells a strip, its code, and the day or the file besides
 
 LEAST_SHARE = 0.002  # of a cell's points: fewer are compared with nothing
 
@@ -50,12 +48,11 @@ def compare_strips(stores: Sequence[PointStore]) -> StripOffsets:
     """
     stores = sorted((s for s in stores if s.count), key=lambda s: s.path.name)
     keys = _Keys(stores)
-    parts: dict[tuple[Key, Key], list[Differences]] = {}
-    shares: list[tuple[int, int, Key, NDArray[np.int64]]] = []
+    parts: dict[tuple[StripKey, StripKey], list[Differences]] = {}
+    shares: list[tuple[int, int, StripKey, NDArray[np.int64]]] = []
     cells = sorted({cell for store in stores for cell in _cells(store)})
     for number, (row, col) in enumerate(cells if keys.several else ()):
-        held = keys.in_cell(row, col)
-        points, which, names = held
+        points, which, names = keys.in_cell(row, col)
         if len(names) == 1:
             squares = np.sum(
                 [s.square_counts[k] for s in stores if (k := _cell_of(s, row, col)) is not None],
@@ -69,22 +66,23 @@ def compare_strips(stores: Sequence[PointStore]) -> StripOffsets:
         ]
         for pair, found in _compared(points, which, names, row, col, number):
             parts.setdefault(pair, []).append(found)
-    named = {key: name for key, name in keys.names.items()}
-    ground: Counter[str] = Counter()
+    names, ground = keys.names, Counter[StripKey]()
     for row, _, key, squares in shares:
         side_m = (1 << CELL_BITS) * LATTICE_DEG / SQUARES * DEGREE_M
         narrow = np.cos(np.radians((row + 0.5) * (1 << CELL_BITS) * LATTICE_DEG))
-        ground[named[key]] += int((squares > 0).sum()) * side_m**2 * narrow
-    order = sorted(ground, key=lambda name: (-ground[name], name))
+        ground[key] += int((squares > 0).sum()) * side_m**2 * narrow
+    flown = [Flown(names[key], key, round(area, 1)) for key, area in ground.items()]
+    flown.sort(key=lambda strip: (-strip.ground_m2, strip.name))
     compared = [
-        Compared(named[a], named[b], offset)
-        for (a, b), found in sorted(parts.items())
+        Compared(names[a], names[b], offset)
+        for (a, b), found in sorted(parts.items(), key=lambda part: part[0])
         if (offset := offset_of(found)) is not None
     ]
+    number_of = {strip.key: k for k, strip in enumerate(flown)}
     table = np.zeros(len(shares), SHARE)
     for k, (row, col, key, squares) in enumerate(shares):
-        table[k] = row, col, order.index(named[key]), np.minimum(squares, 65535)
-    return adjusted_offsets(keys.by, [(name, ground[name]) for name in order], compared, table)
+        table[k] = row, col, number_of[key], np.minimum(squares, 65535)
+    return adjusted_offsets(flown, compared, table)
 
 
 def _cells(store: PointStore) -> Iterator[tuple[int, int]]:
@@ -114,29 +112,26 @@ class _Keys:
 
     def __init__(self, stores: Sequence[PointStore]) -> None:
         self.stores = stores
-        self.by = sorted({store.strips_by for store in stores})
-        told = {store.path: sorted(map(int, store.attrs["strips"]["points"])) for store in stores}
-        timed = [s for s in stores if s.strips_by not in (SOURCE, EDGES)]
-        steps = np.unique([code for s in timed for code in told[s.path] if code])
-        self._first = dict(zip(steps.tolist(), runs_of(steps).tolist()))
-        self._found: set[Key] = set()
-        self.several = len({(s.strips_by, c) for s in stores for c in told[s.path]}) > 1 or (
-            len({day for s in stores for day in s.attrs["days"]}) > 1
-        )
+        codes = {(s.strips_by, c) for s in stores for c in s.strip_counts}
+        days = {day for store in stores for day in store.attrs["days"]}
+        self.several = len(codes) > 1 or len(days) > 1
+        steps = np.array(sorted({c for by, c in codes if by == TIME and c}), np.int64)
+        first = runs_of(steps)
+        last = {int(f): int(steps[first == f].max()) for f in np.unique(first)}
+        self._runs = {int(step): (int(f), last[int(f)]) for step, f in zip(steps, first)}
+        self._found: set[StripKey] = set()
 
-    def _of(self, store: PointStore, code: int, day: int) -> Key:
+    def _of(self, store: PointStore, code: int, day: int) -> StripKey:
         by = store.strips_by
-        if by == EDGES:
-            return by, code, store.path.stem
-        if by == SOURCE:
-            return by, code, day_of(day) if day else ""
-        return by, self._first.get(code, 0), ""
+        if by == TIME:
+            return StripKey(by, *self._runs.get(code, (code, code)))
+        return StripKey(by, code, code, more_of(store, day))
 
-    def in_cell(self, row: int, col: int) -> tuple[Points, Codes, list[Key]]:
+    def in_cell(self, row: int, col: int) -> tuple[Points, Codes, list[StripKey]]:
         """Points of a cell of all stores, the number of each one's strip, and the strips' keys."""
         points: list[Points] = []
         numbers: list[Codes] = []
-        names: list[Key] = []
+        names: list[StripKey] = []
         for store in self.stores:
             cell = _cell_of(store, row, col)
             if cell is None:
@@ -155,21 +150,26 @@ class _Keys:
         return Points.concatenate(points), rank[together], [names[k] for k in order]
 
     @property
-    def names(self) -> dict[Key, str]:
+    def names(self) -> dict[StripKey, str]:
         """What each strip that was found is called."""
-        days: dict[tuple[str, int], set[str]] = {}
-        for by, code, more in self._found:
-            days.setdefault((by, code), set()).add(more)
-        return {key: _name(key, len(days[key[:2]]) > 1) for key in self._found}
+        days = Counter((key.by, key.first) for key in self._found)
+        return {key: _name(key, days[key.by, key.first] > 1) for key in self._found}
 
 
-def _name(key: Key, on_days: bool) -> str:
-    by, code, more = key
-    if by == SOURCE:
-        return f"{code} of {more}" if on_days and more else str(code)
-    if by == EDGES:
-        return f"{code + 1} of {more}"
-    return f"from {(code - 1) * BIN_S:.0f} s" if code else "without time"
+def more_of(store: PointStore, day: int) -> str:
+    """What tells the strip of a point besides its code: the file for numbers within it, and the day
+    for ``point_source_id``, which each survey counts anew."""
+    if store.strips_by == EDGES:
+        return store.path.stem
+    return day_of(day) if day and store.strips_by == SOURCE else ""
+
+
+def _name(key: StripKey, on_days: bool) -> str:
+    if key.by == SOURCE:
+        return f"{key.first} of {key.more or 'no day'}" if on_days else str(key.first)
+    if key.by == EDGES:
+        return f"{key.first + 1} of {key.more}"
+    return f"from {(key.first - 1) * BIN_S:.0f} s on" if key.first else "without time"
 
 
 def _squares(points: Points, of: NDArray[np.bool_], row: int, col: int) -> NDArray[np.int64]:
@@ -182,8 +182,8 @@ def _squares(points: Points, of: NDArray[np.bool_], row: int, col: int) -> NDArr
 
 
 def _compared(
-    points: Points, which: Codes, names: list[Key], row: int, col: int, number: int
-) -> Iterator[tuple[tuple[Key, Key], Differences]]:
+    points: Points, which: Codes, names: list[StripKey], row: int, col: int, number: int
+) -> Iterator[tuple[tuple[StripKey, StripKey], Differences]]:
     """Every two strips of a cell on the planes that both have there."""
     firm = is_firm(points)
     points, which = chosen(points, firm), which[firm]
@@ -202,8 +202,3 @@ def _compared(
             found = compare(planes[a], planes[b], squares, number)
             if found.height.size:
                 yield (names[a], names[b]), found
-
-
-def open_for_comparison(paths: Sequence[str | Path]) -> list[PointStore]:
-    """Point stores by their paths."""
-    return [PointStore(path) for path in paths]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from .strip_offsets import Strip, StripOffsets
+from .strip_offsets import Strip, StripKey, StripOffsets
 from .strip_planes import Offset
 
 Floats = NDArray[np.float64]
@@ -27,20 +27,26 @@ class Compared(NamedTuple):
     offset: Offset
 
 
+class Flown(NamedTuple):
+    """A strip: its name, the key of its points and the ground that they cover (m²)."""
+
+    name: str
+    key: StripKey
+    ground_m2: float
+
+
 def adjusted_offsets(
-    by: Sequence[str],
-    strips: Sequence[tuple[str, float]],
+    strips: Sequence[Flown],
     compared: Sequence[Compared],
     shares: NDArray[np.void],
 ) -> StripOffsets:
-    """Offsets of ``strips`` (name, m² of ground; most ground first) from the first, by least
-    squares.
+    """Offsets of ``strips`` (most ground first) from the first, by least squares.
 
     Strips that no chain of overlaps ties to the first count from the one with most ground among
     those that they are tied to. Offsets are named where chance explains them too seldom
     (:data:`FALSE_REMARK` for all strips together). ``shares``: see :class:`.StripOffsets`.
     """
-    names = [name for name, _ in strips]
+    names = [strip.name for strip in strips]
     index = {name: k for k, name in enumerate(names)}
     group = list(range(len(names)))  # the first strip that each is tied to
     for _ in names:
@@ -70,7 +76,7 @@ def adjusted_offsets(
         covariance[np.ix_(free, free)] = inverse * max(misfit / max(redundancy, 1), 1.0)
     tests = max(sum(group[k] != k for k in range(len(names))), 1)
     found = []
-    for k, (name, ground_m2) in enumerate(strips):
+    for k, strip in enumerate(strips):
         own = slice(3 * k, 3 * k + 3)
         tied = group[k] != k
         chance = 1.0
@@ -79,8 +85,7 @@ def adjusted_offsets(
             chance = min(1.0, float(chdtrc(3, statistic)) * tests)
         found.append(
             Strip(
-                name,
-                ground_m2,
+                *strip,
                 names[group[k]] if tied or k in group[:k] + group[k + 1 :] else "",
                 tuple(value[own].round(4).tolist()),
                 tuple(map(tuple, covariance[own, own].round(10).tolist())),
@@ -88,4 +93,4 @@ def adjusted_offsets(
                 tied and chance < FALSE_REMARK,
             )
         )
-    return StripOffsets(tuple(by), tuple(found), shares)
+    return StripOffsets(tuple(found), shares)

@@ -25,6 +25,8 @@ from .point_store import SQUARES
 Floats = NDArray[np.float64]
 
 RECORD, SHARES = "strips.json", "shares.npy"
+AXES = "east", "north", "up"
+MOST_TOLD = 8  # strips in a sentence
 SHARE = np.dtype(
     [("row", "<i4"), ("col", "<i4"), ("strip", "<u2"), ("points", "<u2", (SQUARES, SQUARES))]
 )
@@ -36,12 +38,25 @@ UNITS = {
 }
 
 
+@dataclass(frozen=True, order=True)
+class StripKey:
+    """What tells the points of a strip: the ``by`` of their store, codes from ``first`` to
+    ``last``, and ``more``: the day that they were measured on (ISO), the file that they are of, or
+    nothing."""
+
+    by: str
+    first: int
+    last: int
+    more: str = ""
+
+
 @dataclass(frozen=True)
 class Strip:
-    """A strip: ``tied_to`` names the strip that its ``offset_m`` (east, north, up) counts from,
+    """A strip: ``key`` of its points; ``tied_to`` names the strip that its ``offset_m`` (east, north, up) counts from,
     itself for that strip, "" for one that overlaps no other. ``named``: beyond noise."""
 
     name: str
+    key: StripKey
     ground_m2: float
     tied_to: str
     offset_m: tuple[float, float, float]
@@ -66,12 +81,12 @@ class Strip:
 
 @dataclass(frozen=True, eq=False)
 class StripOffsets:
-    """The strips of a site, that with most ground first. ``by``: what tells them; ``shares``: of
-    :data:`SHARE`, ``strip`` being the index into ``strips``."""
+    """The strips of a site, that with most ground first. ``shares``: of :data:`SHARE`, ``strip``
+    being the index into ``strips``. ``taken_out``: points are moved by the offsets."""
 
-    by: tuple[str, ...]
     strips: tuple[Strip, ...]
     shares: NDArray[np.void] = field(repr=False)
+    taken_out: bool = False
 
     @property
     def named(self) -> tuple[Strip, ...]:
@@ -79,16 +94,38 @@ class StripOffsets:
         return tuple(strip for strip in self.strips if strip.named)
 
     @property
-    def sentences(self) -> list[str]:
-        """What is to be said of the offsets: one sentence for each strip that is named."""
-        return [str(strip) for strip in self.named]
+    def sentence(self) -> str:
+        """What is to be said of the offsets; empty if no strip is named."""
+        if not self.named:
+            return ""
+        some = "; ".join(map(str, self.named[:MOST_TOLD]))
+        more = f"; and {len(self.named) - MOST_TOLD} more" if len(self.named) > MOST_TOLD else ""
+        end = "; points are moved by that" if self.taken_out else ""
+        return f"strips of the LiDAR disagree: {some}{more}{end}"
+
+    def report(self) -> dict[str, Any] | None:
+        """JSON-ready, for people: ``sentence``, and a row for each strip; None of one strip."""
+        if len(self.strips) < 2:
+            return None
+        rows = []
+        for strip in self.strips:
+            row: dict[str, Any] = {"strip": strip.name, "told_by": strip.key.by}
+            row["ground_km2"] = round(strip.ground_m2 / 1e6, 4)
+            row["off"] = strip.tied_to
+            for name, value, sigma in zip(AXES, strip.offset_m, strip.sigma_m):
+                free = strip.tied_to not in ("", strip.name)
+                row[f"{name}_m"] = round(value, 4) if free else None
+                row[f"{name}_sigma_m"] = round(float(sigma), 4) if free else None
+            row["beyond_noise"] = strip.named
+            rows.append(row)
+        return {"sentence": self.sentence, "taken_out": self.taken_out, "strips": rows}
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready, without the shares."""
         return {
             "kind": "strips",
             "units": UNITS,
-            "by": list(self.by),
+            "taken_out": self.taken_out,
             "strips": [asdict(strip) for strip in self.strips],
         }
 
@@ -117,11 +154,12 @@ class StripOffsets:
             strips = tuple(
                 Strip(**{
                     **strip,
+                    "key": StripKey(**strip["key"]),
                     "offset_m": tuple(strip["offset_m"]),
                     "covariance_m2": tuple(map(tuple, strip["covariance_m2"])),
                 })
                 for strip in values["strips"]
             )  # fmt: skip
-            return cls(tuple(values["by"]), strips, np.load(BytesIO(data)))
+            return cls(strips, np.load(BytesIO(data)), values["taken_out"])
 
         return read_record(folder / RECORD, made, what="record of strips", stage="strips")
