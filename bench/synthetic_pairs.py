@@ -159,9 +159,7 @@ def label_by(
     alignment_file = folder / "alignment.json"
     strips = folder / "points.strips"
     compare_strips([PointStore(path) for path in stores]).write(strips)
-    inputs = SceneInputs.of(
-        *rectified, stores, settings, alignment=alignment_file, strips=strips
-    )
+    inputs = SceneInputs.of(*rectified, stores, settings, alignment=alignment_file, strips=strips)
     inputs = inputs.with_surface(folder, workers)
     project_scene(inputs, made, workers=workers, code=code)
     return made

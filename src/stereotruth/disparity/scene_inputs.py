@@ -98,9 +98,7 @@ class SceneInputs:
         if self.alignment is not None:
             uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
         if self.strips is not None:
-            uncertainty = with_strips(
-                uncertainty, StripOffsets.read(self.strips), model, self.view
-            )
+            uncertainty = with_strips(uncertainty, StripOffsets.read(self.strips), model, self.view)
         return seen_from(
             self.view,
             Pair(

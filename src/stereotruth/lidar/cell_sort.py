@@ -126,7 +126,11 @@ class SortedRuns:
         key, cell = _cells(lattice)
         end, limits = np.zeros(key.size, np.int64), np.empty((key.size, 2), np.int32)
         room = self.held == self.written and self.held + size <= len(self.memory)
-        run = self.memory[self.held : self.held + size] if room else np.empty((size, RUN_WORDS), "<u4")
+        run = (
+            self.memory[self.held : self.held + size]
+            if room
+            else np.empty((size, RUN_WORDS), "<u4")
+        )
         _sort(lattice, attributes, strips, cell, end, limits, run)
         if room:
             self.held += size

@@ -179,10 +179,10 @@ class PointTally:
         keep."""
         unwanted = np.isin(np.arange(256), drop_classes)
         raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
-        xyz, attributes = np.empty((3, len(points))), np.zeros(len(points), np.uint32)
+        xyz, attributes = np.empty((3, len(points))), np.zeros((2, len(points)), np.uint32)
         if has_days(header):
-            self.days.take(points, attributes)
-        strips = self.strips.take(points)
+            self.days.take(points, attributes[0])
+        attributes[1] = self.strips.take(points)
         kept = _unpack(
             raw,
             header.point_format.id >= 6,
@@ -191,12 +191,11 @@ class PointTally:
             np.asarray(header.offsets, np.float64),
             xyz,
             attributes,
-            strips,
             self.counts,
             self.by_return,
             self.file_limits,
         )
-        return xyz[:, :kept], attributes[:kept], strips[:kept]
+        return xyz[:, :kept], attributes[0, :kept], attributes[1, :kept]
 
     @property
     def read(self) -> int:
@@ -305,19 +304,19 @@ def _unpack(
     offset: Floats,
     xyz: Floats,
     attributes: NDArray[np.uint32],
-    strips: NDArray[np.uint32],
     counts: Integers,
     by_return: Integers,
     limits: Integers,
 ) -> int:
-    """Fill ``xyz`` [3, n] and ``attributes`` [n] with the points to keep; returns their number.
+    """Fill ``xyz`` [3, n] and ``attributes`` [2, n] with the points to keep; returns their number.
 
     ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
     in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
     class. Attributes are class + 256 return number + 2**16 number of returns + 2**20 code of the
-    day; of all points, ``attributes`` have this code, and ``strips`` [n] that of their strip. ``counts`` [2, 257]: of kept and of dropped
-    points by class, the last of withheld ones; ``by_return`` [16]: of all points by return number.
-    ``limits`` [2, 3]: lowest and highest stored coordinates of all.
+    day, and codes of the strip; of all points, ``attributes`` have the code of the day and these.
+    ``counts`` [2, 257]: of kept and of dropped points by class, the last of withheld ones;
+    ``by_return`` [16]: of all points by return number. ``limits`` [2, 3]: lowest and highest stored
+    coordinates of all.
     """
     kept = 0
     low_x, low_y, low_z = limits[0]
@@ -339,8 +338,8 @@ def _unpack(
         xyz[0, kept] = x * scale[0] + offset[0]
         xyz[1, kept] = y * scale[1] + offset[1]
         xyz[2, kept] = z * scale[2] + offset[2]
-        attributes[kept] = kind | returns | np.int64(attributes[i]) << 20
-        strips[kept] = strips[i]
+        attributes[0, kept] = kind | returns | np.int64(attributes[0, i]) << 20
+        attributes[1, kept] = attributes[1, i]
         kept += 1 - drop
     limits[0] = low_x, low_y, low_z
     limits[1] = high_x, high_y, high_z

@@ -38,7 +38,7 @@ BIN_S = 10.0  # steps of a week have codes of their own; no aircraft turns in le
 SOURCE, TIME, EDGES = "point_source_id", "GPS time", "edge of flight line"
 MOST_BY_EDGES = 255  # strips of a file: with more, its points do not stand in the order of flight
 LEAST_EDGES = 5  # of a strip, before a jump can be told from the steps between them
-LOG_JUMP = float(np.log(60.0))  # lines of pulses, over the mean of their logarithms: strips overlap by more
+LOG_JUMP = float(np.log(60.0))  # of lines of pulses, over their geometric mean: overlaps are wider
 
 
 @kernel

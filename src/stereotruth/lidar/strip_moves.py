@@ -86,5 +86,7 @@ def _steps(offsets: np.ndarray, store: PointStore, cell: int) -> np.ndarray:
     lat = (store.cell_row[cell] + 0.5) * (1 << CELL_BITS) * LATTICE_DEG
     low, high = store.cell_heights[cell] / PER_M
     per_degree = exact_metres_per_degree(float(lat), float(low + high) / 2)
-    steps = offsets.T / np.array([*per_degree, 1.0])[:, None] * np.array([[PER_DEG]] * 2 + [[PER_M]])
+    steps = (
+        offsets.T / np.array([*per_degree, 1.0])[:, None] * np.array([[PER_DEG]] * 2 + [[PER_M]])
+    )
     return np.rint(steps).astype(np.int64)

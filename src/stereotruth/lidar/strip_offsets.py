@@ -52,8 +52,9 @@ class StripKey:
 
 @dataclass(frozen=True)
 class Strip:
-    """A strip: ``key`` of its points; ``tied_to`` names the strip that its ``offset_m`` (east, north, up) counts from,
-    itself for that strip, "" for one that overlaps no other. ``named``: beyond noise."""
+    """A strip: ``key`` of its points; ``tied_to`` names the strip that its ``offset_m`` (east,
+    north, up) counts from, itself for that strip, "" for one that overlaps no other. ``named``:
+    beyond noise."""
 
     name: str
     key: StripKey
