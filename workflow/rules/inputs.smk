@@ -153,9 +153,25 @@ def paths_of_stores(city, stores):
     return [f"results/ingest/{city}/{scene}/{lidar}.points" for scene, lidar in stores]
 
 
-def point_stores(wildcards):
+def point_stores_as_read(wildcards):
     """The points of a scene; files that another scene of the city reads, too, are read once."""
     return paths_of_stores(wildcards.city, STORES[wildcards.scene])
+
+
+def point_stores(wildcards):
+    """The points of a scene, moved by the offsets of their strips where this is asked for."""
+    if SETTINGS.ingest.strips != "adjusted":
+        return point_stores_as_read(wildcards)
+    city, scene = wildcards.city, wildcards.scene
+    return [
+        f"results/strips/{city}/{SURFACES[scene]}/{origin}/{lidar}.points"
+        for origin, lidar in STORES[scene]
+    ]
+
+
+def strips_of(wildcards):
+    """What the strips of a scene's points are off, found once for all scenes that take the same."""
+    return f"results/strips/{wildcards.city}/{SURFACES[wildcards.scene]}.strips"
 
 
 def point_stores_of_city(wildcards):

@@ -30,6 +30,7 @@ from ..products.ungeoreferenced import open_raster
 from ..project import is_synthetic, lidar_of
 from ..sheets import Scene
 from .check_lidar import check_lidar
+from .check_strips import check_strips
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
 from .findings import Finding, Findings, Level
 
@@ -83,6 +84,7 @@ def check_scene(
             check_frame(Nodes.of(model), settings, found)
     footprint = ground_of(scene, settings) if files and images else None
     surveyed = check_lidar(list(files.values()), scene, found, footprint) if files else []
+    check_strips(surveyed, scene, found)
     facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
         _hold_against_gcps(surveyed, gcps, found)

@@ -69,6 +69,11 @@ class SceneStores:
     light: Mapping[str, Any] | None
     doubts: tuple[str, ...]
 
+    @property
+    def lidar_strips(self) -> Mapping[str, Any] | None:
+        """What the strips of its LiDAR are off; None of one strip."""
+        return (self.lidar or {}).get("strips")
+
 
 def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> SceneStores:
     """Open a scene's stores; InputError if their grids do not fit together.

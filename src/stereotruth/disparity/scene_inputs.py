@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
+from ..alignment.strip_uncertainty import with_strips
 from ..epipolar.acquisition import Acquisition, by_sheet
 from ..epipolar.model import EpipolarModel
 from ..epipolar.pair_light import PairLight, pair_light
@@ -22,6 +23,7 @@ from ..epipolar.rpc import RPC
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_store import PointStore, open_stores
+from ..lidar.strip_offsets import StripOffsets
 from ..products.grids import require_complete
 from ..products.provenance import digest
 from ..settings import acquisition_time
@@ -49,8 +51,9 @@ class SceneInputs:
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
     file whose corrections the images were rectified with; without it, it counts as exact.
-    ``surface``: the store with the surface of the points; the recipe paper needs none. ``light``:
-    what has decided whether the images share it, None where the settings alone say it.
+    ``surface``: the store with the surface of the points; the recipe paper needs none. ``strips``:
+    the folder with what the strips of the points are off; without it, they count as exact.
+    ``light``: what has decided whether the images share it, None where the settings alone say it.
     """
 
     left_store: Path
@@ -60,6 +63,7 @@ class SceneInputs:
     view: str = "left"
     alignment: Path | None = None
     surface: Path | None = None
+    strips: Path | None = None
     light: PairLight | None = None
 
     @classmethod
@@ -72,13 +76,14 @@ class SceneInputs:
         view: str = "left",
         alignment: str | Path | None = None,
         surface: str | Path | None = None,
+        strips: str | Path | None = None,
     ) -> SceneInputs:
         """With absolute paths, since workers of a Dask cluster live in other folders, and the point
         stores in their order by name."""
         left, right = Path(left_store).absolute(), Path(right_store).absolute()
         points = tuple(sorted(Path(path).absolute() for path in point_stores))
-        aligned, ground = (None if p is None else Path(p).absolute() for p in (alignment, surface))
-        return cls(left, right, points, settings, view, aligned, ground)
+        more = (None if p is None else Path(p).absolute() for p in (alignment, surface, strips))
+        return cls(left, right, points, settings, view, *more)
 
     def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
         """The same with the surface of all its points, which is made in a ``folder`` by the pixel
@@ -124,6 +129,8 @@ class SceneInputs:
         uncertainty = LabelUncertainty.none()
         if self.alignment is not None:
             uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
+        if self.strips is not None:
+            uncertainty = with_strips(uncertainty, StripOffsets.read(self.strips), model, self.view)
         return seen_from(
             self.view,
             Pair(

@@ -91,6 +91,19 @@ class Dates:
 
 
 @dataclass(frozen=True)
+class FlightStrip:
+    """One strip of an airborne LiDAR that flies north.
+
+    ``offset_m``: east, north, up that all of its points are off by; ``roll_deg``: the points turn
+    about the strip's middle line besides, the east down. ``spacing_m`` of its pulses.
+    """
+
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spacing_m: float = 0.4
+    roll_deg: float = 0.0
+
+
+@dataclass(frozen=True)
 class Canopy:
     """Crowns with rough tops, besides the trees that the land use has.
 
@@ -172,7 +185,9 @@ class CitySpec:
     ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
     the images have of their own. ``dates``: of images and LiDAR, each of which has a world of its
     own then; None: a few buildings of each scene stand in the images or in the LiDAR alone, but in
-    a twin. ``twin``: the real place whose ground, roofs and crowns the city has; None: it is drawn.
+    a twin. ``strips`` of the LiDAR, from west to east over each scene; none: two crossed sets of
+    flight lines that agree. ``twin``: the real place whose ground, roofs and crowns the city has;
+    None: it is drawn.
     """
 
     name: str
@@ -191,6 +206,7 @@ class CitySpec:
     left: ViewSpec = ViewSpec()
     right: ViewSpec = ViewSpec()
     dates: Dates | None = None
+    strips: tuple[FlightStrip, ...] = ()
     twin: Twin | None = None
 
     def scene(self, name: str) -> SceneSpec:
