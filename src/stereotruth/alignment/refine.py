@@ -54,6 +54,7 @@ from .lidar_checks import (
     doubt_by_rpcs,
     height_by_images,
     height_by_rpcs,
+    heights_of_model,
     pixel_m,
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
@@ -312,6 +313,7 @@ def refine(
             doubt_by_rpcs(stores, sensors),
         ]
         doubts = [text for text in doubts if text]
+        alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
