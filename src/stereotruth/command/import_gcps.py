@@ -118,12 +118,12 @@ def import_gcps(
 def _own_frame(crs: str) -> str:
     """EPSG code of the geographic system of ``--crs`` that points keep; empty: WGS 84."""
     try:
-        geodetic = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs).geodetic_crs
+        system = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs)
     except CRSError:
         return ""  # to_degrees says what is wrong
-    if geodetic is None or not is_known(geodetic):
+    if not is_known(system):
         return ""
-    code = geodetic.to_2d().to_epsg(min_confidence=20)
+    code = system.geodetic_crs.to_2d().to_epsg(min_confidence=20)
     return f"EPSG:{code}" if code else ""
 
 

@@ -283,7 +283,7 @@ def _tell(file: Path, summary: Mapping[str, Any], transform: ToWGS84) -> None:
         log.info("%s: no point lies in the footprint", file.name)
     log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
     if transform.frame is not None:
-        log.info("%s: places are in {frame} at {epoch:g}".format_map(transform.frame), file.name)
+        log.info("%s: places are in {frame} at {epoch:.3f}".format_map(transform.frame), file.name)
 
 
 def _is_whole(part: Part, header: laspy.LasHeader) -> bool:
