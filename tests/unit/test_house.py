@@ -43,6 +43,7 @@ ORDER = (
     {"evaluation", "matching"},
     {"configuration", "last_lines"},
     {"project"},
+    {"epochs"},
     {"command"},  # asks all stages what they think of the input, and nothing asks it
 )
 FLOOR = {package: floor for floor, packages in enumerate(ORDER) for package in packages}

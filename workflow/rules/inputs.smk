@@ -148,6 +148,12 @@ def ground_of_stores(scene):
     return None if found is None else found.runs
 
 
+@cache
+def epoch_of(city):
+    """The epoch of a city's places: decimal year, and what tells it."""
+    return list(epoch_of_city(CITIES[city], SCENES, IMAGES))
+
+
 def paths_of_stores(city, stores):
     """Paths of point stores by their (scene, name)."""
     return [f"results/ingest/{city}/{scene}/{lidar}.points" for scene, lidar in stores]

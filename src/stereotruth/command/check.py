@@ -8,7 +8,9 @@ from time import monotonic
 
 from ..configuration import Configuration
 from ..dataset.windows import cell_step
+from ..epochs import epoch_of_city
 from ..errors import InputError
+from ..lidar.frames import Epoch
 from ..project import (
     adjusted_scenes,
     check_fixed,
@@ -89,6 +91,7 @@ def check_project(
     adjusted = adjusted_scenes(settings, every_scene, in_sheet)
     every, facts = [project], []
     looked: Looked = {}
+    epochs: dict[str, Epoch] = {}
     began = monotonic()
     for k, (name, scene) in enumerate(scenes.items()):
         if k == TIMED:
@@ -98,8 +101,12 @@ def check_project(
             found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
         else:
             alone = name not in adjusted
+            epoch = epochs.get(scene.city)
+            if epoch is None:
+                epoch = epochs[scene.city] = epoch_of_city(cities[scene.city], every_scene, images)
+            names = in_sheet[name]
             facts.append(
-                check_scene(scene, settings, found, in_sheet[name], alone=alone, looked=looked)
+                check_scene(scene, settings, found, names, alone=alone, looked=looked, epoch=epoch)
             )
         every.append(found)
     if settings.images:

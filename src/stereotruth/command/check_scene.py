@@ -25,6 +25,7 @@ from ..epipolar.image_reader import MAX_PIXELS, Source, bands_of
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.footprint import Footprint
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
 from ..project import is_synthetic, lidar_of
@@ -63,19 +64,21 @@ def check_scene(
     *,
     alone: bool = True,
     looked: Looked | None = None,
+    epoch: Epoch = DEFAULT_EPOCH,
 ) -> SceneFacts:
     """Add what is found of a scene to ``found``; what one part refuses keeps no other from it.
 
     ``names`` of its images in the images sheet, where they stand in it. ``alone``: the images are
     not adjusted with those of other scenes, which may have the control points that it lacks.
-    ``looked``: of images that scenes before it have, which are not read again.
+    ``looked``: of images that scenes before it have, which are not read again. ``epoch``: of the
+    city's places.
     """
     facts = SceneFacts(scene.scene)
     files: dict[str, Path] = {}
     with found.of("files"):
         files = lidar_of(scene, settings)
     images = _check_images(scene, settings, {} if looked is None else looked, found)
-    alignment, gcps = _check_alignment(scene, settings, images, names, alone, found)
+    alignment, gcps = _check_alignment(scene, settings, images, names, alone, epoch, found)
     model = None
     if alignment is not None:
         with found.of("images"):
@@ -83,7 +86,9 @@ def check_scene(
             facts.pixels = int(np.prod(model.shape))
             check_frame(Nodes.of(model), settings, found)
     footprint = ground_of(scene, settings) if files and images else None
-    surveyed = check_lidar(list(files.values()), scene, found, footprint) if files else []
+    surveyed = []
+    if files:
+        surveyed = check_lidar(list(files.values()), scene, found, footprint, epoch)
     check_strips(surveyed, scene, found)
     facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
@@ -206,13 +211,14 @@ def _check_alignment(
     images: bool,
     names: tuple[str, str],
     alone: bool,
+    epoch: Epoch,
     found: Findings,
 ) -> tuple[Alignment | None, ControlPoints | None]:
     """The alignment as rule align makes it, and the control points, if they can be read."""
     alignment = gcps = None
     if scene.gcps and Path(scene.gcps).is_file():
         with found.of("GCPs"), _or_of_others(alone, found):
-            gcps = read_gcps(scene.gcps, scene.scene, names)
+            gcps = read_gcps(scene.gcps, scene.scene, names, epoch)
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"), _or_of_others(alone, found):
@@ -226,6 +232,7 @@ def _check_alignment(
                 model=model,
                 scene=name,
                 strict=settings.strict,
+                epoch=epoch,
                 provenance={},
             )
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]

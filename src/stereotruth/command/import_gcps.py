@@ -20,6 +20,7 @@ from pyproj.exceptions import CRSError
 from ..alignment.control_points import COLUMNS, read_gcps
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
+from ..lidar.frames import is_known
 from ..lidar.geoid import GeoidGrid
 from ..numerics.bilinear import bilinear
 from ..numerics.degrees import metres_per_degree
@@ -64,8 +65,12 @@ def import_gcps(
     geoid: Path | None = None,
     left: str = "",
     right: str = "",
+    epoch: str = "",
 ) -> list[str]:
     """Write ``to`` from the files of another program; returns what was done, line by line.
+
+    Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
+    lines, as ``epoch`` of the coordinates where it is given (:mod:`..alignment.control_points`).
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -73,6 +78,7 @@ def import_gcps(
     if to.exists():
         raise InputError("is there already", file=to, remedy="name another file, or remove it")
     kinds = {file.suffix.lower() for file in files}
+    frame = "" if kinds == {".gcp"} else _own_frame(crs)
     if kinds == {".points"}:
         points, lines = from_qgis(files, crs)
     elif kinds == {".gcp"} and len(files) == 1:
@@ -98,7 +104,7 @@ def import_gcps(
         lift = GeoidGrid(geoid)(lon, lat)
         points = [replace(p, height=p.height + float(n)) for p, n in zip(points, lift)]
         lines.append(f"heights brought to the ellipsoid by {geoid.name}")
-    _write(points, to)
+    _write(points, to, frame, epoch)
     try:
         read = read_gcps(to)
     except InputError:
@@ -109,9 +115,24 @@ def import_gcps(
     return lines
 
 
-def _write(points: Sequence[Point], to: Path) -> None:
+def _own_frame(crs: str) -> str:
+    """EPSG code of the geographic system of ``--crs`` that points keep; empty: WGS 84."""
+    try:
+        system = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs)
+    except CRSError:
+        return ""  # to_degrees says what is wrong
+    if not is_known(system):
+        return ""
+    code = system.geodetic_crs.to_2d().to_epsg(min_confidence=20)
+    return f"EPSG:{code}" if code else ""
+
+
+def _write(points: Sequence[Point], to: Path, frame: str, epoch: str) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     with to.open("w", newline="", encoding="utf-8") as stream:
+        for name, value in (("frame", frame), ("epoch", epoch)):
+            if value:
+                stream.write(f"# {name}: {value}\n")
         writer = csv.writer(stream)
         writer.writerow(COLUMNS)
         for p in points:
@@ -144,7 +165,10 @@ def _number(text: str, what: str, line: int, file: Path) -> float:
 
 
 def to_degrees(x: np.ndarray, y: np.ndarray, crs: str, file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """lon, lat of coordinates of a system (EPSG code or WKT; empty: they are degrees)."""
+    """lon, lat of coordinates of a system (EPSG code or WKT; empty: they are degrees).
+
+    In its own frame where that is known to centimetres, else in WGS 84.
+    """
     if not crs:
         if (np.abs(x) > 360).any() or (np.abs(y) > 90).any():
             raise InputError(
@@ -156,7 +180,8 @@ def to_degrees(x: np.ndarray, y: np.ndarray, crs: str, file: Path) -> tuple[np.n
         return x, y
     try:
         system = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs)
-        transform = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+        degrees = _own_frame(crs) or "EPSG:4326"
+        transform = pyproj.Transformer.from_crs(system, degrees, always_xy=True)
     except CRSError as error:
         raise InputError(
             f"its coordinate system cannot be used ({error})",

@@ -16,12 +16,18 @@ from ..errors import InputError
 from ..numerics.degrees import DEGREE_M
 
 VERTICAL_UNITS_KEY = 4099
+EPOCH_KEY = 5120  # CoordinateEpochGeoKey of OGC GeoTIFF 1.1's extension, a double
+DOUBLES = 34736  # where keys of doubles stand
 LINEAR_UNITS = {  # EPSG code: (name, metres)
     9001: ("metre", 1.0),
     9002: ("foot", 0.3048),
     9003: ("US survey foot", 1200 / 3937),
 }
 _NO_DATUM = {"", "unknown", "unnamed", "not specified", "unspecified"}
+_WITH_EPOCH = re.compile(  # WKT2:2019, clause 16, which PROJ reads as no system
+    r"\s*COORDINATEMETADATA\s*\[(.*\])\s*,\s*EPOCH\s*\[\s*([0-9.]+)\s*\]\s*\]\s*",
+    re.DOTALL | re.IGNORECASE,
+)
 # Names of vertical datums that producers put into file names; delimited, so that no word hides one.
 DATUM_IN_NAME = re.compile(
     r"(?<![A-Za-z0-9])(IGN69|IGN78|NAVD88|NGVD29|EGM84|EGM96|EGM08|EGM2008|DHHN92|DHHN2016|NN2000"
@@ -37,6 +43,7 @@ class LidarCRS:
     ``horizontal`` is a 2-D geographic or projected system; ``vertical_datum`` names the orthometric
     datum (None: none declared); ``ellipsoidal`` says that heights are declared ellipsoidal;
     ``vertical_unit_m`` is the length of the height unit in metres (None: not declared).
+    ``epoch`` of the coordinates in a dynamic frame, decimal year (None: not declared).
     ``notes`` are remarks for the user.
     """
 
@@ -45,6 +52,7 @@ class LidarCRS:
     ellipsoidal: bool = False
     vertical_unit_m: float | None = None
     vertical_unit: str = ""
+    epoch: float | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -118,6 +126,16 @@ def interpret(crs: CRS) -> LidarCRS:
     return LidarCRS(crs)
 
 
+def interpret_wkt(text: str) -> LidarCRS:
+    """A system of WKT, with the epoch of the coordinates if the text states it.
+
+    Raises CRSError and ValueError as :func:`interpret`.
+    """
+    if dated := _WITH_EPOCH.fullmatch(text):
+        return replace(interpret(CRS.from_wkt(dated[1])), epoch=float(dated[2]))
+    return interpret(CRS.from_wkt(text))
+
+
 def parse_crs(text: str) -> LidarCRS:
     """Read ``lidar_crs``: "2154", "EPSG:2154", "EPSG:2154+5720" or WKT.
 
@@ -126,6 +144,8 @@ def parse_crs(text: str) -> LidarCRS:
     text = text.strip()
     user = f"EPSG:{text}" if re.fullmatch(r"\d+(\+\d+)?", text) else text
     try:
+        if _WITH_EPOCH.fullmatch(user):
+            return interpret_wkt(user)
         return interpret(CRS.from_user_input(user))
     except (CRSError, ValueError) as error:
         raise InputError(
@@ -162,6 +182,8 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
+        if key == EPOCH_KEY and location == DOUBLES and len(doubles) >= 8 * (value + 1):
+            meaning = replace(meaning, epoch=float(np.frombuffer(doubles, "<f8", 1, 8 * value)[0]))
     return meaning
 
 
@@ -212,7 +234,7 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def wkt() -> None:
         if text := _wkt_text(records.get(2112, b"")):
             x, y = float(header.mins[0]), float(header.mins[1])
-            attempt("WKT", lambda: _held_against_code(interpret(CRS.from_wkt(text)), x, y))
+            attempt("WKT", lambda: _held_against_code(interpret_wkt(text), x, y))
 
     def geokeys() -> None:
         data = records.get(34735, b"")

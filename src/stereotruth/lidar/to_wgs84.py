@@ -15,6 +15,9 @@ Rules
 - Map projections are undone by polynomials that are checked against PROJ at run time, see
   :mod:`stereotruth.lidar.projection_polynomials`; a coordinate may come out one step of 1e-9
   degree beside PROJ's.
+- Frames that are known to centimetres go to ITRF2020 at the date of the images
+  (:mod:`stereotruth.lidar.frames`): WGS 84 as RPCs mean it. Geoid grids count from the frame of
+  the file, so that they come first.
 - Which datum transformation is best depends on the place: on the whole degrees of longitude and
   latitude that the points' own extent touches, whatever box the header states.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
@@ -28,7 +31,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
@@ -40,6 +43,7 @@ from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
+from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .projection_polynomials import PatchedTransform
 
 if TYPE_CHECKING:
@@ -56,7 +60,8 @@ class ToWGS84:
 
     ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
     ``heights`` what was done with the heights, ``notes`` are remarks for the user. ``area``: box of
-    longitude and latitude that the operation was chosen for.
+    longitude and latitude that the operation was chosen for. ``frame``: record of the frame and the
+    epoch of the result and of the file, None if no epoch is wanted.
     """
 
     system: LidarCRS
@@ -65,6 +70,7 @@ class ToWGS84:
     heights: str
     notes: tuple[str, ...]
     area: tuple[float, float, float, float] | None
+    frame: dict[str, object] | None
     _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
@@ -115,6 +121,7 @@ class ToWGS84:
             "heights": self.heights,
             "operation": self.operation,
             "accuracy_m": self.accuracy_m,
+            "frame": self.frame,
             "geoid": None if self._geoid is None else self._geoid.path.name,
         }
 
@@ -160,6 +167,38 @@ def _best_operation(
     return best, notes
 
 
+def _in_frame(horizontal: CRS, change: FrameChange) -> pyproj.Transformer:
+    """From a system to longitude, latitude and height on its own datum, exact and unambiguous."""
+    return pyproj.Transformer.from_crs(
+        _source(horizontal).to_3d(), change.geographic, always_xy=True
+    )
+
+
+def _change_of_frame(
+    horizontal: CRS, stated: np.ndarray, epochs: Epochs | None
+) -> FrameChange | None:
+    """How coordinates in an extent [2, 2 or more] get to ITRF2020 at the epoch of the images.
+
+    None: they are left to PROJ's way to WGS 84.
+
+    Raises InputError: as :func:`.frames.frame_change`.
+    """
+    geographic = _source(horizontal).geodetic_crs
+    if epochs is None or geographic is None or not np.isfinite(stated[:, :2]).all():
+        return None
+    area = area_of(horizontal, stated)
+    if area is not None:
+        place = (area[0] + area[2]) / 2, (area[1] + area[3]) / 2
+    else:
+        degrees = pyproj.Transformer.from_crs(
+            _source(horizontal), geographic.to_2d(), always_xy=True
+        )
+        place = degrees.transform(*stated[:, :2].mean(axis=0))
+        if not np.isfinite(place).all():
+            return None
+    return frame_change(geographic, place, *epochs)
+
+
 def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, float] | None:
     """Whole degrees around an extent [2, 2 or more] in a system; None where it makes no sense.
 
@@ -179,6 +218,13 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
         math.floor(lon.max()) + 1,
         math.floor(lat.max()) + 1,
     )
+
+
+def _after(first: Callable[..., Any], change: FrameChange) -> Callable[..., Any]:
+    def transform(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        return change(*first(x, y, z))
+
+    return transform
 
 
 def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: str | Path) -> None:
@@ -222,13 +268,17 @@ def to_wgs84(
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
     extent: np.ndarray | None = None,
+    epochs: Epochs | None = None,
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
     ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``geoid``: path of a grid for orthometric
     heights; ``extent``: lowest and highest coordinates of the points [2, 3], those that the header
-    states if it is not given.
-    Raises InputError: no or unusable coordinate system, orthometric heights without a geoid.
+    states if it is not given; ``epochs``: that of the images, at which coordinates are brought to
+    ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
+    takes them for, most of them WGS 84.
+    Raises InputError: no or unusable coordinate system, orthometric heights without a geoid, a
+    dynamic frame without an epoch.
     """
     system, notes = resolve(header, lidar_crs or None, file)
     _refuse_degrees_as_metres(system, header, file)
@@ -256,16 +306,33 @@ def to_wgs84(
         taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
         notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
     stated = np.array([header.mins, header.maxs], np.float64)
+    stated = stated if extent is None else extent
+    if epochs is not None and system.epoch is not None:
+        epochs = epochs._replace(own=system.epoch)
     try:
-        area = area_of(system.horizontal, stated if extent is None else extent)
-        transformer, remarks = _best_operation(system.horizontal, area)
+        area = area_of(system.horizontal, stated)
+        change = _change_of_frame(system.horizontal, stated, epochs)
+        if change is None:
+            transformer, remarks = _best_operation(system.horizontal, area)
+        else:
+            transformer, remarks = _in_frame(system.horizontal, change), list(change.notes)
+    except InputError as error:
+        raise InputError(error.problem, file=file, remedy=error.remedy) from error
     except ProjError as error:
         raise InputError(
             f"'{system.name}' cannot be transformed to WGS 84: {error}",
             file=file,
             remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
         ) from error
-    transform = transformer.transform
+    transform, operation = transformer.transform, transformer.description
+    accuracy = frame = None
+    if transformer.accuracy >= 0:
+        accuracy = float(transformer.accuracy)
+    if epochs is not None and change is None:
+        frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
+    if change is not None:
+        transform = _after(transform, change)
+        operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
     if system.horizontal.is_projected:
         transform = PatchedTransform(transform, system.horizontal_unit_m)
     grid = None
@@ -281,11 +348,12 @@ def to_wgs84(
         heights = f"ellipsoidal ({'declared' if system.ellipsoidal else 'assumed'}), in {unit}"
     return ToWGS84(
         system=system,
-        operation=transformer.description,
-        accuracy_m=float(transformer.accuracy) if transformer.accuracy >= 0 else None,
+        operation=operation,
+        accuracy_m=accuracy,
         heights=heights,
         notes=tuple(notes + remarks),
         area=area,
+        frame=frame,
         _transform=transform,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
