@@ -182,7 +182,7 @@ def _refuse_empty(source: Source, *, whole: bool) -> None:
         log.warning("%s: nodata at all of %d places", source.path, PLACES**2)
         return
     raise InputError(
-        f"no pixel but nodata ({source.nodata:g})",
+        f"no pixel but nodata ({source.nodata})",
         file=source.path,
         remedy="check the image and its nodata value",
     )

@@ -174,7 +174,7 @@ def rectify_image(
         raise InputError(
             "image has nothing but nodata where the two images overlap",
             file=source.path,
-            remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
+            remedy=f"check the image (its nodata value is {source.nodata}) and its RPC",
         )
     log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
     bands = {}
