@@ -155,11 +155,10 @@ def ingest(
 
     Withheld points are dropped, and those of ``drop_classes``: by default (None) those of the
     settings, noise, 7 (low) and 18 (high). Synthetic points, overlap points and producers' own
-    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed. Coordinates: see
-    :mod:`stereotruth.lidar.to_wgs84`.
-    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
-    not needed; ``epochs`` of the images, and of the coordinates where files state none (see
-    :mod:`stereotruth.lidar.frames`); None: frames are what PROJ takes them for.
+    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed.
+    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv (:mod:`.to_wgs84`);
+    None or "" where not needed; ``epochs`` of the images, and of the coordinates where files state
+    none (:mod:`.frames`); None: frames are what PROJ takes them for.
     ``footprint``: the ground whose points are kept; of COPC (``.copc.laz``) just the nodes that
     touch it are read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first
     and last day (ISO) by a catalogue, for files whose points do not tell them.
@@ -213,10 +212,8 @@ def ingest(
                 tally, runs = _read(points, part, transform, *reading)
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits) if runs.written else _about(transform, points, own)
-        notes = _notes(points, part, transform, tally, bounds)
         strips = _strips(tally)
         cells_crc32, strips["crc32"] = runs.write(unfinished, strips.pop("at"))
-        days = tally.days.days
         summary = {
             "points": _counts(tally, runs, header, dropped),
             "nodes": part.nodes,
@@ -226,9 +223,9 @@ def ingest(
             "crs": transform.describe(),
             "footprint": None if footprint is None else footprint.runs,
             "acquired": _days(tally, acquired),
-            "days": days if len(days) <= CODES else [],
+            "days": tally.days.days if len(tally.days.days) <= CODES else [],
             "strips": strips,
-            "notes": notes,
+            "notes": _notes(points, part, transform, tally, bounds),
         }
         about = {"source": file.name, "cells_crc32": cells_crc32}
         _write_attributes(unfinished, about, summary, dict(provenance or {}))
