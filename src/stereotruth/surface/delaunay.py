@@ -32,7 +32,7 @@ Places = NDArray[np.int32]
 # Beyond this width (parts of a cell) the sums of the exact tests could leave 64 bits: 8000 px.
 MAX_PARTS = 1 << 19
 _SPLIT = 20  # bits; see _in_circle
-SQUARE_BITS = 6  # of a square's side in parts: two ground cells
+HILBERT_BITS = 6  # of a square's side in parts: two ground cells
 BESIDE = 3  # columns of a mesh from which on the neighbours stand
 NEAR = 1 << 14  # parts: of vertices nearer than this the test needs no split
 
@@ -111,7 +111,7 @@ def _before(at: Places, s: int, t: int) -> bool:
 @kernel
 def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
     """Order of insertion: rounds of four times the vertices each, along a Hilbert curve of squares
-    of 1 << SQUARE_BITS parts, numbered by ``bits`` along each axis."""
+    of 1 << HILBERT_BITS parts, numbered by ``bits`` along each axis."""
     for k in range(x.size):
         mixed = (np.uint64(x[k]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
             np.uint64(y[k]) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -123,7 +123,7 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
         while level < 6 and mixed & np.uint64(3) == np.uint64(3):
             mixed >>= np.uint64(2)
             level += 1
-        px, py = x[k] >> SQUARE_BITS, y[k] >> SQUARE_BITS
+        px, py = x[k] >> HILBERT_BITS, y[k] >> HILBERT_BITS
         key = np.int64(0)
         side = np.int64(1) << (bits - 1)
         while side > 0:
@@ -341,7 +341,7 @@ def triangulate(x: Ints, y: Ints, max_radius: float) -> Triangles:
     if end + spare >= MAX_PARTS:
         raise ValueError(f"positions {end} parts of a cell apart, at most {MAX_PARTS} are exact")
     keys = np.empty(n, np.int64)
-    _keys(x, y, max((end >> SQUARE_BITS).bit_length(), 1), keys)
+    _keys(x, y, max((end >> HILBERT_BITS).bit_length(), 1), keys)
     order = np.argsort(keys, kind="stable")
     at = np.empty((n + 4, 2), np.int32)
     at[:n, 0], at[:n, 1] = x[order], y[order]
