@@ -193,13 +193,14 @@ def rectify_image(
 
 
 def _of_delivery(source: Source, sensor: SensorModel) -> dict[str, Any]:
-    """When an image was ``acquired`` (ISO day, UTC) and the ``sun`` (azimuth, elevation, degrees)
-    by its delivery; None: not told."""
+    """When an image was ``acquired`` (ISO day, UTC) and ``taken`` (ISO time, UTC), and the ``sun``
+    (azimuth, elevation, degrees), by its delivery; None: not told."""
     place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
     delivery = read_acquisition(source.path, place)
-    day = None if delivery.time is None else delivery.time.date().isoformat()
+    time = delivery.time
+    day, taken = (None, None) if time is None else (time.date().isoformat(), time.isoformat())
     sun = None if delivery.sun is None else [round(angle, 4) for angle in delivery.sun]
-    return {"acquired": day, "sun": sun}
+    return {"acquired": day, "taken": taken, "sun": sun}
 
 
 def rectify(

@@ -278,14 +278,17 @@ def _way(datum: int, place: tuple[float, float]) -> _Way | None:
     return _Way((*before, best), known.epoch, dynamic, known.spread_m, notes)
 
 
-def is_known(geodetic: CRS) -> bool:
-    """Whether coordinates on a system's datum get to ITRF2020 otherwise than by WGS 84."""
-    datum, area = datum_code(geodetic), geodetic.area_of_use
+def is_known(system: CRS) -> bool:
+    """Whether coordinates of a system get to ITRF2020 otherwise than by WGS 84."""
+    geodetic = system.geodetic_crs
+    datum = None if geodetic is None else datum_code(geodetic)
     if datum is None or datum == WGS84_ENSEMBLE:
         return False
-    middle = (0.0, 0.0)
-    if area is not None and area.west < area.east:
-        middle = (area.west + area.east) / 2, (area.south + area.north) / 2
+    if datum in REALISATIONS:
+        return True
+    area = system.area_of_use or geodetic.area_of_use
+    east = area.east + 360 * (area.east < area.west) if area else 0.0
+    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else (0.0, 0.0)
     return _way(datum, middle) is not None
 
 
@@ -364,11 +367,11 @@ def frame_change(
     legs = []
     for operation in way.operations:
         steps.append(_at(operation, goal if own is None else own))
-        legs.append(f"{_words(operation)}, at {goal if own is None else own:.4g}")
+        legs.append(f"{_words(operation)}, at {goal if own is None else own:.3f}")
     years = 0.0 if own is None else goal - own
     if plate is not None and abs(years) * speed(*place, plate) > SETTLED_M:
         steps.append(_motion(plate, years))
-        legs.append(f"ITRF2020 from {own:.6g} to {goal:.6g} with the plate {plate}")
+        legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
     notes = list(way.notes)
     if not target.by and plate is not None:
         notes.append(

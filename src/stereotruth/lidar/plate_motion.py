@@ -112,7 +112,7 @@ def _to_geocentric() -> pyproj.Transformer:
 
 
 def _velocity(lon: Floats, lat: Floats, xyz: Floats, plate: str) -> Floats:
-    """Velocity [3, n] of the rotation and of what the bias is horizontally, geocentric, m a year."""
+    """Geocentric velocity [3, n], m a year: the rotation's, and the bias' horizontal part."""
     spin = np.array(ROTATION[plate])[:, None] * MAS
     bias = np.array(ORIGIN_RATE_BIAS)[:, None]
     lon, lat = np.radians(lon), np.radians(lat)
