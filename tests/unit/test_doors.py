@@ -21,16 +21,21 @@ from rasterio.transform import Affine
 
 from stereotruth.alignment.control_points import read_gcps
 from stereotruth.command.import_gcps import import_gcps
+from stereotruth.epipolar.rpc import RPC
 from stereotruth.errors import InputError
 from stereotruth.evaluation.surface_models import score
 from stereotruth.evaluation.surface_models.reference import RasterReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
+from stereotruth.lidar.declared_crs import LidarCRS
 from stereotruth.lidar.geoid import GeoidGrid
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.to_wgs84 import check_area
+from stereotruth.numerics.degrees import continuous
 
 from ..synthetic.analytic_town import EPSG, NORTH, SIDE, WEST, Town, write
-from ..synthetic.las import FT, US_FT, everything, write_gtx
+from ..synthetic.las import FT, US_FT, everything, write_gtx, write_las
+from ..synthetic.surveyed_pair import RPCS
 
 TOWN, CELL = Town(), 0.5
 EAST_M, NORTH_M, UP_M = 2.0, -1.0, 0.5  # of the models that are scored
@@ -373,3 +378,50 @@ def test_each_kind_of_geoid_is_right_or_refused(kind, tmp_path):
         return
     found = GeoidGrid(path)((places[0] + 180) % 360 - 180, places[1])
     np.testing.assert_allclose(found, undulation(*places), atol=0.006)
+
+
+# ------------------------------------------------------------------------------ points of LiDAR
+
+
+def test_points_that_nobody_measured_are_named(tmp_path):
+    """Half of them flagged as synthetic, 7 m lower; of both kinds of records."""
+    for pdrf, version in ((6, "1.4"), (1, "1.2")):
+        file, flags = tmp_path / f"{pdrf}.las", np.arange(3000) % 2
+        write_las(file, pdrf=pdrf, version=version, synthetic=flags)
+        found = ingest(file, tmp_path / "a.points")
+        assert "1500 of 3000 points" in found["doubts"][0] and "synthetic" in found["doubts"][0]
+        write_las(file, pdrf=pdrf, version=version)
+        assert ingest(file, tmp_path / "a.points")["doubts"] == []
+
+
+@pytest.mark.parametrize("epsg", [32660, 32601])
+def test_points_across_the_line_of_180_degrees_lie_side_by_side(epsg, tmp_path):
+    """Where one degree east of the line is one degree more than 180, whatever the zone says."""
+    to_utm = pyproj.Transformer.from_crs(4326, epsg, always_xy=True)
+    x, y = to_utm.transform(180.0, 30.0)
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([x + rng.uniform(-300, 300, 4000), y + rng.uniform(-300, 300, 4000),
+                           20 + 0.002 * rng.permutation(4000)])  # fmt: skip
+    xyz = write_las(tmp_path / "a.las", 4000, xyz=xyz, system=pyproj.CRS(epsg).to_3d())
+    found = ingest(tmp_path / "a.las", tmp_path / "a.points")
+    west, _, east, _ = found["bounds"][:4]
+    assert 179.99 < west < 180 < east < 180.01 and not any("area" in n for n in found["notes"])
+    store = PointStore(tmp_path / "a.points")
+    points = store.query(179.0, 29.0, 181.0, 31.0)
+    back = np.column_stack([*to_utm.transform(points.lon, points.lat), points.height])
+    order, exact = np.argsort(back[:, 2]), np.argsort(xyz[:, 2])
+    np.testing.assert_allclose(back[order], xyz[exact], atol=2e-3)
+
+
+def test_longitudes_are_compared_on_a_circle():
+    rpc = RPCS["left"].to_dict()
+    for given in (179.99, -179.99, 180.01):
+        at = RPC.from_dict(rpc | {"long_off": given}).localize(2000, 1500, 60.0)
+        assert 179.9 < at[0] < 180.1
+    assert RPC.from_dict(rpc).long_off == rpc["long_off"]
+    lon = np.array([-177.6, 182.39, 244.0, -180.0, np.inf])
+    assert continuous(lon).tolist() == [-177.6, 182.39, -116.0, 180.0, np.inf]
+    area = LidarCRS(pyproj.CRS(32601))
+    assert check_area(area, (179.99, 180.2), (10, 11), "a.las") is None
+    with pytest.raises(InputError, match="outside of the area"):
+        check_area(area, (160.0, 160.1), (10, 11), "a.las")

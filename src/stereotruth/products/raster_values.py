@@ -172,10 +172,13 @@ class _Value:
 
 
 class Fills:
-    """The rim rule, of windows that are added one after the other."""
+    """The rim rule, of windows that are added one after the other.
 
-    def __init__(self, values: Values) -> None:
-        self.values = values
+    ``may_be_constant``: one value everywhere is no fill, as of a grid that somebody has made of 0.
+    """
+
+    def __init__(self, values: Values, *, may_be_constant: bool = False) -> None:
+        self.values, self.may_be_constant = values, may_be_constant
         self.cells = 0
         self.found: dict[float, _Value] = {}
         self.rims = np.zeros(RIMS.size + 1, np.int64)  # of all others, in windows that have one
@@ -233,11 +236,13 @@ class Fills:
         """Raise InputError if a value is a fill."""
         for value, found in sorted(self.found.items()):
             if self._is_fill(value, found):
-                self.values.refuse(value, found.cells, "which stand apart from all around")
+                every = found.cells == self.cells
+                why = "and no other value" if every else "which stand apart from all around"
+                self.values.refuse(value, found.cells, why)
 
     def _is_fill(self, value: float, found: _Value) -> bool:
         if value in FILLS and found.cells == self.cells > 1:
-            return True
+            return not self.may_be_constant
         if not (value in FILLS or self._stands_apart(value, found)):
             return False
         if found.cells < OFTEN * found.others or not found.rims.sum():
