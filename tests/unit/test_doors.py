@@ -380,6 +380,60 @@ def test_each_kind_of_geoid_is_right_or_refused(kind, tmp_path):
     np.testing.assert_allclose(found, undulation(*places), atol=0.006)
 
 
+# ------------------------------------------------------------------------------- control points
+
+
+def written(heights: float, crs: str, place: tuple[float, float], suffix: str, head: str) -> str:
+    """A point at a place in a system, as the formats have it."""
+    x, y = pyproj.Transformer.from_crs(4326, crs or 4326, always_xy=True).transform(*place)
+    if suffix == ".gcp":
+        return f"{head}P1 {place[1]:.10f} {place[0]:.10f} {heights} 1 1 1 l 1 2 1 1 r 3 4 1 1\n"
+    columns = "id,lon,lat,height,left_col,left_row,right_col,right_row"
+    return f"{head}{columns}\nP1,{x:.10f},{y:.10f},{heights},1,2,3,4\n"
+
+
+POINTS = [
+    ("degrees", "", 40.0, {}, "", 40.0),
+    ("degrees above a geoid", "", 29.0, {"geoid": True}, "", 40.0),
+    ("above EGM96", "EPSG:32650+5773", 29.0, {}, "", "heights are orthometric ('EGM96 height')"),
+    ("above EGM96, grid given", "EPSG:32650+5773", 29.0, {"geoid": True}, "", 40.0),
+    ("said by the file", "EPSG:32650+5773", 29.0, {"unsaid": True}, "# CRS: {crs}\n",
+     "heights are orthometric"),
+    ("said by the file, grid given", "EPSG:32650+5773", 29.0, {"unsaid": True, "geoid": True},
+     "# WKT: {wkt}\n", 40.0),
+    ("in US survey feet", "EPSG:32650+6360", 29.0 / US_FT, {"geoid": True}, "", 40.0),
+    ("ellipsoidal, grid given", "EPSG:4979", 40.0, {"geoid": True}, "", 40.0),
+    ("depths", "EPSG:32650+5715", -29.0, {"geoid": True}, "", "point down"),
+    ("no system", "EPSG:99", 29.0, {}, "", "cannot be used"),
+    (".gcp above a geoid", "EPSG:4326+5773", 29.0, {"unsaid": True}, "# WKT: {wkt}\n",
+     "heights are orthometric"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "crs", "height", "how", "head", "right"), POINTS, ids=str)
+def test_control_points_mean_what_their_system_says(
+    kind, crs, height, how, head, right, folder, tmp_path
+):
+    place = (117.001, 29.829)
+    file = tmp_path / ("a.gcp" if kind.startswith(".gcp") else "a.csv")
+    known = crs not in ("", "EPSG:99")
+    wkt = pyproj.CRS(crs).to_wkt("WKT1_GDAL") if "{wkt}" in head else ""
+    text = written(height, crs if known else "", place, file.suffix, head.format(crs=crs, wkt=wkt))
+    file.write_text(text)
+    options = {"crs": "" if how.get("unsaid") else crs}
+    options |= {"geoid": folder / "egm96.gtx"} if how.get("geoid") else {}
+    if isinstance(right, str):
+        with pytest.raises(InputError) as error:
+            import_gcps([file], tmp_path / "out.csv", **options)
+        assert right in str(error.value) and file.name in str(error.value)
+        assert "Remedy: " in str(error.value) and not (tmp_path / "out.csv").exists()
+        return
+    import_gcps([file], tmp_path / "out.csv", **options)
+    found = read_gcps(tmp_path / "out.csv")
+    assert (found.lon[0], found.lat[0]) == pytest.approx(place, abs=1e-8)
+    assert found.height[0] == pytest.approx(right, abs=2e-3)
+
+
 # ------------------------------------------------------------------------------ points of LiDAR
 
 

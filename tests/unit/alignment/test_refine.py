@@ -263,6 +263,24 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
 
 
 @pytest.mark.slow
+def test_uncertainty_holds_rpcs_of_other_pixels(images, tmp_path):
+    """As of images that were cut: 70 px off by RPCs that are said to be within 10, no points."""
+    store = write_points(tmp_path, lidar())
+    off = [np.array([[0.0, 0.0, 45.0], [0.0, 0.0, 2.0]])] * 2
+    good, _ = refine(start(NONE, NONE, 10.0), *images, [store])
+    refined, _ = refine(start(*off, 10.0), *images, [store])
+    if refined.refinement["applied"]:
+        assert refined.refinement["uncertainty_widened_by"] > 1.5
+        assert any("RPCs belong to the images" in text for text in refined.warnings)
+    miss = [
+        np.subtract(fit.affine, exact.affine)[:, 2]
+        for fit, exact in ((refined.left, good.left), (refined.right, good.right))
+    ]
+    deviations = np.sqrt(np.diag(refined.left_fit.covariance))[[2, 5]]
+    assert (np.abs(miss[0]) < 3 * deviations + 0.1).all()
+
+
+@pytest.mark.slow
 def test_the_order_of_the_stores_changes_nothing(images, tmp_path):
     cloud = lidar()
     half = cloud[:, 0] < LON
