@@ -62,10 +62,12 @@ class Planes(NamedTuple):
         return Planes(*(values[chosen] for values in self))
 
 
-def squares_along(counts: list[int]) -> int:
-    """Squares along a cell's side for strips that have so many points in it."""
+def squares_along(counts: list[Ints]) -> int:
+    """Squares along a cell's side, by the points that each strip has in each of its SQUARES[-1]²
+    largest squares."""
+    sparsest = min(float(of[of > 0].mean()) for of in counts)
     for squares in SQUARES[:-1]:
-        if min(counts) >= EXPECTED * squares**2:
+        if sparsest >= EXPECTED * (squares // SQUARES[-1]) ** 2:
             return squares
     return SQUARES[-1]
 
