@@ -22,7 +22,7 @@ REACH = {
     "simulate_lidar": {"simulate", "products"},
     "simulate_truth": {"simulate", "products"},
     "ingest": {"lidar", "products"},
-    "align": {"alignment", "epipolar", "products"},
+    "align": {"alignment", "epipolar", "lidar", "products"},
     "refine": {"alignment", "epipolar", "lidar", "products"},
     "adjust": {"alignment", "epipolar", "lidar", "products"},
     "adjusted_alignment": {"alignment", "epipolar", "products"},

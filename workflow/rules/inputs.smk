@@ -19,6 +19,18 @@ def with_files_beside(scene, view):
     return [given(file) for file in (image, *dict.fromkeys(beside))]
 
 
+def file_of_city(wildcards):
+    """The file of a synthetic city of the project's own; none of the six has one."""
+    file = city_files.file_of(wildcards.city)
+    return [given(file)] if file.is_file() else []
+
+
+def files_of_place(wildcards):
+    """The files of the real place that a synthetic city is the twin of."""
+    city = city_files.synthetic_city(wildcards.city)
+    return [given(file) for file in city.twin.files] if city and city.twin else []
+
+
 def left_image(wildcards):
     return with_files_beside(SCENES[wildcards.scene], "left")
 
@@ -32,6 +44,8 @@ def given_in(column):
 
     def file_of(wildcards):
         path = getattr(SCENES[wildcards.scene], column)
+        if is_made(path):
+            return path
         return given(path) if path else []
 
     return file_of
@@ -132,6 +146,12 @@ def ground_of_stores(scene):
     takers = [SCENES[name] for name, stores in STORES.items() if scene in dict(stores)]
     found = footprint_of([(of.left_image, of.right_image) for of in takers], margin_m)
     return None if found is None else found.runs
+
+
+@cache
+def epoch_of(city):
+    """The epoch of a city's places: decimal year, and what tells it."""
+    return list(epoch_of_city(CITIES[city], SCENES, IMAGES))
 
 
 def paths_of_stores(city, stores):
@@ -269,7 +289,14 @@ def cities_of_report():
     )
 
 
-def diachronic_of(scene):
-    """Whether a scene's images share no light, by its row if that says."""
+def light_of(scene):
+    """What the sheets tell of the light of a scene's images (see SceneInputs.in_light)."""
     cell = SCENES[scene].diachronic
-    return {"diachronic": cell == "true" if cell else SETTINGS.project.diachronic}
+    cells = {view: cells_of(name) for view, name in zip(VIEWS, IMAGE_NAMES[scene])}
+    return {"diachronic": cell == "true" if cell else None, "cells": cells}
+
+
+def cells_of(name):
+    """When and by which sun an image was taken, by its row of the images sheet, if it has one."""
+    row = IMAGES.get(name)
+    return (row.acquired, row.sun_azimuth, row.sun_elevation) if row else ("", None, None)

@@ -26,7 +26,8 @@ rule project:
     params:
         script=content_of("../scripts/project.py"),
         view="left",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
@@ -52,7 +53,8 @@ use rule project as project_right with:
     params:
         script=content_of("../scripts/project.py"),
         view="right",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
@@ -82,7 +84,8 @@ rule project_strip:
         script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"

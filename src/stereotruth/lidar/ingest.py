@@ -33,6 +33,7 @@ from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
 from .cell_sort import RUN_WORDS, SCRATCH_POINTS, SortedRuns
 from .footprint import Footprint
+from .frames import Epochs
 from .gps_times import BY_CATALOGUE, CODES, not_told_apart
 from .las_files import PointTally
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
@@ -137,6 +138,7 @@ def ingest(
     footprint: Footprint | None = None,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
+    epochs: Epochs | None = None,
     acquired: Sequence[str] = (),
     drop_classes: Sequence[int] | None = None,
     provenance: Mapping[str, Any] | None = None,
@@ -153,10 +155,10 @@ def ingest(
 
     Withheld points are dropped, and those of ``drop_classes``: by default (None) those of the
     settings, noise, 7 (low) and 18 (high). Synthetic points, overlap points and producers' own
-    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed. Coordinates: see
-    :mod:`stereotruth.lidar.to_wgs84`.
-    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
-    not needed.
+    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed.
+    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv (:mod:`.to_wgs84`);
+    None or "" where not needed; ``epochs`` of the images, and of the coordinates where files state
+    none (:mod:`.frames`); None: frames are what PROJ takes them for.
     ``footprint``: the ground whose points are kept; of COPC (``.copc.laz``) just the nodes that
     touch it are read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first
     and last day (ISO) by a catalogue, for files whose points do not tell them.
@@ -183,7 +185,8 @@ def ingest(
     header = points.header
 
     def transform_of(extent: Floats | None) -> ToWGS84:
-        return to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, extent=extent)
+        how = {"lidar_crs": lidar_crs, "geoid": geoid, "epochs": epochs}
+        return to_wgs84(header, file, extent=extent, **how)
 
     transform = transform_of(None)
     _refuse_coarse(points, transform)
@@ -209,10 +212,8 @@ def ingest(
                 tally, runs = _read(points, part, transform, *reading)
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits) if runs.written else _about(transform, points, own)
-        notes = _notes(points, part, transform, tally, bounds)
         strips = _strips(tally)
         cells_crc32, strips["crc32"] = runs.write(unfinished, strips.pop("at"))
-        days = tally.days.days
         summary = {
             "points": _counts(tally, runs, header, dropped),
             "nodes": part.nodes,
@@ -222,9 +223,9 @@ def ingest(
             "crs": transform.describe(),
             "footprint": None if footprint is None else footprint.runs,
             "acquired": _days(tally, acquired),
-            "days": days if len(days) <= CODES else [],
+            "days": tally.days.days if len(tally.days.days) <= CODES else [],
             "strips": strips,
-            "notes": notes,
+            "notes": _notes(points, part, transform, tally, bounds),
         }
         about = {"source": file.name, "cells_crc32": cells_crc32}
         _write_attributes(unfinished, about, summary, dict(provenance or {}))
@@ -291,6 +292,8 @@ def _tell(file: Path, summary: Mapping[str, Any], transform: ToWGS84) -> None:
     else:
         log.info("%s: no point lies in the footprint", file.name)
     log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
+    if transform.frame is not None:
+        log.info("%s: places are in {frame} at {epoch:.3f}".format_map(transform.frame), file.name)
 
 
 def _is_whole(part: Part, header: laspy.LasHeader) -> bool:

@@ -310,6 +310,7 @@ def simulate_lidar_tile(
     cover = coverage(city, scene)
     box = tile_box(city, scene, tile_index(scene, tile_name))
     top = max(float(s.terrain.max()), float((s.boxes[:, 6] + s.boxes[:, 7]).max(initial=0)))
+    top = max(top, float(s.patches[..., 0].max(initial=0)))
     low = np.array([box[0] - 120, box[1] - 120, s.terrain.min() - 60])
     high = np.array([box[2] + 120, box[3] + 120, top + 150])
     grid = to_grid(frame, city.epsg, low, high)
