@@ -386,14 +386,15 @@ def stores_of(
 ) -> dict[str, list[tuple[str, str]]]:
     """The point stores of each scene: (scene that they are made for, name of the LiDAR file).
 
-    A file is read once by all scenes of a city that take it by the same coordinate system and
-    geoid: its store is that of the first of them in the sheet. ``lidar``: files of each scene by
-    the names of their stores.
+    A file is read once by all scenes of a city that take it by the same system, epoch and geoid:
+    its store is that of the first of them in the sheet. ``lidar``: files of each scene by the names
+    of their stores.
     """
     made: dict[tuple[str, ...], tuple[str, str]] = {}
     found: dict[str, list[tuple[str, str]]] = {}
     for name, scene in scenes.items():
-        how = scene.city, scene.lidar_crs, sheets.file_key(scene.geoid) if scene.geoid else ""
+        geoid = sheets.file_key(scene.geoid) if scene.geoid else ""
+        how = scene.city, scene.lidar_crs, scene.lidar_epoch, geoid
         found[name] = [
             made.setdefault((*how, sheets.file_key(str(file))), (name, store))
             for store, file in lidar[name].items()

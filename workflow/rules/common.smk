@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from stereotruth.configuration import Configuration
+from stereotruth.epochs import epoch_of_city
 from stereotruth.errors import InputError, in_words
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.project import (

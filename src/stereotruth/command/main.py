@@ -224,12 +224,15 @@ def gcps_import(
     ] = None,
     left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
     right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
+    epoch: Annotated[
+        str, typer.Option(help="Epoch of the coordinates, 2016.4 or a date; empty: of the images.")
+    ] = "",
 ) -> None:
     """Bring control points of QGIS, Ames Stereo Pipeline or a CSV into the project's form."""
     from .import_gcps import import_gcps
 
     for line in import_gcps(
-        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right
+        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
     ):
         typer.echo(line)
 
