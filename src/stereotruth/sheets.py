@@ -39,7 +39,6 @@ MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
 LIDAR_SUFFIXES = (".las", ".laz")
 RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
 LIDAR_SEPARATOR = ";"
-DIACHRONIC_DAYS = 30.0  # more than these, as in DiachronicStereo (2026)
 
 
 Count = Annotated[Whole, Field(ge=0)]
@@ -128,8 +127,9 @@ class Scene:
 
     diachronic: Literal["", "true", "false"] = ""
     """optional: whether both images were taken under different suns or in different seasons, see
-    `project.diachronic`; empty: true if the images sheet knows both dates and they are more than 30
-    days apart, else as `project.diachronic` says"""
+    `project.diachronic`; empty: true if the images were taken more than 30 days apart, or under two
+    suns by which the shadows of a building of 10 m end more than half a pixel apart; where neither
+    the images sheet nor the deliveries know it, as `project.diachronic` says"""
 
 
 @settings
@@ -305,7 +305,6 @@ def with_images(
     """
     by_file = {file_key(image.file): image for image in images.values()}
     found = dict(cells)
-    dates: list[date | None] = []
     for view in ("left", "right"):
         cell = cells[f"{view}_image"]
         image = images.get(cell) or by_file.get(file_key(cell))
@@ -327,10 +326,6 @@ def with_images(
             )
         found[f"{view}_image"] = image.file
         found[f"{view}_mask"] = cells[f"{view}_mask"] or image.mask
-        dates.append(day_of(image.acquired))
-    if len(dates) == 2 and not cells["diachronic"] and None not in dates:
-        apart = abs((dates[0] - dates[1]).days)
-        found["diachronic"] = "true" if apart > DIACHRONIC_DAYS else ""
     return found
 
 

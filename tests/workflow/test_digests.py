@@ -31,6 +31,8 @@ REACH = {
     "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
+    "compare_strips": {"lidar", "products"},
+    "move_strips": {"lidar", "products"},
     "surface": {"surface", "epipolar", "lidar", "products"},
     "project": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},
     "project_right": {"disparity", "surface", "alignment", "epipolar", "lidar", "products"},

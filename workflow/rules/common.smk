@@ -14,6 +14,7 @@ from stereotruth.project import (
     check_fixed,
     days_of_pair,
     file_of_image,
+    is_made,
     is_synthetic,
     lidar_days,
     lidar_of,
@@ -23,6 +24,7 @@ from stereotruth.project import (
     stores_of,
     surfaces_of,
 )
+from stereotruth.simulate import city_files
 
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"

@@ -17,7 +17,7 @@ MEANING = (
     "right, of the correction of the RPC's (col, row) by (a_u u + a_v v + a_1, b_u u + b_v v + "
     "b_1), px, (u, v) being px from the image's middle in halves of its longer side; own: px, "
     "standard deviation of the match by itself; site: tie points of one part of the scene; at: "
-    "(col, row) px in the left image"
+    "(col, row) px in the left image, there: in the right one"
 )
 
 
@@ -45,7 +45,7 @@ def read_equations(path: str | Path) -> tuple[PairEquations | None, str]:
 def _from_dict(values: dict[str, Any]) -> tuple[PairEquations | None, str]:
     if "design" not in values:
         return None, values["reason"]
-    names = ("design", "observed", "own", "site", "at")
+    names = ("design", "observed", "own", "site", "at", "there")
     equations = Equations(*(np.array(values[name]) for name in names))
     about = (np.array(values[name]) for name in ("start", "linearised_at"))
     return PairEquations(equations, *about, values["places"], values["common_px"]), ""

@@ -74,6 +74,7 @@ def _callback(
         "stereotruth init my-project",
         "stereotruth init --example demo",
         "stereotruth init --example site",
+        "stereotruth init --twin place.laz --crs EPSG:2154 twin",
     )
 )
 def init(
@@ -87,12 +88,45 @@ def init(
             help="Simulate a small city in it, to try: demo (a pair) or site (a stack of images)."
         ),
     ] = "",
+    twin: Annotated[
+        Path | None,
+        typer.Option(
+            help="LAS or LAZ file of a real place: the project's images, LiDAR and exact truth are "
+            "simulated over its ground, roofs and crowns."
+        ),
+    ] = None,
+    crs: Annotated[str, typer.Option(help="CRS of a --twin without one.")] = "",
+    density: Annotated[
+        float | None, typer.Option(help="Points per m² of the twin's LiDAR; default 6.25.")
+    ] = None,
+    sun: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Azimuth and elevation of the twin's sun, degrees; default 148 54."),
+    ] = None,
+    size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            help="Columns and rows of the twin's left image, about the middle of the place; "
+            "default: all of it."
+        ),
+    ] = None,
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     from .new_project import begin, with_example
 
-    folder = folder or Path(example)
-    next_step = with_example(folder, example) if example else begin(folder)
+    if twin is not None:
+        from .twin_project import DENSITY, SUN_DEG, Options, with_twin
+
+        folder = folder or Path("twin")
+        options = Options(crs, density or DENSITY, sun or SUN_DEG, size)
+        next_step = with_twin(folder, twin, options)
+    else:
+        if crs or density or sun or size:
+            raise InputError(
+                "--crs, --density, --sun and --size are of a twin", remedy="add --twin FILE"
+            )
+        folder = folder or Path(example)
+        next_step = with_example(folder, example) if example else begin(folder)
     typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
 
 

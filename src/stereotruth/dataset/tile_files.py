@@ -298,6 +298,7 @@ def write_tile(
         "lon": f"{lon:.7f}",
         "lat": f"{lat:.7f}",
         **_lidar_days(source, window, known),
+        **_light(source),
         **check_cells(checks, cut.limits),
     }
     for value, meaning in cut.flags.items():
@@ -331,6 +332,14 @@ def _lidar_days(
             since_1970 = int(np.datetime64(taken, "D").astype(np.int64))
             found[cell] = since_1970 - int(days[days.size // 2])
     return found
+
+
+def _light(source: SceneStores) -> dict[str, str]:
+    """Whether the images share no light, and what decided that; empty where nothing says it."""
+    if source.light is None:
+        return {"diachronic": "", "diachronic_by": ""}
+    told = "yes" if source.light["diachronic"] else "no"
+    return {"diachronic": told, "diachronic_by": source.light["decided_by"]}
 
 
 def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:

@@ -183,6 +183,7 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
         "height_min, height_max (m, ellipsoidal)",
         "lidar": lidar_read(inputs, EpipolarModel.from_dict(epipolar)),
         "settings": parameters,
+        "light": None if inputs.light is None else asdict(inputs.light),
         "provenance": describe(made_of, parameters, code),
     }
 

@@ -1,10 +1,14 @@
-"""The coordinate system that a LiDAR file declares, or that the sheet gives it."""
+"""The coordinate system that a file declares, or that its user gives it: places, heights, units.
+
+The one reader of systems: of LiDAR, surface models, control points and geoid grids.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -23,6 +27,18 @@ LINEAR_UNITS = {  # EPSG code: (name, metres)
     9002: ("foot", 0.3048),
     9003: ("US survey foot", 1200 / 3937),
 }
+LENGTHS = {  # names of units in files: metres
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("dm", "decimetre", "decimeter", "decimetres", "decimeters"), 0.1),
+    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter", "millimetres", "millimeters"), 0.001),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(
+        ("us-ft", "us_ft", "ftus", "us survey foot", "us survey feet", "foot_us", "sft"),
+        1200 / 3937,
+    ),
+}
+SAME_UNIT = 1e-5  # of a unit: feet and US survey feet of a band's name are often not told apart
 _NO_DATUM = {"", "unknown", "unnamed", "not specified", "unspecified"}
 _WITH_EPOCH = re.compile(  # WKT2:2019, clause 16, which PROJ reads as no system
     r"\s*COORDINATEMETADATA\s*\[(.*\])\s*,\s*EPOCH\s*\[\s*([0-9.]+)\s*\]\s*\]\s*",
@@ -92,6 +108,15 @@ def _source(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+class Depths(ValueError):
+    """A system whose vertical axis points down."""
+
+
+def _refuse_depths(crs: CRS, axis: Any) -> None:
+    if axis.direction.lower() != "up":
+        raise Depths(f"the heights of '{crs.name}' point {axis.direction}: they are depths")
+
+
 def interpret(crs: CRS) -> LidarCRS:
     """Split a system into its horizontal and vertical meaning.
 
@@ -105,8 +130,7 @@ def interpret(crs: CRS) -> LidarCRS:
     if crs.is_compound:
         vertical = _source(parts[1])
         axis = vertical.axis_info[0]
-        if axis.direction.lower() != "up":
-            raise ValueError(f"the heights of '{crs.name}' point {axis.direction}")
+        _refuse_depths(crs, axis)
         datum = vertical.datum.name if vertical.datum is not None else vertical.name
         unnamed = {datum.lower(), vertical.name.lower()} <= _NO_DATUM
         return LidarCRS(
@@ -117,6 +141,7 @@ def interpret(crs: CRS) -> LidarCRS:
         )
     if len(first.axis_info) == 3:
         axis = first.axis_info[2]
+        _refuse_depths(crs, axis)
         return LidarCRS(
             crs.to_2d(),
             ellipsoidal=True,
@@ -136,10 +161,10 @@ def interpret_wkt(text: str) -> LidarCRS:
     return interpret(CRS.from_wkt(text))
 
 
-def parse_crs(text: str) -> LidarCRS:
+def parse_crs(text: str, name: str = "lidar_crs", file: str | Path | None = None) -> LidarCRS:
     """Read ``lidar_crs``: "2154", "EPSG:2154", "EPSG:2154+5720" or WKT.
 
-    Raises InputError.
+    ``name``: what users call it, ``file``: where it stands. Raises InputError.
     """
     text = text.strip()
     user = f"EPSG:{text}" if re.fullmatch(r"\d+(\+\d+)?", text) else text
@@ -149,10 +174,47 @@ def parse_crs(text: str) -> LidarCRS:
         return interpret(CRS.from_user_input(user))
     except (CRSError, ValueError) as error:
         raise InputError(
-            f"lidar_crs '{text}' cannot be used: {error}",
+            f"{name} '{text}' cannot be used: {error}",
+            file=file,
             remedy="give an EPSG code such as EPSG:32650, a compound such as EPSG:2154+5720, "
             "or WKT of a geographic or projected system",
         ) from error
+
+
+def of_raster(wkt: str, band_unit: str, file: str | Path) -> LidarCRS:
+    """The system of a raster of heights, whose unit its band may tell.
+
+    Raises InputError: no place on the ground, no known unit, or two that differ.
+    """
+    try:
+        system = interpret(CRS.from_wkt(wkt))
+    except (CRSError, ValueError) as error:
+        raise InputError(
+            str(error),
+            file=file,
+            remedy="set its coordinate system by gdal_edit.py -a_srs, or bring the raster to "
+            "another by gdalwarp -t_srs",
+        ) from None
+    if not band_unit:
+        return system
+    metres = LENGTHS.get(band_unit.lower())
+    if metres is None:
+        raise InputError(
+            f"its heights are in {band_unit!r}, which is no known unit",
+            file=file,
+            remedy="write the unit again: gdal_edit.py -units metre, or foot, or 'US survey foot'",
+        )
+    stated = system.vertical_unit_m
+    if stated is None:
+        return replace(system, vertical_unit_m=metres, vertical_unit=band_unit)
+    if abs(stated / metres - 1) > SAME_UNIT:
+        raise InputError(
+            f"its band counts heights in {band_unit!r}, its coordinate system in "
+            f"{system.vertical_unit}",
+            file=file,
+            remedy="correct the wrong one: gdal_edit.py -units, or -a_srs",
+        )
+    return system
 
 
 def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS | None:
@@ -225,6 +287,8 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def attempt(what: str, read) -> None:
         try:
             meaning = read()
+        except Depths:
+            raise
         except (ProjError, ValueError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
@@ -288,9 +352,14 @@ def resolve(
 ) -> tuple[LidarCRS, list[str]]:
     """The system that applies to a file, and remarks for the user.
 
-    Raises InputError if the file declares none and ``lidar_crs`` is empty.
+    Raises InputError if the file declares none and ``lidar_crs`` is empty, and for depths.
     """
-    own, problems = header_crs(header)
+    try:
+        own, problems = header_crs(header)
+    except Depths as error:
+        raise InputError(
+            str(error), file=file, remedy="write the file again with heights, which point up"
+        ) from None
     given = parse_crs(lidar_crs) if lidar_crs else None
     notes: list[str] = []
     if own is None:

@@ -92,6 +92,28 @@ class ToWGS84:
             height[good] = base[good] + self._geoid(lon[good], lat[good])
         return lon, lat, height
 
+    @property
+    def _exact(self) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """PROJ's own, without polynomials."""
+        transform = self._transform
+        return transform.exact if isinstance(transform, PatchedTransform) else transform
+
+    def inverse(self, lon: np.ndarray, lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none.
+
+        Of transformations without epochs.
+        """
+        return self._exact(lon, lat, np.zeros(np.shape(lon)), direction="INVERSE")[:2]
+
+    @property
+    def is_orthometric(self) -> bool:
+        """Whether heights of the file count from a geoid."""
+        return self._geoid is not None
+
+    def undulation(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray | float:
+        """What an ellipsoidal height is above one of the file, m; 0 without a geoid."""
+        return 0.0 if self._geoid is None else self._geoid(lon, lat)
+
     def ground_boxes(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """West, south, east, north (degrees) [n, 4] around boxes of corners [n, 2 or more].
 
@@ -101,10 +123,7 @@ class ToWGS84:
         share = np.linspace(0.0, 1.0, BOX_SAMPLES)
         ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
         x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
-        exact = self._transform
-        if isinstance(exact, PatchedTransform):
-            exact = exact.exact
-        lon, lat, _ = exact(x, y, np.zeros(x.size))
+        lon, lat, _ = self._exact(x, y, np.zeros(x.size))
         places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
         places[~np.isfinite(places)] = np.nan
         first, last = places.min(axis=1), places.max(axis=1)
@@ -167,11 +186,9 @@ def _best_operation(
     return best, notes
 
 
-def _in_frame(horizontal: CRS, change: FrameChange) -> pyproj.Transformer:
+def _in_frame(horizontal: CRS, geographic: CRS) -> pyproj.Transformer:
     """From a system to longitude, latitude and height on its own datum, exact and unambiguous."""
-    return pyproj.Transformer.from_crs(
-        _source(horizontal).to_3d(), change.geographic, always_xy=True
-    )
+    return pyproj.Transformer.from_crs(_source(horizontal).to_3d(), geographic, always_xy=True)
 
 
 def _change_of_frame(
@@ -227,26 +244,27 @@ def _after(first: Callable[..., Any], change: FrameChange) -> Callable[..., Any]
     return transform
 
 
-def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: str | Path) -> None:
-    corners = np.abs([header.mins[:2], header.maxs[:2]]).max(axis=0)
+def _refuse_degrees_as_metres(system: LidarCRS, extent: np.ndarray, file: str | Path) -> None:
+    corners = np.abs(extent[:, :2]).max(axis=0)
     if system.horizontal.is_projected and corners[0] <= 360 and corners[1] <= 90:
         raise InputError(
             f"coordinates up to ({corners[0]:g}, {corners[1]:g}) are no coordinates of "
             f"'{system.name}'; they look like degrees",
             file=file,
-            remedy="correct lidar_crs or the file's header (longitude/latitude is EPSG:4979)",
+            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
+            "(longitude/latitude is EPSG:4979)",
         )
 
 
-def _geoid_remedy(system: LidarCRS, header: laspy.LasHeader, datum: str) -> str:
+def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
     """What to do about heights of a datum: the grid of the place that PROJ has of it."""
     from .geoid_candidates import grid_of  # for refusals alone
 
-    text = "set geoid to a grid (GTX or GeoTIFF) of that datum for this scene"
+    text = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
     geographic = _source(system.horizontal).geodetic_crs
     if geographic is None:
         return text
-    middle = (np.asarray(header.mins[:2]) + np.asarray(header.maxs[:2])) / 2
+    middle = extent[:, :2].mean(axis=0)
     try:
         degrees = pyproj.Transformer.from_crs(
             _source(system.horizontal), geographic.to_2d(), always_xy=True
@@ -272,57 +290,90 @@ def to_wgs84(
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
-    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``geoid``: path of a grid for orthometric
-    heights; ``extent``: lowest and highest coordinates of the points [2, 3], those that the header
-    states if it is not given; ``epochs``: that of the images, at which coordinates are brought to
-    ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
-    takes them for, most of them WGS 84.
-    Raises InputError: no or unusable coordinate system, orthometric heights without a geoid, a
-    dynamic frame without an epoch.
+    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``extent``: lowest and highest coordinates
+    of the points [2, 3], those that the header states if it is not given. Others, errors: see
+    :func:`transformation`.
     """
     system, notes = resolve(header, lidar_crs or None, file)
-    _refuse_degrees_as_metres(system, header, file)
+    stated = np.array([header.mins, header.maxs], np.float64)
+    _refuse_degrees_as_metres(system, stated, file)
+    extent = stated if extent is None else extent
+    return transformation(system, file, extent, geoid=geoid, epochs=epochs, notes=notes)
+
+
+def _surface_of_heights(
+    system: LidarCRS, file: str | Path, extent: np.ndarray, geoid: str | Path | None, unit: str
+) -> tuple[str | Path | None, list[str]]:
+    """The geoid that heights of a file count from, None for the ellipsoid; and remarks."""
     hint = DATUM_IN_NAME.search(Path(file).stem)
     if system.vertical_datum and not geoid:
         raise InputError(
             f"heights are orthometric ('{system.vertical_datum}'), not ellipsoidal",
             file=file,
-            remedy=_geoid_remedy(system, header, system.vertical_datum),
+            remedy=_geoid_remedy(system, extent, system.vertical_datum),
         )
     if not system.has_vertical and hint and not geoid:
         raise InputError(
             f"declares no vertical datum, but its name says orthometric heights ({hint[1]})",
             file=file,
-            remedy=f"{_geoid_remedy(system, header, hint[1])}, or name the file otherwise if its "
+            remedy=f"{_geoid_remedy(system, extent, hint[1])}, or name the file otherwise if its "
             "heights are ellipsoidal",
         )
     if system.ellipsoidal and geoid:
-        notes.append("the file declares ellipsoidal heights: the geoid is not applied to it")
-        geoid = None
+        return None, ["the file declares ellipsoidal heights: the geoid is not applied to it"]
+    if system.has_vertical:
+        return geoid, []
+    taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
+    return geoid, [f"declares no vertical datum: heights are taken as {taken}, in {unit}"]
+
+
+def transformation(
+    system: LidarCRS,
+    file: str | Path,
+    extent: np.ndarray,
+    *,
+    geoid: str | Path | None = None,
+    epochs: Epochs | None = None,
+    keep_frame: bool = False,
+    notes: Sequence[str] = (),
+) -> ToWGS84:
+    """The transformation of coordinates of a system, as LiDAR, rasters and control points need it.
+
+    ``extent``: lowest and highest coordinates [2, 2 or more]; ``geoid``: path of a grid for
+    orthometric heights; ``epochs``: that of the images, at which coordinates are brought to
+    ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
+    takes them for, most of them WGS 84; ``keep_frame``: the result is in the system's own frame;
+    ``notes``: remarks that go before others.
+
+    Raises InputError: a system that PROJ cannot transform, orthometric heights without a geoid, a
+    dynamic frame without an epoch.
+    """
     unit = system.vertical_unit or (
         "metre" if system.horizontal.is_geographic else system.horizontal.axis_info[0].unit_name
     )
-    if not system.has_vertical:
-        taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
-        notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
-    stated = np.array([header.mins, header.maxs], np.float64)
-    stated = stated if extent is None else extent
+    geoid, more = _surface_of_heights(system, file, extent, geoid, unit)
+    notes = [*notes, *more]
     if epochs is not None and system.epoch is not None:
         epochs = epochs._replace(own=system.epoch)
     try:
-        area = area_of(system.horizontal, stated)
-        change = _change_of_frame(system.horizontal, stated, epochs)
-        if change is None:
+        area = area_of(system.horizontal, extent)
+        change = _change_of_frame(system.horizontal, extent, epochs)
+        if keep_frame:
+            geographic = _source(system.horizontal).geodetic_crs.to_3d()
+            transformer, remarks = _in_frame(system.horizontal, geographic), []
+        elif change is None:
             transformer, remarks = _best_operation(system.horizontal, area)
         else:
-            transformer, remarks = _in_frame(system.horizontal, change), list(change.notes)
+            transformer = _in_frame(system.horizontal, change.geographic)
+            remarks = list(change.notes)
     except InputError as error:
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
     except ProjError as error:
         raise InputError(
             f"'{system.name}' cannot be transformed to WGS 84: {error}",
             file=file,
-            remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
+            remedy="name a system that PROJ can transform (lidar_crs, --crs), or transform the "
+            "file",
         ) from error
     transform, operation = transformer.transform, transformer.description
     accuracy = frame = None
@@ -358,7 +409,7 @@ def to_wgs84(
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.
-        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
+        _heights_follow_datum=modern and not keep_frame and not (grid and grid.above_wgs84),
     )
 
 
@@ -386,6 +437,9 @@ def check_area(
     )
     if beyond > 8:
         raise InputError(
-            where, file=file, remedy="correct lidar_crs or the file's coordinate system"
+            where,
+            file=file,
+            remedy="correct the coordinate system that is given (lidar_crs, --crs) or that the "
+            "file declares",
         )
     return where
