@@ -98,8 +98,8 @@ _NZGD2000 = Realisation(
     2000.0,
     spread_m=0.5,
     remark="New Zealand deforms, by up to 4 cm a year between its coasts: NZGD2000 is brought to "
-    "the date of the images as on a rigid plate, since LINZ's grid nz_linz_nzgd2000-20180701.json is "
-    "not installed (projsync --file gets it)",
+    "the date of the images as on a rigid plate, since LINZ's grid nz_linz_nzgd2000-20180701.json "
+    "is not installed (projsync --file gets it)",
 )
 # By the EPSG code of the datum, with the definitions of EPSG's register (v11) where nothing else
 # stands. No entry is made where PROJ knows the way itself.
