@@ -57,6 +57,7 @@ from .lidar_checks import (
     heights_of_model,
     pixel_m,
 )
+from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -126,7 +127,8 @@ def _record(
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
-        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
+        "m (east, north), see plan_place",
     }
 
 
@@ -291,6 +293,9 @@ def refine(
         doubts = [text for text in doubts if text]
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
+        if not isinstance(result, str):
+            observations, found, refined, halves = result
+            found, in_plan, seen_in_plan = place_pair(refined, found, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:
@@ -308,12 +313,15 @@ def refine(
             provenance=record_of,
         )
         return unrefined, None
-    observations, found, refined, halves = result
+    refined = with_corrections(alignment, found.parameters)
+    of_images = replace(observations.of_images, in_plan=seen_in_plan)
+    observations = replace(observations, of_images=of_images)
     reason = _objection(found, halves, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
+    record["place_in_plan"] = in_plan
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     misfits = [round(misfit, 3) for misfit in halves]
