@@ -98,6 +98,8 @@ def plan_offset(
     source: Source, sensor: SensorModel, edges: RoofEdges, reach_m: float
 ) -> PlanOffset | str:
     """The offset within ``reach_m`` of all edges in an image, or why it is not known."""
+    if len(edges) < FEWEST:
+        return f"the LiDAR has only {len(edges)} edges of roofs here"
     at = _Projected.of(sensor, edges)
     lines = _find_lines(source, at, edges.site, reach_m)
     if np.unique(lines.edge).size < FEWEST:

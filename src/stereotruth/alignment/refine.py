@@ -316,7 +316,7 @@ def refine(
     refined = with_corrections(alignment, found.parameters)
     of_images = replace(observations.of_images, in_plan=seen_in_plan)
     observations = replace(observations, of_images=of_images)
-    reason = _objection(found, halves, bool(gcps))
+    reason = _objection(found, halves, bool(gcps), bool(seen_in_plan))
     record = _record(alignment, refined, observations, found, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
@@ -357,13 +357,16 @@ def refine(
     return refined, observations
 
 
-def _objection(found: Estimate, halves: tuple[float, float], with_gcps: bool) -> str:
+def _objection(
+    found: Estimate, halves: tuple[float, float], with_gcps: bool, with_roofs: bool
+) -> str:
     """Why a refinement is not applied, or an empty string.
 
-    ``halves``: misfit of one half of the sites, before and by the other half.
+    ``halves``: misfit of one half of the sites, before and by the other half; ``with_roofs``:
+    edges of roofs tell the place of both images, which tie points need not contradict.
     """
     before, after = halves
-    if _chance(found) > SIGNIFICANT:
+    if _chance(found) > SIGNIFICANT and not with_roofs:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (
