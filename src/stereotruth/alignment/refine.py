@@ -5,13 +5,14 @@ LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative 
 both images have in common they see on slopes only, as LiDAR strips are co-registered by their
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it.
+settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
+open, edges of roofs settle it (:mod:`.plan_place`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
 by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if the tie
-points do not contradict it, or if the corrections from one half of the sites do not improve the
+from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
+points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
 other half.
 """
 
