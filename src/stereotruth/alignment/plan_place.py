@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 WORTH = 0.5  # of COMMON_M: a place that is known better gains nothing by edges
 REACH_SIGMAS, LEAST_REACH_M, LARGEST_REACH_M = 3.0, 4.0, 8.0  # of the search for an offset
-EDGES = 300  # about, of a scene
+EDGES = 240  # about, of a scene
 AGREE_SIGMAS = 3.0  # of images and halves, that the offsets of either may lie apart
 
 

@@ -32,6 +32,7 @@ SMOOTH_M, SMOOTH = 0.3, 0.8  # m from a roof's plane within which this share of 
 STEEPEST = 0.6  # m per m, of a roof
 LOW = 0.9  # share of the points beside a roof that lie lower
 MISPLACED = 0.08  # share of the points on the wrong side of an edge, at most
+BESIDE = 4.5  # cells around a step where no other line is looked for
 FEWEST = 6  # steps, and points of each side
 TURNS = np.radians(np.arange(-6.0, 6.5, 1.0))  # of a line, that are tried
 EMPTY_CELLS = 3.0  # cells from the nearest point on: nothing is known there
@@ -118,16 +119,18 @@ def _lines(at: Floats, height: Floats, most: int) -> Floats:
     if len(steps) < FEWEST:
         return np.zeros((0, 7))
     tree, points = cKDTree(steps[:, :2]), cKDTree(at)
-    free = np.ones(len(steps), bool)
+    free, tried = np.ones(len(steps), bool), np.zeros(len(steps), bool)
     lines = []
     # in any order but that of the place: of a site with many edges all sides have their share
     for k in np.random.default_rng(len(steps)).permutation(len(steps)):
-        if not free[k]:
+        if tried[k] or not free[k]:
             continue
         near = np.array(tree.query_ball_point(steps[k, :2], length / 2, return_sorted=True))
         near = near[free[near] & (np.abs(steps[near, 4] - steps[k, 4]) < ONE_ROOF_M)]
-        free[k] = False
-        line = _line_of(steps[near], length, cell) if near.size >= FEWEST else None
+        beside = np.abs(steps[near, :2] - steps[k, :2]).max(axis=1) < BESIDE * cell
+        tried[near[beside]] = True
+        enough = max(FEWEST, COVERED * SHORTEST * length / cell)
+        line = _line_of(steps[near], length, cell) if near.size >= enough else None
         if line is None:
             continue
         chosen, middle, along, half = line
