@@ -20,7 +20,7 @@ class Equations:
     ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
     matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
     and biased where the surface is not what the points say). Observations of one ``site`` int[n]
-    share errors. ``at`` [n, 2] px: place in the left image.
+    share errors. ``at``, ``there`` [n, 2] px: place in the left and in the right image.
     """
 
     design: Floats
@@ -28,6 +28,12 @@ class Equations:
     own: Floats
     site: NDArray[np.int64]
     at: Floats
+    there: Floats
+
+    @property
+    def lines(self) -> Floats:
+        """[n, 2] px: lines of the left and of the right image."""
+        return np.column_stack([self.at[:, 1], self.there[:, 1]])
 
     def part(self, chosen: Bools) -> Equations:
         """Those that are ``chosen`` [n]."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.rpc import RPC, SensorModel
 from ..errors import InputError
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from .align import LARGE_SHIFT
 from .aligned_pair import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
@@ -73,7 +74,7 @@ def _px_per_m(rpc: RPC, size: tuple[int, int], height: float) -> Floats:
 
 
 def _images(
-    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment]
+    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment], epoch: Epoch
 ) -> dict[str, ImageToFit]:
     """All images by name, with the control points that any pair's file has of them."""
     starts: dict[str, tuple[ViewFit, RPC, float]] = {}
@@ -86,7 +87,7 @@ def _images(
         if pair.gcps is None:
             continue
         try:
-            points = read_gcps(pair.gcps, pair.scene, pair.names)
+            points = read_gcps(pair.gcps, pair.scene, pair.names, epoch)
         except NoPoints:
             continue
         for name, at in zip(pair.names, (points.left, points.right)):
@@ -139,6 +140,7 @@ def adjust_site(
     *,
     fixed: Mapping[str, str | Path] | None = None,
     strict: bool = False,
+    epoch: Epoch = DEFAULT_EPOCH,
     provenance: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Adjust the images of a city's pairs that share images; JSON-ready figures and corrections.
@@ -151,7 +153,7 @@ def adjust_site(
     """
     scenes = sorted(scenes, key=lambda pair: pair.scene)
     alignments = {pair.scene: Alignment.load(pair.alignment) for pair in scenes}
-    images = _images(scenes, alignments)
+    images = _images(scenes, alignments, epoch)
     pairs = [
         PairToFit(pair.scene, pair.left, pair.right, *read_equations(pair.equations))
         for pair in scenes

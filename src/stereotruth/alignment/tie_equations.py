@@ -17,9 +17,9 @@ MEANING = (
     "right, of the correction of the RPC's (col, row) by (a_u u + a_v v + a_1, b_u u + b_v v + "
     "b_1), px, (u, v) being px from the image's middle in halves of its longer side; own: px, "
     "standard deviation of the match by itself; site: tie points of one part of the scene; at: "
-    "(col, row) px in the left image; in_plan: of the left and the right image, by edges of roofs: "
-    "observed [col, row; px] = design [2, 6] @ parameters of the image + error of this covariance "
-    "[px^2], and px_per_m @ (east, north; m) of an error that all images share"
+    "(col, row) px in the left image, there: in the right one; in_plan: of the left and the right "
+    "image, by edges of roofs: observed [col, row; px] = design [2, 6] @ parameters of the image + "
+    "error of this covariance [px^2], and px_per_m @ (east, north; m) of an error that all share"
 )
 
 
@@ -51,7 +51,7 @@ def read_equations(path: str | Path) -> tuple[PairEquations | None, str]:
 def _from_dict(values: dict[str, Any]) -> tuple[PairEquations | None, str]:
     if "design" not in values:
         return None, values["reason"]
-    names = ("design", "observed", "own", "site", "at")
+    names = ("design", "observed", "own", "site", "at", "there")
     equations = Equations(*(np.array(values[name]) for name in names))
     about = (np.array(values[name]) for name in ("start", "linearised_at"))
     in_plan = tuple(

@@ -172,7 +172,7 @@ def estimated(shifts: np.ndarray, sigma: float, rng: np.random.Generator, noise:
     observed = design @ truth + rng.normal(0, noise, (n, 2))
     prior = np.eye(12) * sigma**2
     where = np.column_stack([u, v])
-    equations = Equations(design, observed, np.full(n, noise), np.arange(n) // 9, where)
+    equations = Equations(design, observed, np.full(n, noise), np.arange(n) // 9, where, where)
     return estimate(equations, prior)
 
 

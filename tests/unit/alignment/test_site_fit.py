@@ -67,7 +67,7 @@ class Made:
         observed = design @ truth + self.rng.normal(0, 1, (TIES, 2)) * own[:, None]
         site = (at // 125).astype(int) @ [8, 1]
         about = truth + self.rng.normal(0, 0.05, 12)
-        ties = PairEquations(Equations(design, observed, own, site, at), about, about, 200, 0.0)
+        ties = PairEquations(Equations(design, observed, own, site, at, at), about, about, 200, 0.0)
         return PairToFit(f"{left}-{right}", left, right, ties)
 
     def errors(self, fit: SiteFit, name: str) -> np.ndarray:
