@@ -127,10 +127,14 @@ class SceneInputs:
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
         if self.alignment is not None:
-            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
         if self.strips is not None:
-            uncertainty = with_strips(uncertainty, StripOffsets.read(self.strips), model, self.view)
+            strips = StripOffsets.read(self.strips)
+            uncertainty = with_strips(uncertainty, strips, model, self.view, shared_px)
         return seen_from(
             self.view,
             Pair(
