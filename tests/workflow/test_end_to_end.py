@@ -59,7 +59,11 @@ def test_tiles_are_made_with_all_their_files(made):
     disparity = rioxarray.open_rasterio(next((folder / "disp").iterdir()), masked=True)
     assert disparity.isnull().any() and disparity.notnull().any()
     assert abs(disparity).max() < 200
-    assert len(list((folder / "orientation").iterdir())) >= len(labelled)
+    orientations = sorted((folder / "orientation").iterdir())
+    assert len(orientations) >= len(labelled)
+    ground = json.loads(orientations[0].read_text())["ground_frame"]  # of LiDAR in a zone of UTM
+    assert (ground["frame"], ground["epoch"], ground["by"]) == ("ITRF2020", 2020.0, "")
+    assert [one["legs"] for one in ground["source"]] == [[]]
 
 
 def test_disparity_agrees_with_the_exact_truth(made, tmp_path):

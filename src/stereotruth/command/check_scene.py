@@ -19,13 +19,13 @@ from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..alignment.pair_ground import footprint_of
 from ..configuration import Configuration
-from ..disparity.overlap_check import FAR, Box, apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import MAX_PIXELS, Source, bands_of
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.footprint import Footprint
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
+from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
 from ..project import is_synthetic, lidar_of

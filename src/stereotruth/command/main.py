@@ -124,17 +124,18 @@ def init(
     if twin is not None:
         from .twin_project import DENSITY, SUN_DEG, Options, with_twin
 
-        folder = folder or Path("twin")
+        to: Path | str = folder or Path("twin")
         options = Options(crs, density or DENSITY, sun or SUN_DEG, size, rpc)
-        next_step = with_twin(folder, twin, options)
+        next_step = with_twin(Path(to), twin, options)
     else:
         if crs or density or sun or size or rpc:
             raise InputError(
                 "--crs, --density, --sun, --size and --rpc are of a twin", remedy="add --twin FILE"
             )
-        folder = folder or Path(example)
-        next_step = with_example(folder, example) if example else begin(folder)
-    typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
+        to = example if folder is None else folder
+        next_step = with_example(to, example) if example else begin(to)
+    go = "" if Path(to) == Path() else f"cd {to}, then "
+    typer.echo(f"{to}: a project. Next: {go}{next_step}")
 
 
 @scene_app.command(

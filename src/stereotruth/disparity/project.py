@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..job import block_progress
+from ..lidar.overlap_check import apart, refuse_apart
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
-from .overlap_check import apart, refuse_apart
 from .recipe import label_window
 from .scene_inputs import SceneInputs
 from .status import Status, is_labelled

@@ -93,11 +93,19 @@ _NAD83 = Realisation(
     remark="names no realisation of NAD83, or an old one: taken as NAD83(2011); NAD83(HARN) and "
     "later ones lie within some 0.1 m of it, NAD83(1986) within 1 m",
 )
+_NZGD2000 = Realisation(
+    7907,  # ITRF96
+    2000.0,
+    spread_m=0.5,
+    remark="New Zealand deforms, by up to 4 cm a year between its coasts: NZGD2000 is brought to "
+    "the date of the images as on a rigid plate, since LINZ's grid nz_linz_nzgd2000-20180701.json "
+    "is not installed (projsync --file gets it)",
+)
 # By the EPSG code of the datum, with the definitions of EPSG's register (v11) where nothing else
 # stands. No entry is made where PROJ knows the way itself.
 REALISATIONS = {
-    6167: Realisation(7907, 2000.0),  # NZGD2000: ITRF96
-    1043: Realisation(7908, 2000.0),  # China 2000 (CGCS2000): ITRF97
+    6167: _NZGD2000,
+    1043: Realisation(7908, 2000.0, spread_m=0.2),  # China 2000 (CGCS2000): ITRF97
     6674: Realisation(7909, 2000.4),  # SIRGAS 2000: ITRF2000
     6170: Realisation(7906, 1995.4),  # SIRGAS 1995: ITRF94
     1062: Realisation(7910, 2006.632),  # POSGAR 2007: ITRF2005

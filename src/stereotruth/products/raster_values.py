@@ -61,6 +61,13 @@ HEIGHT = Quantity(
 MASK = Quantity("pixel of a mask", "mask", 0.0, np.inf, "give a mask of one band")
 
 
+def is_value(raw: NDArray[Any], value: float) -> NDArray[np.bool_]:
+    """Where stored numbers are a value, as precise as their type can tell it."""
+    if np.dtype(raw.dtype).kind == "f":
+        value = np.asarray(value, raw.dtype)
+    return raw == value
+
+
 def refuse_bands(dataset: Any, file: Path, quantity: Quantity) -> None:
     """Raise InputError for other than one band of real numbers beside an alpha band."""
     bands = dataset.count - (ColorInterp.alpha in dataset.colorinterp)
@@ -108,7 +115,7 @@ class Values:
         raw = self.dataset.read(1, **how)
         there = np.isfinite(raw)
         if self.dataset.nodata is not None:
-            there &= raw != np.array(self.dataset.nodata).astype(raw.dtype)
+            there &= ~is_value(raw, self.dataset.nodata)
         if (hidden := self.hidden.read(self.dataset, **how)) is not None:
             there &= ~hidden
         return raw, there

@@ -157,7 +157,7 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
     doubts = quality.get("doubts", {})
-    doubted = [scene for scene, of in doubts.items() if any(d["of"] != "strips" for d in of)]
+    doubted = [scene for scene, of in doubts.items() if any(d.get("of") != "strips" for d in of)]
     if doubted:
         note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"

@@ -26,6 +26,7 @@ from ..job import progress
 from ..kernels import kernel
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
+from ..lidar.overlap_check import refuse_apart
 from ..lidar.point_store import PointStore
 from ..products.atomic_outputs import marks_of_inputs
 from ..products.files import atomic_file, atomic_folder, link, sealed
@@ -222,6 +223,8 @@ def make_surface(
     :func:`group_blocks`; ``made_of``, ``code``:
     digests of other input and of the source, for the provenance. Blocks that an earlier call has
     left, made of the same, are taken over.
+
+    Raises InputError where the images show no point.
     """
     out = Path(out).absolute()
     density = points_per_m2(stores, ground and ground.shows) or points_per_m2(stores)
@@ -231,7 +234,13 @@ def make_surface(
     side = block_side(scale)
     imaged = ShownBlocks.of(stores, scale, side, ground)
     maker = _Maker(scale, side, imaged, tuple(stores), folder, code)
-    groups = _groups(imaged.numbers(), blocks_at_once or group_blocks(scale, side))
+    numbers = imaged.numbers()
+    if ground is not None and not numbers:
+        bounds = np.array([store.bounds for store in stores])
+        box = (*bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:4].max(axis=0).tolist())
+        heights = float(bounds[:, 4].min()), float(bounds[:, 5].max())
+        refuse_apart(box, ground.box(heights), heights, stores[0].path)
+    groups = _groups(numbers, blocks_at_once or group_blocks(scale, side))
     lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
     try:
         lock.take(out)
