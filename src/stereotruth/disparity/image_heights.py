@@ -232,9 +232,9 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
 
 @dataclass(frozen=True, eq=False)
 class _CrownPixels:
-    """What the tops of crowns show in a block, arrays [h, w]: ``is_nearest``, where they are nearest;
-    their ``values``, the ``disparity`` (−∞ for none), and ``variance`` px² of what lies between
-    them, NaN for none."""
+    """What the tops of crowns show in a block, arrays [h, w]: ``is_nearest`` where nothing hides
+    them; their ``values``, ``disparity`` (−∞ for none), and the ``variance`` px² of what lies
+    between them, NaN for none."""
 
     is_nearest: NDArray[np.bool_]
     values: PixelValues
