@@ -1,9 +1,9 @@
-"""Places and heights of scenes whose LiDAR is in a national frame and whose control points are ITRF.
+"""Places and heights of scenes whose LiDAR is in a national frame and whose GCPs are in ITRF.
 
-One small synthetic scene for each country, through the whole workflow, twice: with its LiDAR in WGS 84, which is taken
-as ITRF at the date of the images, and with the same points in the national frame, where PROJ's
-time-dependent operations (written out from EPSG's parameters) put them at that date. What both make
-of a pixel must be the same place and height.
+One small synthetic scene for each country goes through the whole workflow twice: with its LiDAR in
+WGS 84, which is taken as ITRF at the date of the images, and with the same points in the national
+frame, where PROJ's time-dependent operations (written out from EPSG's parameters) put them at that
+date. Both must make the same place and height of a point, and of a pixel of the original image.
 
 python bench/frames.py FOLDER [COUNTRY …]
 """
@@ -11,8 +11,10 @@ python bench/frames.py FOLDER [COUNTRY …]
 from __future__ import annotations
 
 import csv
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +27,8 @@ from numpy.typing import NDArray
 
 from stereotruth.command.example_city import DEMO
 from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.lidar.frames import Epoch, Epochs
+from stereotruth.lidar.to_wgs84 import to_wgs84
 from stereotruth.numerics.degrees import metres_per_degree
 from stereotruth.simulate.__main__ import make_scene
 from stereotruth.simulate.cities import SceneSpec
@@ -32,6 +36,7 @@ from stereotruth.simulate.cities import SceneSpec
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parents[1]
+LIDAR = ("in/lidar", "national")  # in WGS 84, in the frame
 SEED, SPACING_M, SIDE_PX, TILE_PX = 1, 0.5, 560, 128
 NAD83 = (
     "+proj=helmert +x=1.0039 +y=-1.90961 +z=-0.54117 +rx=0.02678138 +ry=-0.00042027 "
@@ -81,7 +86,7 @@ def to_national(file: Path, to: Path, country: Country) -> None:
     """The points of a LAS file in UTM of WGS 84 (ITRF2020) in the national system."""
     las = laspy.read(file)
     lon, lat, height = pyproj.Transformer.from_crs(
-        CRS_3D(country.utm), "EPSG:4979", always_xy=True
+        pyproj.CRS.from_epsg(country.utm).to_3d(), "EPSG:4979", always_xy=True
     ).transform(np.array(las.x), np.array(las.y), np.array(las.z))
     pipeline = (
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart "
@@ -106,10 +111,6 @@ def to_national(file: Path, to: Path, country: Country) -> None:
     out.write(to)
 
 
-def CRS_3D(code: int) -> pyproj.CRS:
-    return pyproj.CRS.from_epsg(code).to_3d()
-
-
 def made(name: str, folder: Path) -> Path:
     """A project of two cities, the same scene with its LiDAR in WGS 84 and in the frame."""
     country, project = COUNTRIES[name], folder / name
@@ -130,73 +131,83 @@ def made(name: str, folder: Path) -> Path:
         "scenes": [["scene", "city", "left_image", "right_image", "lidar", "lidar_crs", "geoid",
                     "gcps"]],
     }  # fmt: skip
-    for k, lidar in enumerate(("in/lidar", "national")):
+    for k, lidar in enumerate(LIDAR):
         town = f"{name}{k}"
         tables["cities"].append([town, f"T{k}", "6", "1", "3"])
-        views = [f"in/{view}.tif" for view in ("left", "right")]
-        copies = []
-        for view in views:
-            copy = Path(view).with_stem(f"{Path(view).stem}{k}")
-            (project / copy).symlink_to(Path(view).name) if False else None
-            copies.append(str(copy))
-            (project / copy).write_bytes((project / view).read_bytes())
-            tables["images"].append([f"{Path(copy).stem}", town, str(copy), country.day])
-        stems = [Path(copy).stem for copy in copies]
-        tables["scenes"].append([f"{town}-1", town, *stems, lidar, "", "", "in/gcps.csv"])
+        for view in ("left", "right"):  # a copy for each city: the sheet has a file once
+            shutil.copy(project / f"in/{view}.tif", project / f"in/{view}{k}.tif")
+            tables["images"].append([f"{view}{k}", town, f"in/{view}{k}.tif", country.day])
+        images = [f"left{k}", f"right{k}"]
+        tables["scenes"].append([f"{town}-1", town, *images, lidar, "", "", "in/gcps.csv"])
     for table, rows in tables.items():
         with (project / f"{table}.tsv").open("w", newline="") as stream:
             csv.writer(stream, delimiter="\t", lineterminator="\n").writerows(rows)
-    config = {key: f"{key}.tsv" for key in tables} | {"tiles": {"size": TILE_PX, "min_labelled": 0.3}}  # fmt: skip
+    config = {key: f"{key}.tsv" for key in tables}
+    config["tiles"] = {"size": TILE_PX, "min_labelled": 0.3}
     (project / "config.yaml").write_text(yaml.safe_dump(config))
     return project
 
 
-def places(project: Path, town: str) -> tuple[Floats, Floats, EpipolarModel]:
-    """Heights of labels on the grid, rows and columns of which are those of the model."""
-    store = zarr.open_group(project / f"results/project/{town}/{town}-1.zarr", mode="r")
-    model = EpipolarModel.from_dict(store.attrs["epipolar"])
-    height = np.where(np.isfinite(store["disparity"][:]), store["height"][:], np.nan)
-    return height.astype(np.float64), store["disparity"][:].astype(np.float64), model
+def metres(lon: Floats, lat: Floats, height: Floats, judge: Sequence[Floats]) -> Floats:
+    """Median east, north, up of places less those of the judge."""
+    per = metres_per_degree(float(np.median(lat)))
+    east, north = (lon - judge[0]) * per[0], (lat - judge[1]) * per[1]
+    return np.nanmedian(np.stack([east, north, height - judge[2]]), axis=1)
 
 
-def compare(project: Path, name: str) -> None:
-    """Print what the frame changes of places and heights."""
-    (h0, d0, m0), (h1, d1, m1) = (places(project, f"{name}{k}") for k in (0, 1))
-    print(f"{name}: grids {h0.shape} {h1.shape}, labels {np.isfinite(h0).sum()} {np.isfinite(h1).sum()}")  # fmt: skip
-    rows, cols = np.nonzero(np.isfinite(h0))
-    pick = np.random.default_rng(0).choice(rows.size, min(rows.size, 4000), replace=False)
-    rows, cols = rows[pick], cols[pick]
-    # The same pixel of the left original image, in both grids.
-    lon, lat = m0.epipolar_to_ground(cols.astype(float), rows.astype(float), h0[rows, cols])
-    col, row = m0.left.project(lon, lat, h0[rows, cols])
-    x, y = m1.left_to_epipolar(col, row) if hasattr(m1, "left_to_epipolar") else (None, None)
-    if x is None:
-        x, y, _, _ = m1.ground_to_epipolar(lon, lat, h0[rows, cols])
-    near = np.rint(y).astype(int), np.rint(x).astype(int)
-    inside = (near[0] >= 0) & (near[1] >= 0) & (near[0] < h1.shape[0]) & (near[1] < h1.shape[1])
-    near = near[0][inside], near[1][inside]
-    other = h1[near]
-    lon1, lat1 = m1.epipolar_to_ground(near[1].astype(float), near[0].astype(float), other)
-    dh = other - h0[rows, cols][inside]
-    per = metres_per_degree(float(np.mean(lat)))
-    shift = np.nanmedian(np.stack([(lon1 - lon[inside]) * per[0], (lat1 - lat[inside]) * per[1], dh]), axis=1)  # fmt: skip
-    dd = d1[near] - d0[rows, cols][inside]
-    print(f"  east {shift[0]:+.4f} m, north {shift[1]:+.4f} m, up {shift[2]:+.4f} m (medians), "
-          f"disparity {np.nanmedian(dd):+.4f} px")  # fmt: skip
+def points(project: Path, country: Country) -> Floats:
+    """How far the points are off as ingest takes them, east, north, up (m)."""
+    epochs = Epochs(Epoch(country.year, "the sheet"))
+    placed = []
+    for folder in LIDAR:
+        (file,) = sorted((project / folder).iterdir())
+        las = laspy.read(file)
+        transform = to_wgs84(las.header, file, epochs=epochs)
+        placed.append(transform(np.array(las.x), np.array(las.y), np.array(las.z)))
+    return metres(*placed[1], placed[0])
+
+
+def pixels(project: Path, name: str) -> tuple[Floats, float, int]:
+    """How far places and heights of the left image's pixels are off, east, north, up (m), labels
+    by disparity (px), and how many there are."""
+    heights, disparities, models = [], [], []
+    for k in (0, 1):
+        store = zarr.open_group(project / f"results/project/{name}{k}/{name}{k}-1.zarr", mode="r")
+        models.append(EpipolarModel.from_dict(store.attrs["epipolar"]))
+        disparities.append(store["disparity"][:].astype(np.float64))
+        heights.append(np.where(np.isfinite(disparities[k]), store["height"][:], np.nan))
+    row, col = np.nonzero(np.isfinite(heights[0]))
+    x, y = col.astype(float), row.astype(float)
+    there = models[1].left_to_epipolar(*models[0].epipolar_to_left(x, y))
+    at = tuple(np.rint(v).astype(int) for v in reversed(there))
+    inside = np.all([(v >= 0) & (v < n) for v, n in zip(at, heights[1].shape)], axis=0)
+    x, y, row, col, *at = (v[inside] for v in (x, y, row, col, *at))
+    there = [v[inside] for v in there]
+    judge = (*models[0].epipolar_to_ground(x, y, heights[0][row, col]), heights[0][row, col])
+    height = heights[1][tuple(at)]
+    known = np.isfinite(height)
+    found = models[1].epipolar_to_ground(*(v[known] for v in there), height[known])
+    off = metres(*found, height[known], [v[known] for v in judge])
+    change = disparities[1][tuple(at)] - disparities[0][row, col]
+    return off, float(np.nanmedian(change)), int(known.sum())
 
 
 def main() -> None:
+    """Make and compare the scenes of all countries, or of those that are named."""
     folder = Path(sys.argv[1])
     for name in sys.argv[2:] or COUNTRIES:
         project = made(name, folder)
-        towns = [f"results/project/{name}{k}/{name}{k}-1.zarr" for k in (0, 1)]
-        subprocess.run(
-            [sys.executable, "-m", "snakemake", "--cores", "1", "--snakefile", ROOT / "Snakefile",
-             "--directory", project, "--configfile", project / "config.yaml", "--quiet", "all",
-             "--", *towns],
-            check=True,
-        )  # fmt: skip
-        compare(project, name)
+        stores = [f"results/project/{name}{k}/{name}{k}-1.zarr" for k in (0, 1)]
+        command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
+        command += ["--snakefile", ROOT / "Snakefile", "--directory", project]
+        command += ["--configfile", project / "config.yaml", "--", *stores]
+        subprocess.run(command, check=True)
+        off, change, count = pixels(project, name)
+        of_points = points(project, COUNTRIES[name])
+        for what, shift in (("points", of_points), ("pixels", off)):
+            east, north, up = shift
+            print(f"{name}: {what} east {east:+.4f}, north {north:+.4f}, up {up:+.4f} m")
+        print(f"{name}: disparity {change:+.4f} px at {count} pixels", flush=True)
 
 
 if __name__ == "__main__":

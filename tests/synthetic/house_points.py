@@ -9,11 +9,11 @@ import numpy as np
 import pyproj
 
 ORIGIN = np.array([500_000.0, 4_800_000.0])  # of EPSG:32631, in France
-HALF_M = 95.0  # half the side of the place
+HALF_M = 62.0  # half the side of the place
 GROUND_Z, EAVES_Z, RISE = 120.0, 128.0, 4.0
 HOUSE = 24.0, 12.0  # half length (east), half width (north) of the gabled one, in the middle
-FLAT = (40.0, -50.0), 15.0, 134.0  # middle, half side, height of the flat one
-TREES = ((-55.0, 40.0), 6.0, 131.0), ((-40.0, -45.0), 5.0, 129.0)  # middle, radius, top
+FLAT = (38.0, -40.0), 12.0, 134.0  # middle, half side, height of the flat one
+TREES = ((-42.0, 36.0), 6.0, 131.0), ((-38.0, -38.0), 5.0, 129.0)  # middle, radius, top
 DENSITY = 6.0  # points per m²
 ROOF_GREY, GROUND_GREY = 200, 120  # of 255
 

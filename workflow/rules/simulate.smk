@@ -26,6 +26,7 @@ rule simulate_city:
 rule simulate_image:
     input:
         city=file_of_city,
+        place=files_of_place,
         surfaces=rules.simulate_city.output.surfaces,
     output:
         image="data/synthetic/{city}/{scene}/{view}.tif",

@@ -25,7 +25,8 @@ UNITS = {
     "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
     "lon, lat": "degrees, WGS 84",
     "height": "m above the WGS 84 ellipsoid",
-    "model_heights": "m above the WGS 84 ellipsoid, lowest and highest that the epipolar model is fitted to",
+    "model_heights": "m above the WGS 84 ellipsoid, lowest and highest that the epipolar model "
+    "is fitted to",
     "affine": "(col, row)_image = affine @ (col_rpc, row_rpc, 1); px",
     "covariance": "px^2, of (a_u, a_v, a_1, b_u, b_v, b_1) in col = … + a_u u + a_v v + a_1, "
     "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",

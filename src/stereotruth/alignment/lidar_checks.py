@@ -77,7 +77,7 @@ def heights_of_model(
         lowest, highest = sensor.rpc.ground_box[4:]
         spare = (highest - lowest) / 4
         low, high = max(low, lowest - spare), min(high, highest + spare)
-    return (round(low - margin, 3), round(high + margin, 3)) if low < high else None
+    return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
 def _heights_around(

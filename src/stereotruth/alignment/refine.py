@@ -5,13 +5,14 @@ LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative 
 both images have in common they see on slopes only, as LiDAR strips are co-registered by their
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it.
+settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
+open, edges of roofs settle it (:mod:`.plan_place`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
 by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if the tie
-points do not contradict it, or if the corrections from one half of the sites do not improve the
+from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
+points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
 other half.
 """
 
@@ -61,6 +62,7 @@ from .lidar_checks import (
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
+from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -130,7 +132,8 @@ def _record(
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
-        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
+        "m (east, north), see plan_place",
     }
 
 
@@ -227,6 +230,21 @@ def _search(
     halves = agreement_of_halves(equations, prior)
     log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
     return _Found(observations, found, shared, lines, current, halves)
+
+
+def _placed(
+    start: Alignment, result: _Found, sources: tuple[Source, Source], stores: Sequence[PointStore]
+) -> tuple[_Found, dict[str, Any]]:
+    """What tie points tell, with the place in plan, and the figures of it."""
+    found, figures, seen = place_pair(result.alignment, result.estimate, sources, stores)
+    of_images = replace(result.observations.of_images, in_plan=seen)
+    placed = replace(
+        result,
+        observations=replace(result.observations, of_images=of_images),
+        estimate=found,
+        alignment=with_corrections(start, found.parameters, result.lines.corrections),
+    )
+    return placed, figures
 
 
 def _discord(observations: Observations) -> str:
@@ -343,6 +361,8 @@ def refine(
         doubts = [text for text in doubts if text]
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
+        if not isinstance(result, str):
+            result, in_plan = _placed(alignment, result, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:
@@ -367,6 +387,7 @@ def refine(
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
+    record["place_in_plan"] = in_plan
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     misfits = [round(misfit, 3) for misfit in result.halves]
@@ -411,7 +432,9 @@ def refine(
 def _objection(result: _Found, with_gcps: bool) -> str:
     """Why a refinement is not applied, or an empty string."""
     before, after = result.halves
-    if _chance(result.estimate) > SIGNIFICANT and not result.lines.stands_out:
+    # what roofs tell of the place of both images, tie points need not contradict
+    told = result.lines.stands_out or bool(result.observations.of_images.in_plan)
+    if _chance(result.estimate) > SIGNIFICANT and not told:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (

@@ -110,6 +110,13 @@ def init(
             "default: all of it."
         ),
     ] = None,
+    rpc: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            help="Images with RPCs, or texts of RPCs: the twin's left and right image see the "
+            "place as they do; default: GaoFen-7."
+        ),
+    ] = None,
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     from .new_project import begin, with_example
@@ -118,12 +125,12 @@ def init(
         from .twin_project import DENSITY, SUN_DEG, Options, with_twin
 
         to: Path | str = folder or Path("twin")
-        options = Options(crs, density or DENSITY, sun or SUN_DEG, size)
+        options = Options(crs, density or DENSITY, sun or SUN_DEG, size, rpc)
         next_step = with_twin(Path(to), twin, options)
     else:
-        if crs or density or sun or size:
+        if crs or density or sun or size or rpc:
             raise InputError(
-                "--crs, --density, --sun and --size are of a twin", remedy="add --twin FILE"
+                "--crs, --density, --sun, --size and --rpc are of a twin", remedy="add --twin FILE"
             )
         to = example if folder is None else folder
         next_step = with_example(to, example) if example else begin(to)

@@ -26,6 +26,7 @@ class Options:
     density: float = DENSITY
     sun_deg: tuple[float, float] = SUN_DEG
     size_px: tuple[int, int] | None = None
+    rpcs: tuple[Path, Path] | None = None
 
 
 def with_twin(folder: str | Path, file: Path, options: Options) -> str:
@@ -44,7 +45,12 @@ def with_twin(folder: str | Path, file: Path, options: Options) -> str:
             remedy="--sun takes azimuth and elevation, 15 to 90 degrees high",
         )
     city = twin_city(
-        NAME, file.resolve(), crs=options.crs, size_px=options.size_px, sun_deg=options.sun_deg
+        NAME,
+        file.resolve(),
+        crs=options.crs,
+        size_px=options.size_px,
+        sun_deg=options.sun_deg,
+        rpcs=None if options.rpcs is None else tuple(rpc.resolve() for rpc in options.rpcs),
     )
     (scene,) = city.scenes
     shorter = min(scene.cols, scene.rows)

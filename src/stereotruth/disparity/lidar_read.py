@@ -15,7 +15,6 @@ from ..epipolar.virtual_points import frame, inside
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..lidar.lattice import cell_key
 from ..lidar.point_store import PointStore
-from ..lidar.strip_offsets import StripOffsets
 from ..numerics.hull import corners_of_hull
 from .scene_inputs import SceneInputs
 
@@ -34,7 +33,8 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
     points labels may follow from, and which the footprint left out. ``acquired``: first and last
     day of the points, None unless all files tell them; ``doubts`` about the points; ``surfaces``:
     what heights count from, by number of files; ``strips``: what they are off, None of one strip;
-    ``frame`` and epoch of the places, and those of the files. What is missing is logged, and files of different surfaces.
+    ``frame`` and epoch of the places, and those of the files. What is missing is logged, and files
+    of different surfaces.
     """
     attrs = [PointStore(path).attrs for path in inputs.point_stores]
     nodes = [a["nodes"] for a in attrs if a["nodes"]]
@@ -58,7 +58,7 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
         "acquired": _days([a["acquired"] for a in attrs]),
         "doubts": sorted({text for a in attrs for text in a.get("doubts", ())}),
         "surfaces": _surfaces([a["crs"]["heights"] for a in attrs]),
-        "strips": None if inputs.strips is None else StripOffsets.read(inputs.strips).report(),
+        "strips": inputs.lidar_strips.report() if inputs.lidar_strips else None,
         "frame": _frame([a["crs"].get("frame") for a in attrs]),
     }
 

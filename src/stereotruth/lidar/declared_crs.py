@@ -20,8 +20,6 @@ from ..errors import InputError
 from ..numerics.degrees import DEGREE_M
 
 VERTICAL_UNITS_KEY = 4099
-EPOCH_KEY = 5120  # CoordinateEpochGeoKey of OGC GeoTIFF 1.1's extension, a double
-DOUBLES = 34736  # where keys of doubles stand
 LINEAR_UNITS = {  # EPSG code: (name, metres)
     9001: ("metre", 1.0),
     9002: ("foot", 0.3048),
@@ -224,7 +222,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
     key is honoured here.
     """
-    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
+    from .geokeys import epoch_in, wkt_of_geokeys  # GDAL, which few files need
 
     keys = shorts[4:].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
@@ -244,9 +242,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
-        if key == EPOCH_KEY and location == DOUBLES and len(doubles) >= 8 * (value + 1):
-            meaning = replace(meaning, epoch=float(np.frombuffer(doubles, "<f8", 1, 8 * value)[0]))
-    return meaning
+    return replace(meaning, epoch=epoch_in(shorts, doubles))
 
 
 def _wkt_text(data: bytes) -> str:

@@ -93,11 +93,19 @@ _NAD83 = Realisation(
     remark="names no realisation of NAD83, or an old one: taken as NAD83(2011); NAD83(HARN) and "
     "later ones lie within some 0.1 m of it, NAD83(1986) within 1 m",
 )
+_NZGD2000 = Realisation(
+    7907,  # ITRF96
+    2000.0,
+    spread_m=0.5,
+    remark="New Zealand deforms, by up to 4 cm a year between its coasts: NZGD2000 is brought to "
+    "the date of the images as on a rigid plate, since LINZ's grid nz_linz_nzgd2000-20180701.json "
+    "is not installed (projsync --file gets it)",
+)
 # By the EPSG code of the datum, with the definitions of EPSG's register (v11) where nothing else
 # stands. No entry is made where PROJ knows the way itself.
 REALISATIONS = {
-    6167: Realisation(7907, 2000.0),  # NZGD2000: ITRF96
-    1043: Realisation(7908, 2000.0),  # China 2000 (CGCS2000): ITRF97
+    6167: _NZGD2000,
+    1043: Realisation(7908, 2000.0, spread_m=0.2),  # China 2000 (CGCS2000): ITRF97
     6674: Realisation(7909, 2000.4),  # SIRGAS 2000: ITRF2000
     6170: Realisation(7906, 1995.4),  # SIRGAS 1995: ITRF94
     1062: Realisation(7910, 2006.632),  # POSGAR 2007: ITRF2005
@@ -205,19 +213,20 @@ def _is_dynamic(datum: int) -> bool:
     return Datum.from_epsg(datum).type_name.startswith("Dynamic")
 
 
-def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.Transformer | None:
-    """PROJ's best transformation between two frames at a place; None if it knows none.
+def _operation(
+    source: CRS, target: int, place: tuple[float, float] | None
+) -> pyproj.Transformer | None:
+    """PROJ's best transformation between two frames at a place (None: at any), or None.
 
     What it calls a ballpark is none, nor is one that needs a grid which is not installed.
     """
     pyproj.network.set_network_enabled(False)
-    lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
-    around = AreaOfInterest(
-        max(lon - NEAR_DEG, -180.0),
-        max(lat - NEAR_DEG, -90.0),
-        min(lon + NEAR_DEG, 180.0),
-        min(lat + NEAR_DEG, 90.0),
-    )
+    around = None
+    if place is not None:
+        lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
+        west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
+        south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
+        around = AreaOfInterest(west, south, east, north)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of grids that are not installed
@@ -257,7 +266,7 @@ class _Way:
         return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
 
 
-def _way(datum: int, place: tuple[float, float]) -> _Way | None:
+def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
     """How a datum gets to ITRF2020; None where nothing better than WGS 84 is known."""
     own, dynamic, known = _geographic(datum), _is_dynamic(datum), REALISATIONS.get(datum)
     direct = None
@@ -288,7 +297,7 @@ def is_known(system: CRS) -> bool:
         return True
     area = system.area_of_use or geodetic.area_of_use
     east = area.east + 360 * (area.east < area.west) if area else 0.0
-    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else (0.0, 0.0)
+    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else None
     return _way(datum, middle) is not None
 
 

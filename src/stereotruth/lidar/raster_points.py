@@ -26,6 +26,7 @@ from ..errors import InputError
 from ..products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
 from ..products.remote_files import url_of
 from ..products.ungeoreferenced import open_raster
+from .geokeys import epoch_of_tiff
 from .height_raster import refuse_grid, system_of
 from .range_copies import open_stream
 
@@ -156,6 +157,8 @@ def raster_header(file: Path) -> laspy.LasHeader:
         header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
         header.point_count = rows * cols
         if wkt := _system(raster, file):
+            if url_of(file) is None and (epoch := epoch_of_tiff(file)) is not None:
+                wkt = f"COORDINATEMETADATA[{wkt},EPOCH[{epoch!r}]]"
             record = laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0")
             header.vlrs.append(record)
             header.global_encoding.wkt = True

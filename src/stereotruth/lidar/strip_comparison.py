@@ -192,7 +192,7 @@ def _compared(
     large = np.flatnonzero(counts > max(LEAST_SHARE * counts.sum(), 4 * LEAST_POINTS)).tolist()
     if len(large) < 2:
         return
-    squares = squares_along([int(counts[k]) for k in large])
+    squares = squares_along([_squares(points, which == k, row, col) for k in large])
     planes = {}
     for k in large:
         own = which == k

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import fdtrc
 
 from .strip_offsets import Strip, StripKey, StripOffsets
 from .strip_planes import Offset
@@ -82,7 +82,8 @@ def adjusted_offsets(
         chance = 1.0
         if tied:
             statistic = value[own] @ np.linalg.solve(covariance[own, own], value[own])
-            chance = min(1.0, float(chdtrc(3, statistic)) * tests)
+            fewest = min(c.offset.groups for c in compared if strip.name in c[:2])
+            chance = min(1.0, float(fdtrc(3, fewest - 3, statistic / 3)) * tests)
         found.append(
             Strip(
                 *strip,

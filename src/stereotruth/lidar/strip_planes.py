@@ -34,10 +34,15 @@ PLANE = 2.0  # times the residuals of a strip's evener squares: four standard er
 EVENER = 0.25  # quantile of the squares' rms
 SAME_SLOPE = 13.8  # χ² of two slopes of one plane that 0.1 % exceed
 LEAST_NOISE_M = 0.005  # of heights: steps of files of 1 cm and less
-MOST = 64  # planes of a cell that are kept of two strips: the steepest, and as many others
+# Twice the repeatability on smooth surfaces that the USGS Lidar Base Specification asks of its
+# quality level 2: what is rougher are plants and rubble
+MOST_NOISE_M = 0.12
+MOST = 64  # tilted planes of a cell that are kept of two strips, the steepest, and as many others
+TILTED = 4.0  # standard deviations of a slope from which noise does not choose the steepest
 MOVES = (3, 4, 5, 9)  # water, and plants by height: they move, or let pulses pass
 PRIOR_M = 1.0  # standard deviation of an offset in plan before anything is known of it
 ROUNDS = 50
+LEAST_GROUPS = 6  # from which three unknowns and their scatter are told
 GROUPS = 8  # along a side of a cell: planes of 15 m share their errors
 
 
@@ -57,10 +62,12 @@ class Planes(NamedTuple):
         return Planes(*(values[chosen] for values in self))
 
 
-def squares_along(counts: list[int]) -> int:
-    """Squares along a cell's side for strips that have so many points in it."""
+def squares_along(counts: list[Ints]) -> int:
+    """Squares along a cell's side, by the points that each strip has in each of its SQUARES[-1]²
+    largest squares."""
+    sparsest = min(float(of[of > 0].mean()) for of in counts)
     for squares in SQUARES[:-1]:
-        if min(counts) >= EXPECTED * squares**2:
+        if sparsest >= EXPECTED * (squares // SQUARES[-1]) ** 2:
             return squares
     return SQUARES[-1]
 
@@ -105,7 +112,7 @@ def planes_of(points: Points, at: Floats, row: int, col: int, squares: int) -> P
     if not found.square.size:
         return found
     noise = max(float(np.quantile(found.rms, EVENER)), LEAST_NOISE_M)
-    found = found.taken(found.rms <= PLANE * noise)
+    found = found.taken(found.rms <= min(PLANE * noise, MOST_NOISE_M))
     return found._replace(rms=np.maximum(found.rms, noise))
 
 
@@ -144,19 +151,24 @@ def compare(first: Planes, second: Planes, squares: int, cell: int) -> Differenc
     found = Differences(height, slope, variance, both / 4, group)
     if len(height) <= 2 * MOST:
         return found
-    order = np.argsort(-np.hypot(*slope.T), kind="stable")
-    others = np.sort(order[MOST:])
-    kept = np.concatenate([order[:MOST], others[:: -(-others.size // MOST)]])
+    steep = np.einsum("ni,ni->n", slope, slope)
+    steep[steep < TILTED**2 * np.trace(both, axis1=1, axis2=2) / 4] = 0.0
+    order = np.argsort(-steep, kind="stable")
+    first = min(MOST, np.count_nonzero(steep))
+    others = np.sort(order[first:])
+    kept = np.concatenate([order[:first], others[:: -(-others.size // (2 * MOST - first))]])
     return Differences(*(values[np.sort(kept)] for values in found))
 
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """Offset of a strip from another, east, north, up (m), with its covariance [3, 3] (m²)."""
+    """Offset of a strip from another, east, north, up (m), with its covariance [3, 3] (m²), from
+    so many planes in so many ``groups`` of planes nearby."""
 
     value: Floats
     covariance: Floats
     planes: int
+    groups: int
 
 
 def offset_of(parts: list[Differences]) -> Offset | None:
@@ -187,10 +199,12 @@ def offset_of(parts: list[Differences]) -> Offset | None:
         value = value + step
         if np.abs(step).max() < 1e-6:
             break
-    _, which = np.unique(d.group, return_inverse=True)
+    distinct, which = np.unique(d.group, return_inverse=True)
+    if distinct.size < LEAST_GROUPS:
+        return None
     scores = (weight * residual)[:, None] * design
     groups = np.stack([np.bincount(which, scores[:, k]) for k in range(3)], axis=1)
     inverse = np.linalg.inv(corrected)
-    meat = groups.T @ groups * groups.shape[0] / max(groups.shape[0] - 3, 1) + prior
+    meat = groups.T @ groups * len(groups) / (len(groups) - 3) + prior
     used = np.abs(residual / np.sqrt(spread) / scale) < TUKEY
-    return Offset(value, inverse @ meat @ inverse, int(used.sum()))
+    return Offset(value, inverse @ meat @ inverse, int(used.sum()), len(groups))

@@ -162,18 +162,20 @@ class Twin:
 
     ``file``: LAS or LAZ; ``crs``: of its points, if it declares none. ``half_m``: half the ground
     that the file covers, along its axes east and north; ``turned_rad``: counter-clockwise turn of
-    these axes in the city's frame.
+    these axes in the city's frame. ``rpcs``: files of RPCs by which left and right image see the
+    place, over it or moved there; None: GaoFen-7's camera takes them.
     """
 
     file: str
     crs: str
     half_m: tuple[float, float]
     turned_rad: float
+    rpcs: tuple[str, str] | None = None
 
     @property
     def files(self) -> list[str]:
         """The files of the place."""
-        return [self.file]
+        return [self.file, *(self.rpcs or ())]
 
 
 @dataclass(frozen=True)

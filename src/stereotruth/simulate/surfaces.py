@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels import inlined, kernel
-from .patches import patch_top
+from .patches import PATCH_M, patch_top
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
@@ -25,6 +25,7 @@ ANY_VIEW = LEFT_VIEW | RIGHT_VIEW
 FIRST_PATCH = -2  # object number of patch 0; patch n has FIRST_PATCH - n
 CELL_M = 8.0
 REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+SAME_M = 0.01  # off a patch's plane: of the same roof
 CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
 LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
 
@@ -47,6 +48,7 @@ class Surfaces(NamedTuple):
     ``patches`` float32[rows, cols, 3]: z in the middle and slopes along x and y of the patches of
     :mod:`.patches`, from cell (``patch_i``, ``patch_j``) on; ``patch_side`` uint8[rows, cols]:
     direction in which their sides look, counter-clockwise from east, in 256 parts of a turn.
+    ``patch_building`` int32[rows, cols]: the building that a patch is part of, −1 for none.
     ``paint`` uint16[rows, cols]: reflectance of ground and roofs there, in parts of PAINT. A drawn
     city has none of them.
     """
@@ -79,6 +81,7 @@ class Surfaces(NamedTuple):
     resurfaced: float
     patches: np.ndarray
     patch_side: np.ndarray
+    patch_building: np.ndarray
     patch_i: int
     patch_j: int
     paint: np.ndarray
@@ -302,11 +305,19 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
 
 
 @inlined
-def stands_in(s, kind, index, view):
-    """Whether the object of a surface point is in a view, where something may hide it."""
+def stands_in(s, kind, index, view, z):
+    """Whether the object of a surface point at height z is in a view of a world, where something
+    may hide it."""
+    if kind in (ROOF, WALL) and index <= FIRST_PATCH:
+        number = FIRST_PATCH - index
+        n, m = number // s.patches.shape[1], number % s.patches.shape[1]
+        slopes = abs(s.patches[n, m, 1]) + abs(s.patches[n, m, 2])
+        off = s.patches[n, m, 0] - z
+        reach = 0.5 * PATCH_M * slopes + SAME_M
+        return off > -reach and (kind == WALL or off < reach)
     if kind == TREE:
         return s.tree_view[index] & view != 0
-    if kind in (ROOF, WALL) and index >= 0:
+    if kind in (ROOF, WALL):
         return s.box_view[index] & view != 0
     return True
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -14,6 +16,7 @@ OBJECT_M = 1.5  # above the ground: less is none
 ROUGH_M = 0.2  # rms of neighbours off their plane: more is no roof
 SEVERAL = 0.6  # share of the neighbours whose pulses had more returns: more is no roof
 SPACING_M = 1.2  # between tops
+TREE_M = 6.0  # between trees
 RADIUS_M = (1.0, 1.35)
 DEPTH_M = 5.0  # of a crown below its top at most
 BOTTOM = 0.3  # of a top's height above the ground
@@ -40,12 +43,20 @@ def is_leaf(points: Points) -> np.ndarray:
     return leaf
 
 
-def crowns_of(
-    points: Points, ground: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ellipsoids float64[n, 6] and their style [n, 2], as in :class:`.surfaces.Surfaces`.
+class Crowns(NamedTuple):
+    """``ellipsoids`` float64[n, 6] and their ``style`` [n, 2], as in :class:`.surfaces.Surfaces`;
+    ``tree`` [n]: number of the tree that one is part of; ``foot`` [n]: z of the ground below."""
 
-    ``points``: leaves; ``ground`` [n]: z of the ground below each of them.
+    ellipsoids: np.ndarray
+    style: np.ndarray
+    tree: np.ndarray
+    foot: np.ndarray
+
+
+def crowns_of(points: Points, ground: np.ndarray, rng: np.random.Generator) -> Crowns:
+    """The crowns whose leaves are ``points``; ``ground`` [n]: z of the ground below each of them.
+
+    A tree is what lies nearest to the highest top of TREE_M².
     """
     first = np.flatnonzero(points.first)
     top = first[thinned(points.xyz[first], SPACING_M)]
@@ -57,4 +68,7 @@ def crowns_of(
     crowns = np.column_stack([xyz[:, :2], xyz[:, 2] - half, radius, half, (radius / half) ** 2])
     light = np.full(len(top), 1.0) if points.tint is None else points.tint[top] / LEAF
     style = np.column_stack([np.clip(light, 0.4, 1.6), np.full(len(top), POROSITY)])
-    return crowns, style
+    tree = np.zeros(len(top), np.int64)
+    if len(top):
+        tree = cKDTree(xyz[thinned(xyz, TREE_M), :2]).query(xyz[:, :2])[1]
+    return Crowns(crowns, style, tree, foot)

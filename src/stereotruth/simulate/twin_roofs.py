@@ -30,6 +30,7 @@ REACH_M = 1.3
 PAINTED_M = 8.0  # from the nearest point: what is farther has no paint
 STRAIGHT_M = 0.6  # over which outlines are smoothed
 SMALLEST_M2 = 10.0  # of a building
+BUILDING_M2 = 400.0  # of one among others that it touches
 SEAM_M = 0.35  # planes that come so near each other meet in a ridge or a valley
 SEAM = 3  # patches to each side, among which such a plane is sought
 SIDE_M = 1.0  # over which the directions of sides are smoothed
@@ -55,12 +56,12 @@ class Raster(NamedTuple):
 
 def thinned(xyz: np.ndarray, side_m: float = THIN_M) -> np.ndarray:
     """Indices of the highest point in each square of a side, in order."""
-    cell = np.floor(xyz[:, :2] / side_m).astype(np.int64)
-    order = np.lexsort((-xyz[:, 2], cell[:, 0], cell[:, 1]))
-    ordered = cell[order]
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(ordered, axis=0) != 0).any(axis=1)
-    return np.sort(order[first])
+    if not len(xyz):
+        return np.zeros(0, np.int64)
+    i, j = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / side_m).astype(np.int64).T
+    cell = j * (i.max() + 1) + i
+    order = np.lexsort((-xyz[:, 2], cell))
+    return np.sort(order[np.diff(cell[order], prepend=-1) != 0])
 
 
 def local_planes(xyz: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -290,6 +291,29 @@ def rasterised(
     roof = _straightened(roof)
     _raise(roof, found.plane, *origin, patches)
     return Raster(patches, _sides(patches[..., 0]), paint, roof)
+
+
+def buildings_of(roof: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The building that each patch of a raster of planes is part of, −1 for none.
+
+    Roofs that touch each other are one, or several of about BUILDING_M2, parted halfway between
+    places that are drawn.
+    """
+    part, count = ndimage.label(roof >= 0)
+    j, i = np.nonzero(part)
+    of = part[j, i]
+    size = np.bincount(of, minlength=count + 1)
+    several = np.maximum(np.rint(size * PATCH_M**2 / BUILDING_M2), 1).astype(int)
+    order = np.argsort(of, kind="stable")
+    ends = np.cumsum(size)
+    building, first = np.full(roof.shape, -1, np.int32), 0
+    for k in range(1, count + 1):
+        inside = order[ends[k - 1] : ends[k]]
+        at = np.column_stack([i[inside], j[inside]])
+        seeds = at[rng.integers(len(at), size=several[k])]
+        building[j[inside], i[inside]] = first + cKDTree(seeds).query(at)[1]
+        first += several[k]
+    return building
 
 
 def _sides(z: np.ndarray) -> np.ndarray:

@@ -9,13 +9,14 @@ import numpy as np
 from ..errors import InputError
 from .appearance import PAINT
 from .cities import CitySpec
+from .dated_worlds import dated_patches
 from .layout import extent, frame_of
 from .patches import PATCHES_A_CELL, greatest
 from .surfaces import CELL_M, Surfaces, terrain_heights
-from .twin_crowns import OBJECT_M, crowns_of, is_leaf
+from .twin_crowns import OBJECT_M, Crowns, crowns_of, is_leaf
 from .twin_ground import STEP_M, is_ground, terrain_of
 from .twin_points import Points, read_points
-from .twin_roofs import Planes, planes_of, rasterised, thinned
+from .twin_roofs import Planes, buildings_of, planes_of, rasterised, thinned
 from .zones import draw_zones
 
 log = logging.getLogger("stereotruth")
@@ -24,8 +25,8 @@ ROOF_LIGHT = 0.1, 0.5  # reflectance of roofs where the points tell none
 GROUND_M = 0.7  # one point of the ground at most in a square of this side paints it
 
 
-def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, np.ndarray, np.ndarray]:
-    """The surfaces of a twin but for its crowns, which are ellipsoids [n, 6] with styles [n, 2].
+def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
+    """The surfaces of a twin but for its crowns, and these.
 
     ``empty``: surfaces of the city's extent where nothing stands. Raises InputError if the file
     has no ground, or no points in the scenes.
@@ -64,17 +65,18 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, np.ndarray, np.
         found, points.xyz[roofs], points.xyz[low], tint, tuple(box[:2] + CELL_M * first),
         tuple(PATCHES_A_CELL * (last - first)[::-1]),
     )  # fmt: skip
-    crowns, style = crowns_of(points.which(leaves), ground[leaves], rng)
+    crowns = crowns_of(points.which(leaves), ground[leaves], rng)
     log.info(
         "%s: %d roof planes over %.0f m², %d crown tops",
         city.name, len(found.plane), (raster.roof >= 0).sum() * (CELL_M / PATCHES_A_CELL) ** 2,
-        len(crowns),
+        len(crowns.ellipsoids),
     )  # fmt: skip
     s = s._replace(
-        patches=raster.patches, patch_side=raster.side, patch_i=int(first[0]),
+        patches=raster.patches, patch_side=raster.side,
+        patch_building=buildings_of(raster.roof, rng), patch_i=int(first[0]),
         patch_j=int(first[1]), paint=np.rint(raster.paint * PAINT).astype(np.uint16),
     )  # fmt: skip
-    return s, crowns, style
+    return s, crowns
 
 
 def _tints(
@@ -90,15 +92,18 @@ def _tints(
     return drawn[found.number], np.zeros(len(low))
 
 
-def patch_tops(s: Surfaces) -> np.ndarray:
-    """Greatest z of the patches in each cell of a city, as its ``cell_top`` [ny, nx]."""
+def patch_tops(city: CitySpec, s: Surfaces) -> np.ndarray:
+    """Greatest z of the patches in each cell of a city at any date, as its ``cell_top``."""
     top = np.full(s.cell_top.shape, -1e9)
     if not s.patches.size:
         return top
     rows, cols = (n // PATCHES_A_CELL for n in s.patches.shape[:2])
-    cells = greatest(s.patches.astype(np.float64)).reshape(
-        rows, PATCHES_A_CELL, cols, PATCHES_A_CELL
-    )
+    highest = greatest(s.patches.astype(np.float64))
+    if city.dates is not None:
+        for passed in (0.0, 1.0):
+            of = dated_patches(city, s, passed)
+            highest = np.maximum(highest, greatest(of.astype(np.float64)))
+    cells = highest.reshape(rows, PATCHES_A_CELL, cols, PATCHES_A_CELL)
     # rays are not followed where a cell ends: what is left over for rounding
     top[s.patch_j : s.patch_j + rows, s.patch_i : s.patch_i + cols] = cells.max(axis=(1, 3)) + 1e-3
     return top

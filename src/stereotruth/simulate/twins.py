@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from .cities import LEFT_GSD_M, Character, CitySpec, SceneSpec, Twin
 from .geodesy import LocalFrame
+from .given_rpcs import read_rpc
 from .layout import image_axes
 from .twin_points import extent_of
 
@@ -35,14 +36,17 @@ def twin_city(
     crs: str = "",
     size_px: tuple[int, int] | None = None,
     sun_deg: tuple[float, float] = SUN_DEG,
+    rpcs: tuple[str | Path, str | Path] | None = None,
     pose_seed: int = 1,
 ) -> CitySpec:
     """The twin of the place whose points a LAS or LAZ file has, with its one scene ``name``-1.
 
     ``crs``: of a file that declares none. ``size_px``: columns and rows of the left image, about
-    the middle of the place; None: all of it. ``sun_deg``: azimuth and elevation. ``pose_seed``
-    draws orbit, attitude and the bias of the RPCs. Heights are taken as ellipsoidal. Raises
-    InputError of :func:`.twin_points.extent_of`.
+    the middle of the place; None: all of it. ``sun_deg``: azimuth and elevation. ``rpcs``: of
+    the left and the right image, instead of GaoFen-7's camera; images have the size that the place
+    has in them then. ``pose_seed`` draws orbit, attitude and the bias of the RPCs. Heights are
+    taken as ellipsoidal. Raises InputError of :func:`.twin_points.extent_of` and
+    :func:`.given_rpcs.read_rpc`.
     """
     of = extent_of(file, crs)
     low, high = of.low, of.high
@@ -69,10 +73,18 @@ def twin_city(
         scenes=(scene,),
         sun_azimuth_deg=sun_deg[0],
         sun_elevation_deg=sun_deg[1],
-        twin=Twin(str(file), crs, half, math.atan2(right[1], right[0])),
+        twin=Twin(str(file), crs, half, math.atan2(right[1], right[0]), _read_once(rpcs)),
     )
     cols, rows = size_px or _all_of_it(city, scene, right, up)
     return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
+
+
+def _read_once(rpcs: tuple[str | Path, str | Path] | None) -> tuple[str, str] | None:
+    """The names of files of RPCs that can be read."""
+    if rpcs is None:
+        return None
+    left, right = (str(read_rpc(file).file) for file in rpcs)
+    return left, right
 
 
 def _all_of_it(

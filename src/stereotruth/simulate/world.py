@@ -85,10 +85,10 @@ class Objects(NamedTuple):
 def build_surfaces(city: CitySpec) -> Surfaces:
     """Everything that stands in a city, ready for casting rays. Some seconds."""
     if city.twin is not None:
-        s, crowns, style = place_of(city, _nothing(city))
-        view = np.full(len(crowns), IN_IMAGES | IN_LIDAR, np.uint8)
+        s, crowns = place_of(city, _nothing(city))
+        trees, view, which = dated_trees(city, crowns.ellipsoids, crowns.tree, crowns.foot)
         boxes = Objects(s.boxes, s.box_view, s.box_style)
-        return _standing(city, s, boxes, Objects(crowns, view, style))
+        return _standing(city, s, boxes, Objects(trees, view, crowns.style[which]))
     rng = np.random.default_rng([city.world_seed, 0])
     s = _nothing(city)
     terrain, water = make_terrain(city, rng, extent(city))
@@ -115,7 +115,7 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         boxes = np.concatenate([boxes, vehicles.boxes])
         style = np.concatenate([style, vehicles.style])
         view = np.concatenate([view, vehicles.view])
-    trees, tree_view = dated_trees(city, trees)
+    trees, tree_view, _ = dated_trees(city, trees)
     tree_style = np.tile([1.0, 0.0], (len(trees), 1))
     if city.character.canopy is not None:
         canopy = place_canopy(city, city.character.canopy, s, sites, boxes)
@@ -148,7 +148,8 @@ def _nothing(city: CitySpec) -> Surfaces:
         broad=broad.astype(np.float32),
         sun=direction_of_sun(city.sun_azimuth_deg, city.sun_elevation_deg), resurfaced=0.0,
         patches=np.zeros((0, 0, 3), np.float32), patch_side=np.zeros((0, 0), np.uint8),
-        patch_i=0, patch_j=0, paint=np.zeros((0, 0), np.uint16),
+        patch_building=np.zeros((0, 0), np.int32), patch_i=0, patch_j=0,
+        paint=np.zeros((0, 0), np.uint16),
     )  # fmt: skip
 
 
@@ -163,7 +164,7 @@ def _standing(city: CitySpec, s: Surfaces, boxes: Objects, trees: Objects) -> Su
     box_first, box_list = _cells(half, shapes[:, :2], s)
     radius = np.repeat(trees.shapes[:, 3:4], 2, axis=1)
     tree_first, tree_list = _cells(radius, trees.shapes[:, :2], s)
-    top = patch_tops(s).ravel()
+    top = patch_tops(city, s).ravel()
     cells = np.arange(ny * nx)
     for first, listed, height in (
         (box_first, box_list, shapes[:, 6] + shapes[:, 7]),

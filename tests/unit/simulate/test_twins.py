@@ -10,12 +10,25 @@ import pyproj
 import pytest
 
 from stereotruth.errors import InputError
+from stereotruth.simulate.built_city import surfaces_of
 from stereotruth.simulate.camera import rays
+from stereotruth.simulate.changes import BUILT, DEMOLISHED, changes_at
+from stereotruth.simulate.cities import Dates
 from stereotruth.simulate.city_files import read_city, write_city
+from stereotruth.simulate.dated_worlds import YOUNG
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.patches import PATCH_M, PATCHES_A_CELL
 from stereotruth.simulate.render import prepare
-from stereotruth.simulate.surfaces import CELL_M, GROUND, ROOF, TREE, WALL, terrain_heights
+from stereotruth.simulate.surfaces import (
+    CELL_M,
+    GROUND,
+    IN_IMAGES,
+    IN_LIDAR,
+    ROOF,
+    TREE,
+    WALL,
+    terrain_heights,
+)
 from stereotruth.simulate.top_surface import top_surface
 from stereotruth.simulate.truth import truth_at
 from stereotruth.simulate.twins import twin_city
@@ -39,7 +52,7 @@ def test_cells_hold_whole_patches():
 
 def test_ground_and_roofs_are_those_of_the_house(house):
     """At a metre from walls: the height of the planes, to a tenth of the points' spacing."""
-    x, y = np.meshgrid(np.arange(-90.0, 91.0, 1.7), np.arange(-90.0, 91.0, 1.7))
+    x, y = np.meshgrid(np.arange(-58.0, 59.0, 1.3), np.arange(-58.0, 59.0, 1.3))
     around = np.stack([place.top_of(x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)])
     true = around[4]
     clear = np.ptp(around, axis=0) < 0.5
@@ -117,6 +130,42 @@ def test_the_lidar_of_a_twin_lies_on_it(house, tmp_path):
     open_ground = (cloud.classification == 2) & (place.top_of(x, y) == place.GROUND_Z)
     off = (cloud.z - place.GROUND_Z)[open_ground]
     assert off.std() == pytest.approx(0.03, abs=0.015) and abs(off.mean()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("share", "days", "reason", "changed"),
+    [
+        ("built", (9.0, 9.0, 0.0), BUILT, 2),
+        ("demolished", (9.0, 9.0, 0.0), DEMOLISHED, 1),
+        ("raised", (9.0, 9.0, 0.0), BUILT, 2),
+        ("demolished", (0.0, 9.0, 0.0), DEMOLISHED, 0),
+    ],
+)
+def test_buildings_of_a_twin_have_their_dates(house, share, days, reason, changed):
+    """All of them change between LiDAR and images, or between the images."""
+    city = replace(house, dates=Dates(*days, **{share: 1.0}))
+    (scene,) = city.scenes
+    row, col = np.mgrid[20 : scene.rows - 20 : 5, 20 : scene.cols - 20 : 5].astype(float)
+    found, truth = changes_at(city, scene, col, row), truth_at(city, scene, col, row)
+    off = np.fmax(*(np.abs(found["height"] - found[f"height_{of}"]) for of in ("lidar", "other")))
+    differs = off > 3.0
+    assert differs.sum() > 100 and set(found["reason"][differs]) == {reason}
+    assert set(truth["changed"][differs]) == {changed}
+    untouched = off < 0.01
+    assert (truth["changed"][untouched] == 0).all()
+    if days[0] != days[1]:  # what is gone in the right image is neither seen there nor hidden
+        roofs = differs & (truth["surface"] == ROOF)
+        assert roofs.sum() > 50
+        assert not (truth["visible_right"] | truth["hidden_right"])[roofs].any()
+
+
+def test_trees_of_a_twin_are_felled_whole(house):
+    felled = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, felled=1.0)))
+    assert (felled.tree_view == IN_LIDAR).all() and len(felled.trees) > 50
+    grown = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, grown=1.0)))
+    young, old = (grown.trees[grown.tree_view == bits] for bits in (IN_LIDAR, IN_IMAGES))
+    base = place.GROUND_Z - house.base_height_m
+    np.testing.assert_allclose(young[:, 2] - base, YOUNG * (old[:, 2] - base), atol=0.1)
 
 
 def test_a_file_without_coordinate_system_is_refused(tmp_path):
