@@ -154,6 +154,12 @@ class _Found:
     halves: tuple[float, float]
 
 
+HEIGHTS_BY_RPCS = (
+    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
+    "told from errors of the RPCs"
+)
+
+
 def _search(
     alignment: Alignment,
     sources: tuple[Source, Source],
@@ -404,12 +410,8 @@ def refine(
     covariance, doubts = ratio * covariance, [*doubts, *odd]
     _warn(doubts, strict, left_image, of)
     if not gcps and not doubts:
-        unknown = (
-            f"without ground control points a fault of the LiDAR's heights of less than "
-            f"{offset.told_from_m:.0f} m cannot be told from errors of the RPCs"
-        )
-        log.warning("warning: %s", unknown)
-        doubts = [unknown]
+        doubts = [HEIGHTS_BY_RPCS.format(offset.told_from_m)]
+        log.warning("warning: %s", *doubts)
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)

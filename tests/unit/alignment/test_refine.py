@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stereotruth.alignment.aligned_pair import Alignment, GcpResidual
 from stereotruth.alignment.label_uncertainty import label_sigma
+from stereotruth.alignment.lidar_checks import lines_of_sight, scatter_by_heights
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_figure import draw_refinement
 from stereotruth.alignment.refine_report import write_refinement
@@ -262,22 +263,14 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
     assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
 
 
-@pytest.mark.slow
-def test_uncertainty_holds_rpcs_of_other_pixels(images, tmp_path):
-    """As of images that were cut: 70 px off by RPCs that are said to be within 10, no points."""
-    store = write_points(tmp_path, lidar())
-    off = [np.array([[0.0, 0.0, 45.0], [0.0, 0.0, 2.0]])] * 2
-    good, _ = refine(start(NONE, NONE, 10.0), *images, [store])
-    refined, _ = refine(start(*off, 10.0), *images, [store])
-    if refined.refinement["applied"]:
-        assert refined.refinement["uncertainty_widened_by"] > 1.5
-        assert any("RPCs belong to the images" in text for text in refined.warnings)
-    miss = [
-        np.subtract(fit.affine, exact.affine)[:, 2]
-        for fit, exact in ((refined.left, good.left), (refined.right, good.right))
-    ]
-    deviations = np.sqrt(np.diag(refined.left_fit.covariance))[[2, 5]]
-    assert (np.abs(miss[0]) < 3 * deviations + 0.1).all()
+@pytest.mark.parametrize(("metres", "told"), [(0.02, False), (0.15, False), (0.4, True)])
+def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told):
+    """As of images that were cut, with the RPCs of before: no point says where they look."""
+    alignment, rng = start(NONE, NONE, 10.0), np.random.default_rng(1)
+    px_per_m = np.linalg.norm(np.subtract(*lines_of_sight(alignment)))
+    along, across = rng.normal(0, 1, (2, 80)) * [[np.hypot(0.02, px_per_m * metres)], [0.02]]
+    scatter, explained = scatter_by_heights(alignment, along, across)
+    assert (scatter > explained) == told
 
 
 @pytest.mark.slow
