@@ -28,6 +28,12 @@ def continuous(lon: ArrayLike) -> NDArray[np.float64]:
     return lon - 360.0 * turns if turns.any() else lon
 
 
+def for_readers(lon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Longitudes of one outline as other programs have them, up to 180; those of an outline across
+    the line of 180° go on beyond it, so that it stays in one piece."""
+    return lon - 360.0 if lon.min() >= 180.0 else lon
+
+
 def metres_per_degree(lat: ArrayLike) -> NDArray[np.float64]:
     """Metres [2, ...] of a degree to the east and to the north at latitudes ``lat``; to 0.7 %."""
     return DEGREE_M * np.stack([np.cos(np.radians(lat)), np.ones(np.shape(lat))])
