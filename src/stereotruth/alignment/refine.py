@@ -220,6 +220,7 @@ def _search(
         np.stack(model.left_to_epipolar(*ties.left.T), axis=1),
         total,
         equations.observed - design @ found.parameters,
+        total - design @ found.parameters,
         found.weights > 0.0,
         of_images,
     )
@@ -353,7 +354,9 @@ def refine(
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
-        observations = replace(observations, after=observations.before)
+        observations = replace(
+            observations, after=observations.before, by_affines=observations.before
+        )
         record["after"] = record["before"]
     doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
