@@ -117,11 +117,14 @@ def _shared_of(sites: _Sites) -> tuple[float, float, float]:
     return sigma, length, float(chdtrc(UNKNOWNS, max(top - without, 0.0)))
 
 
-def with_shared_errors(found: Estimate, equations: Equations) -> tuple[Estimate, SharedErrors]:
+def with_shared_errors(
+    found: Estimate, equations: Equations, *, by_line: bool = False
+) -> tuple[Estimate, SharedErrors]:
     """The estimate of a pair's affines with what near sites share counted, and these errors.
 
     Then the parameters are those of generalised least squares; without such errors nothing changes.
-    ``equations``: of ``found``, corrections by line taken off.
+    ``equations``: of ``found``, corrections by line taken off. ``by_line``: there are some. They take
+    a part of what near sites share with them, so that the rest counts whatever its probability.
     """
     index = np.unique(equations.site, return_inverse=True)[1]
     residuals = equations.observed - equations.design @ found.parameters
@@ -139,7 +142,7 @@ def with_shared_errors(found: Estimate, equations: Equations) -> tuple[Estimate,
         for i, r, t in zip(information.T, residuals.T, total.T)
     ]
     told = [_shared_of(_Sites.of(at, *mean)) for mean in means]
-    sigma = tuple(s if chance < CHANCE else 0.0 for s, _, chance in told)
+    sigma = tuple(s if by_line or chance < CHANCE else 0.0 for s, _, chance in told)
     smooth = told[0][2] < SURE and _shared_of(_Sites.of(at, *means[0], curved=True))[2] > CHANCE
     shared = SharedErrors(
         sigma,

@@ -76,14 +76,18 @@ class LineFit:
     rms_px: Floats
     length: float
     chance: float
-    misfits: tuple[float, float, float]
+    halves: _Halves
     noise: float
     of_site: float
 
     @property
     def stands_out(self) -> bool:
         """Whether lines are off by more than chance, and the halves of the sites agree."""
-        return self.chance < CHANCE and bool(ndtr(-self.misfits[2]) < CHANCE)
+        return self.chance < CHANCE and bool(ndtr(-self.halves.clear) < CHANCE)
+
+    def taken(self) -> LineFit:
+        """The same, used whatever chance and halves say."""
+        return replace(self, chance=0.0, halves=replace(self.halves, clear=np.inf))
 
     @property
     def coefficients(self) -> Floats:
@@ -108,16 +112,11 @@ class LineFit:
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready."""
-        before, after, clear = (round(misfit, 3) for misfit in self.misfits)
         return {
             "rms_px": dict(zip(("along_lines", "across"), self.rms_px.round(4).tolist())),
             "length_over_image": round(self.length, 4),
             "probability_by_chance": float(f"{self.chance:.3g}"),
-            "misfit_of_one_half_by_the_other": {
-                "before": before,
-                "after": after,
-                "clear_by_deviations": clear,
-            },
+            "one_half_by_the_other": {k: round(v, 3) for k, v in vars(self.halves).items()},
             "used": self.stands_out,
         }
 
@@ -169,12 +168,7 @@ def _from_all(
     weights = np.ones(len(expected))
     for step in range(STEPS):
         lines = fit_lines(equations, root, expected, weights, rows)
-        size = (
-            np.hypot(
-                *_left(equations, replace(lines, chance=0.0, misfits=(1.0, 0.0, np.inf)), design).T
-            )
-            / expected
-        )
+        size = np.hypot(*_left(equations, lines.taken(), design).T) / expected
         size /= robust_sigma(size, LEAST_SIGMA) / RAYLEIGH
         weights = huber_weights(size) if step < STEPS // 2 else tukey_weights(size)
     return lines
@@ -359,7 +353,7 @@ def fit_lines(
     variances = _variances(free, steps[:2], root.shape[1])
     sums = every.reduced(affine, root)
     found = _posterior(sums, amount(steps[2]), variances)
-    misfits = _misfits_of_halves(
+    halves = _Halves.of(
         both, observed, weights, sites, variances, amount(steps[2]), affine,
         np.sqrt(found.noise),
     )  # fmt: skip
@@ -374,11 +368,13 @@ def fit_lines(
         affine_root @ found.mean[:affine],
         _freedom(beside, variances[own]),
         rows,
-        covariance_at_lines(beside * found.noise * unit**2, root, equations.lines, rows),
+        covariance_at_lines(
+            beside * found.noise * unit**2 * halves.spread, root, equations.lines, rows
+        ),
         np.array([amount(k) for k in steps[:2]]) * noise * unit,
         length,
         float(chdtrc(KINDS, max(gain, 0.0))),
-        misfits,
+        halves,
         noise,
         amount(steps[2]),
     )
@@ -443,34 +439,55 @@ def _variances(free: Floats, steps: Steps, rank: int) -> Floats:
     return np.concatenate([free, *(np.full(rank, v) for v in (along, across, along, across))])
 
 
-def _misfits_of_halves(
-    design: Floats,
-    observed: Floats,
-    weights: Floats,
-    sites: NDArray,
-    variances: Floats,
-    of_site: float,
-    affine: int,
-    noise: float,
-) -> tuple[float, float, float]:
-    """Mean misfit of one half of the sites by the affine of the other half, and by its lines too.
+@dataclass(frozen=True)
+class _Halves:
+    """What one half of the sites says of the other: mean misfits (standard deviations, TUKEY at
+    most) by its affine alone, ``before``, and by its lines too, ``after``; by how many standard
+    errors the latter is less, ``clear``; ``spread``: variance of what the fit errs by, in that
+    which it states, at least 1."""
 
-    In standard deviations; it counts TUKEY at most, so that blunders say nothing. The third is by
-    how many standard errors the second is less, by its scatter from site to site.
-    """
-    misfits = np.zeros((2, len(sites)))
-    for half in (0, 1):
-        seen = sites % 2 != half
-        for k, count in enumerate((affine, design.shape[-1])):
-            part = design[:, :, :count]
-            sums = _Sums.of(part[seen], observed[seen], weights[seen], sites[seen])
-            found = _posterior(sums, of_site, variances[:count])
-            left = observed[~seen] - part[~seen] @ found.mean
-            misfits[k, ~seen] = np.minimum(np.hypot(*left.T) / noise, TUKEY)
-    gain = np.bincount(sites, misfits[0] - misfits[1])
-    error = np.sqrt(np.sum((gain - gain.mean()) ** 2) / max(len(gain) - 1, 1) * len(gain))
-    before, after = misfits.mean(axis=1)
-    return float(before), float(after), float(gain.sum() / max(error, 1e-12))
+    before: float
+    after: float
+    clear: float
+    spread: float
+
+    @classmethod
+    def of(
+        cls,
+        design: Floats,
+        observed: Floats,
+        weights: Floats,
+        sites: NDArray,
+        variances: Floats,
+        of_site: float,
+        affine: int,
+        noise: float,
+    ) -> _Halves:
+        """Of a design [n, 2, p], the first ``affine`` of whose unknowns are the affine's."""
+        misfits = np.zeros((2, len(sites)))
+        seen_squares = stated = 0.0
+        for half in (0, 1):
+            seen = sites % 2 != half
+            for k, count in enumerate((affine, design.shape[-1])):
+                part = design[:, :, :count]
+                sums = _Sums.of(part[seen], observed[seen], weights[seen], sites[seen])
+                found = _posterior(sums, of_site, variances[:count])
+                left = (observed[~seen] - part[~seen] @ found.mean) / noise
+                misfits[k, ~seen] = np.minimum(np.hypot(*left.T), TUKEY)
+            covariance = posterior_covariance(sums.sharing(of_site)[0], variances)
+            effect = np.einsum("nap,pq,naq->n", design[~seen], covariance, design[~seen])
+            share = weights[~seen]
+            seen_squares += float(np.sum(share * (np.sum(left**2, axis=1) - 2 - 2 * of_site**2)))
+            stated += float(np.sum(share * effect))
+        gain = np.bincount(sites, misfits[0] - misfits[1])
+        error = np.sqrt(np.sum((gain - gain.mean()) ** 2) / max(len(gain) - 1, 1) * len(gain))
+        before, after = misfits.mean(axis=1)
+        return cls(
+            float(before),
+            float(after),
+            float(gain.sum() / max(error, 1e-12)),
+            max(seen_squares / max(stated, 1e-12), 1.0),
+        )
 
 
 def covariance_at_lines(

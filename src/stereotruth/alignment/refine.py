@@ -213,7 +213,7 @@ def _search(
         radius = FINEST if change < FINEST / 2 or radius == FINEST else FINE
     equations = replace(equations, observed=total - of_lines @ by_line)
     by_scatter = found.covariance
-    found, shared = with_shared_errors(found, equations)
+    found, shared = with_shared_errors(found, equations, by_line=lines.stands_out)
     current = with_corrections(alignment, found.parameters, lines.corrections)
     observations = Observations(
         ties,

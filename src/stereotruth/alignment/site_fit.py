@@ -201,7 +201,8 @@ class _Pair:
             equations = replace(equations, observed=equations.observed - effect)
             prior = found.root @ found.root.T
             found = estimate(equations.about(ties.linearised_at), prior, ties.common_px)
-        shared = with_shared_errors(found, equations.about(ties.linearised_at))[1]
+        about = equations.about(ties.linearised_at)
+        shared = with_shared_errors(found, about, by_line=bool(lines.corrections))[1]
         sums = Sums.of(equations.design, equations.observed, found.information)
         spread = sums.spread(found.shared) + shared_spread(found, equations, shared)
         index = np.concatenate([_six(k) for k in own.images])
