@@ -386,6 +386,7 @@ def epipolar_model(alignment: Alignment) -> EpipolarModel:
         alignment.left_fit.size,
         alignment.right_fit.size,
         alignment.reference_height,
+        height_range=alignment.model_heights,
     )
 
 

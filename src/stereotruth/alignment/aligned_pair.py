@@ -25,6 +25,8 @@ UNITS = {
     "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
     "lon, lat": "degrees, WGS 84",
     "height": "m above the WGS 84 ellipsoid",
+    "model_heights": "m above the WGS 84 ellipsoid, lowest and highest that the epipolar model "
+    "is fitted to",
     "affine": "(col, row)_image = affine @ (col_rpc, row_rpc, 1); px",
     "covariance": "px^2, of (a_u, a_v, a_1, b_u, b_v, b_1) in col = … + a_u u + a_v v + a_1, "
     "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",
@@ -132,6 +134,8 @@ class Alignment:
     ``reference_height``: mean of the GCPs that are used in either view (without any: of the RPCs,
     after refinement of the tie points), ellipsoidal m.
     ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
+    ``model_heights``: ellipsoidal m, over which the pair's epipolar model is fitted: those of the
+    LiDAR that `refine` saw, and a margin; None: all that both RPCs cover;
     ``refinement``: what `refine` observed and changed, empty before. ``lines_covariance`` [k, 4, 4]
     and ``shared_px``: see OF_MISFITS; None and 0 without any.
     """
@@ -146,6 +150,7 @@ class Alignment:
     warnings: tuple[str, ...]
     provenance: dict[str, Any]
     cross_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    model_heights: tuple[float, float] | None = None
     refinement: dict[str, Any] = field(default_factory=dict)
     lines_covariance: Floats | None = None
     shared_px: float = 0.0
@@ -188,6 +193,7 @@ class Alignment:
             "scene": self.scene,
             "model": self.model,
             "reference_height": self.reference_height,
+            "model_heights": None if self.model_heights is None else list(self.model_heights),
             **views,
             "cross_covariance": self.cross_covariance.tolist(),
             **misfits,
@@ -199,6 +205,7 @@ class Alignment:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Alignment:
         """The inverse of :meth:`to_dict`."""
+        heights = values.get("model_heights")  # which a file that a user made may do without
         return cls(
             scene=values["scene"],
             model=values["model"],
@@ -210,6 +217,7 @@ class Alignment:
             warnings=tuple(values["warnings"]),
             provenance=values["provenance"],
             cross_covariance=np.array(values["cross_covariance"]),
+            model_heights=None if heights is None else tuple(heights),
             refinement=values["refinement"],
             lines_covariance=(
                 np.array(values["lines_covariance"]) if "lines_covariance" in values else None

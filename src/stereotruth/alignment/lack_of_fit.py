@@ -30,7 +30,7 @@ SURE = 0.001  # the same, from which on their form is told
 UNKNOWNS = 2  # a standard deviation and a length
 LENGTHS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)  # of the covariance, in spacings of the sites
 FEWEST = 12  # sites that tell a covariance
-LEAST = 0.25  # of the variance that labels have at least, whatever the corrections take of it
+LEAST = 0.5  # of the variance that labels have at least, whatever the corrections take of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,8 @@ def with_shared_errors(
     """The estimate of a pair's affines with what near sites share counted, and these errors.
 
     Then the parameters are those of generalised least squares; without such errors nothing changes.
-    ``equations``: of ``found``, corrections by line taken off. ``by_line``: there are some. They take
-    a part of what near sites share with them, so that the rest counts whatever its probability.
+    ``equations``: of ``found``, corrections by line taken off. ``by_line``: there are some. They
+    take a part of what near sites share, so that the rest counts whatever its probability.
     """
     index = np.unique(equations.site, return_inverse=True)[1]
     residuals = equations.observed - equations.design @ found.parameters

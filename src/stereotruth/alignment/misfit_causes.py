@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .lack_of_fit import SharedErrors
+from .lack_of_fit import CHANCE, SharedErrors
 from .line_fit import LineFit
 
 Floats = NDArray[np.float64]
@@ -56,7 +56,7 @@ def remark_of(sigma: LabelSigma, fit: LineFit, shared: SharedErrors) -> str:
             f"{along:.2f} px along and {across:.2f} px across the lines), which is corrected by "
             "line"
         )
-    if shared.sigma_px[0] and grown:
+    if shared.sigma_px[0] and shared.chance[0] < CHANCE and grown:
         amount = f"{shared.sigma_px[0]:.3f} px of disparity"
         causes.append(
             f"residuals change smoothly over the scene and not by line ({amount}), as RPCs leave "

@@ -5,13 +5,14 @@ LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative 
 both images have in common they see on slopes only, as LiDAR strips are co-registered by their
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it.
+settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
+open, edges of roofs settle it (:mod:`.plan_place`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
 by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if the tie
-points do not contradict it, or if the corrections from one half of the sites do not improve the
+from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
+points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
 other half.
 """
 
@@ -55,11 +56,13 @@ from .lidar_checks import (
     doubt_by_rpcs,
     height_by_images,
     height_by_rpcs,
+    heights_of_model,
     pixel_m,
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
 from .misfit_causes import LabelSigma, remark_of
+from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -129,7 +132,8 @@ def _record(
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
-        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
+        "m (east, north), see plan_place",
     }
 
 
@@ -234,6 +238,21 @@ def _search(
     return _Found(observations, found, shared, lines, current, halves, sigma)
 
 
+def _placed(
+    start: Alignment, result: _Found, sources: tuple[Source, Source], stores: Sequence[PointStore]
+) -> tuple[_Found, dict[str, Any]]:
+    """What tie points tell, with the place in plan, and the figures of it."""
+    found, figures, seen = place_pair(result.alignment, result.estimate, sources, stores)
+    of_images = replace(result.observations.of_images, in_plan=seen)
+    placed = replace(
+        result,
+        observations=replace(result.observations, of_images=of_images),
+        estimate=found,
+        alignment=with_corrections(start, found.parameters, result.lines.corrections),
+    )
+    return placed, figures
+
+
 def _discord(observations: Observations) -> str:
     """Why tie points tell nothing, or an empty string."""
     used = observations.used
@@ -320,7 +339,10 @@ def refine(
             doubt_by_rpcs(stores, sensors),
         ]
         doubts = [text for text in doubts if text]
+        alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
+        if not isinstance(result, str):
+            result, in_plan = _placed(alignment, result, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:
@@ -341,12 +363,11 @@ def refine(
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
-    record |= {"by_line": result.lines.figures(), "shared_by_near_sites": result.shared.figures()}
-    record["remark"] = "" if reason else remark_of(result.sigma, result.lines, result.shared)
-    record["sigma_of_labels_px"] = {k: round(v, 4) for k, v in vars(result.sigma).items()}
+    record |= _misfits(result, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
+    record["place_in_plan"] = in_plan
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
     misfits = [round(misfit, 3) for misfit in result.halves]
@@ -386,10 +407,22 @@ def refine(
     return refined, observations
 
 
+def _misfits(result: _Found, reason: str) -> dict[str, Any]:
+    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
+    return {
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+    }
+
+
 def _objection(result: _Found, with_gcps: bool) -> str:
     """Why a refinement is not applied, or an empty string."""
     before, after = result.halves
-    if _chance(result.estimate) > SIGNIFICANT and not result.lines.stands_out:
+    # what roofs tell of the place of both images, tie points need not contradict
+    told = result.lines.stands_out or bool(result.observations.of_images.in_plan)
+    if _chance(result.estimate) > SIGNIFICANT and not told:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (

@@ -7,7 +7,8 @@ jitter of roll and pitch, which RPCs cannot follow. Image
 coordinates are (col, row), (0, 0) the centre of the upper-left pixel.
 
 A camera is a flat float64 array for the kernels, made by :func:`aim`; its fields are the constants
-below. Positions and directions come out in the world frame of the city (see ``geodesy``).
+below. Where the radius of the orbit is 0, it is one of :mod:`.rpc_cameras`.
+Positions and directions come out in the world frame of the city (see ``geodesy``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from ..kernels import inlined, kernel
 from .cities import Jitter
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
+from .rpc_cameras import direction_by_rpc, pose_by_rpc, project_by_rpc
 
 ALTITUDE_M = 505e3
 INCLINATION_DEG = 97.4
@@ -44,7 +46,13 @@ SIZE = WAVE + 4 * MOST_WAVES
 
 @inlined
 def pose(cam, row, out):
-    """Write position and body axes (forward, left, up) of one line, world frame, to out[12]."""
+    """Write position and body axes (forward, left, up) of one line, world frame, to out[12].
+
+    Of a camera by given RPCs: its position, and what its directions follow from.
+    """
+    if cam[RADIUS] == 0.0:
+        pose_by_rpc(cam, row, out)
+        return
     t = cam[TIME0] + row * cam[PERIOD]
     # the circle in inertial space, turned back into ECEF
     c, s = math.cos(cam[MOTION] * t), math.sin(cam[MOTION] * t)
@@ -92,6 +100,8 @@ def pose(cam, row, out):
 @inlined
 def direction(cam, line, col):
     """Direction (not normalised, z < 0) of the ray of a column, given its line's pose."""
+    if cam[RADIUS] == 0.0:
+        return direction_by_rpc(cam, line, col)
     across = (col - cam[COL0]) * cam[PITCH_PER_COL]
     look = cam[LOOK]
     return (
@@ -108,6 +118,8 @@ def project_point(cam, x, y, z, row, line):
     Solves for the line time by the secant method; the pose in ``line`` is that of the result to
     1e-4 rows, 0.1 mm of the satellite's way.
     """
+    if cam[RADIUS] == 0.0:
+        return project_by_rpc(cam, x, y, z, line)
     slope = cam[SLOPE]
     last = 0.0
     step = 0.0

@@ -91,6 +91,19 @@ class Dates:
 
 
 @dataclass(frozen=True)
+class FlightStrip:
+    """One strip of an airborne LiDAR that flies north.
+
+    ``offset_m``: east, north, up that all of its points are off by; ``roll_deg``: the points turn
+    about the strip's middle line besides, the east down. ``spacing_m`` of its pulses.
+    """
+
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spacing_m: float = 0.4
+    roll_deg: float = 0.0
+
+
+@dataclass(frozen=True)
 class Canopy:
     """Crowns with rough tops, besides the trees that the land use has.
 
@@ -144,6 +157,28 @@ class Character:
 
 
 @dataclass(frozen=True)
+class Twin:
+    """The real place that a city is the twin of.
+
+    ``file``: LAS or LAZ; ``crs``: of its points, if it declares none. ``half_m``: half the ground
+    that the file covers, along its axes east and north; ``turned_rad``: counter-clockwise turn of
+    these axes in the city's frame. ``rpcs``: files of RPCs by which left and right image see the
+    place, over it or moved there; None: GaoFen-7's camera takes them.
+    """
+
+    file: str
+    crs: str
+    half_m: tuple[float, float]
+    turned_rad: float
+    rpcs: tuple[str, str] | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """The files of the place."""
+        return [self.file, *(self.rpcs or ())]
+
+
+@dataclass(frozen=True)
 class CitySpec:
     """A synthetic city: where it lies, what it looks like, and its scenes.
 
@@ -151,7 +186,10 @@ class CitySpec:
     height of its lowest ground; ``world_seed`` draws everything that is built.
     ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
     the images have of their own. ``dates``: of images and LiDAR, each of which has a world of its
-    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone.
+    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone, but in
+    a twin. ``strips`` of the LiDAR, from west to east over each scene; none: two crossed sets of
+    flight lines that agree. ``twin``: the real place whose ground, roofs and crowns the city has;
+    None: it is drawn.
     """
 
     name: str
@@ -170,6 +208,8 @@ class CitySpec:
     left: ViewSpec = ViewSpec()
     right: ViewSpec = ViewSpec()
     dates: Dates | None = None
+    strips: tuple[FlightStrip, ...] = ()
+    twin: Twin | None = None
 
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""

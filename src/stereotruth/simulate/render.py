@@ -22,6 +22,7 @@ from .camera import Pass, aim, direction, jittering, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
 from .dated_worlds import world_of
 from .geodesy import LocalFrame
+from .given_rpcs import read_rpc, rpc_camera
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import (
@@ -49,6 +50,7 @@ LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a
 # Of each lane: its ray, the ground, the last step, where in a cell of the spline, coefficients
 AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
 RPC_MARGIN_M = 130.0
+FRAME_PX = 30  # of a window of given RPCs around the place
 SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
 LEFT_COLLAR, RIGHT_COLLAR = 1, 2  # see in_collar
@@ -111,21 +113,9 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
     surfaces = surfaces_of(city, built)
     frame = frame_of(city)
     relief = relief_of(city, scene, surfaces)
-    target = np.array([*scene.centre_m, relief.middle])
-    # the forward view takes in all that the backward view shows, however high it stands
-    rise = max(relief.top - relief.middle, relief.middle - relief.low)
-    lean = rise * math.tan(math.radians(29)) + 45
-    right_cols = math.ceil(scene.cols * LEFT_GSD_M / RIGHT_GSD_M + 2 * 60 + 0.02 * scene.rows)
-    right_rows = math.ceil(
-        scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
-    )
+    views = _by_rpcs(city, frame, relief) if city.twin and city.twin.rpcs else None
     cameras = []
-    for view, gsd, cols, rows in (
-        ("left", LEFT_GSD_M, scene.cols, scene.rows),
-        ("right", RIGHT_GSD_M, right_cols, right_rows),
-    ):
-        flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
-        cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
+    for view, cam, cols, rows in views or _on_a_pass(scene, frame, relief):
         rpc = biased_rpc(cam, frame, relief, (cols, rows), (scene.pose_seed, view))
         look = getattr(city, view)
         if look.jitter:  # the RPCs know nothing of it
@@ -139,6 +129,57 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
             )
         )  # fmt: skip
     return ImagedScene(city, scene, frame, surfaces, *cameras)
+
+
+class View(NamedTuple):
+    """One of two images: its name, packed camera, columns and rows."""
+
+    name: str
+    cam: np.ndarray
+    cols: int
+    rows: int
+
+
+def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View]:
+    """Both images of a scene as GaoFen-7 takes them on one pass."""
+    target = np.array([*scene.centre_m, relief.middle])
+    # the forward view takes in all that the backward view shows, however high it stands
+    rise = max(relief.top - relief.middle, relief.middle - relief.low)
+    lean = rise * math.tan(math.radians(29)) + 45
+    right_cols = math.ceil(scene.cols * LEFT_GSD_M / RIGHT_GSD_M + 2 * 60 + 0.02 * scene.rows)
+    right_rows = math.ceil(
+        scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
+    )
+    views = []
+    for view, gsd, cols, rows in (
+        ("left", LEFT_GSD_M, scene.cols, scene.rows),
+        ("right", RIGHT_GSD_M, right_cols, right_rows),
+    ):
+        flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
+        cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
+        views.append(View(view, cam, cols, rows))
+    return views
+
+
+def _by_rpcs(city: CitySpec, frame: LocalFrame, relief: Relief) -> list[View]:
+    """Both images of a twin as given RPCs see its place: the windows of them that show it."""
+    (half_x, half_y), turned = city.twin.half_m, city.twin.turned_rad
+    turn = np.array([[math.cos(turned), -math.sin(turned)], [math.sin(turned), math.cos(turned)]])
+    corners = np.array([
+        [*(turn @ [i * half_x, j * half_y]), z]
+        for i in (-1, 1) for j in (-1, 1) for z in (relief.low, relief.top)
+    ])  # fmt: skip
+    ground = frame.to_geodetic(corners)
+    heights = frame.height + relief.low - RPC_MARGIN_M, frame.height + relief.top + RPC_MARGIN_M
+    views = []
+    for view, file in zip(SHOWN, city.twin.rpcs):
+        rpc = read_rpc(file).over(city.lon, city.lat, frame.height + relief.middle)
+        image = rpc.project(ground)
+        first = np.floor(image.min(axis=0)).astype(int) - FRAME_PX
+        cols, rows = (np.ceil(image.max(axis=0)).astype(int) + FRAME_PX - first).tolist()
+        cam = rpc_camera(rpc.cropped(*first.tolist()), frame, (cols, rows), heights)
+        views.append(View(view, cam, cols, rows))
+    return views
 
 
 def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
@@ -157,6 +198,8 @@ def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
         near = scene_coordinates(city, scene, surfaces.boxes[:, :2])
         inside = (np.abs(near) < half_size(scene) + 100).all(axis=1)
         objects = objects[np.append(True, inside)]
+    if surfaces.patches.size:
+        objects = np.append(objects, surfaces.cell_top.max())
     return Relief(low, (low + high) / 2, float(objects.max()))
 
 

@@ -53,7 +53,8 @@ class Made:
         measured = measured + self.rng.normal(0, 0.25, measured.shape)
         zeros = np.zeros(len(where))
         ids = tuple(f"G{k}" for k in range(len(where)))
-        return ImageToFit(name, start, PointsOfImage(ids, zeros, zeros, zeros, measured, where))
+        seen = PointsOfImage(ids, zeros, zeros, zeros, measured, where)
+        return ImageToFit(name, start, seen, 2.0 * np.eye(2))
 
     def pair(self, left: str, right: str) -> PairToFit:
         """A pair with tie points of 0.03 px."""
