@@ -28,12 +28,18 @@ MOVE_M = 10.0  # over which J is a difference
 
 
 def with_strips(
-    uncertainty: LabelUncertainty, strips: StripOffsets, model: EpipolarModel, view: str = "left"
+    uncertainty: LabelUncertainty,
+    strips: StripOffsets,
+    model: EpipolarModel,
+    view: str = "left",
+    shared_px: float = 0.0,
 ) -> LabelUncertainty:
     """The uncertainty of labels with what the offsets of named strips add to it.
 
     The same if no strip is named, or if none lies in the pair. Of offsets that are taken out of the
-    points, their own uncertainty remains.
+    points, their own uncertainty remains. ``shared_px``: standard deviation of disparity, in
+    ``uncertainty``, by errors that near tie points share: as much of it as strips explain counts
+    once.
     """
     if not strips.named:
         return uncertainty
@@ -53,8 +59,10 @@ def with_strips(
     mean = np.einsum("krc,krci->i", shares, np.nan_to_num(effects)) / known.sum()
     rest = effects - mean
     found = np.einsum("krc,krci,krcj->rcij", shares, rest, rest)
+    explained = float(np.mean(found[known][:, 0, 0]))
     found += np.einsum("krc,rcia,kab,rcjb->rcij", shares, jacobian, covariance, jacobian)
     found[~known] = found[known].mean(axis=0)
+    found[..., 0, 0] -= min(shared_px**2, explained)
     nodes = np.moveaxis(found[..., *_UPPER], -1, 0).round(10)
     return replace(uncertainty, nodes=uncertainty.nodes + nodes, step=STEP)
 

@@ -23,6 +23,7 @@ from ..project import (
     sheet,
 )
 from ..sheets import Scene
+from ..simulate.city_files import city_of, file_of
 from .check_scene import Looked, SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
@@ -98,7 +99,7 @@ def check_project(
             _tell_time(tell, (monotonic() - began) / TIMED, len(scenes) - TIMED)
         found = Findings(name)
         if is_synthetic(scene):
-            found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
+            _check_synthetic(scene, found)
         else:
             alone = name not in adjusted
             epoch = epochs.get(scene.city)
@@ -126,6 +127,24 @@ def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None
             f"looking at {left} more scenes, about {duration(scene_s * left)}; "
             "stereotruth check SCENE … looks at some"
         )
+
+
+def _check_synthetic(scene: Scene, found: Findings) -> None:
+    """What a run makes needs nothing but the files of the place that a city is the twin of."""
+    with found.of("input"):
+        city = city_of(scene.city)
+        words = "images, LiDAR and truth are made by the run"
+        if city.twin is None:
+            found.say("input", Level.FACT, f"synthetic: {words}")
+            return
+        for file in city.twin.files:
+            if not Path(file).is_file():
+                raise InputError(
+                    "there is no such file, of which the city is the twin",
+                    file=file,
+                    remedy=f"put it back, or correct its path in {file_of(city.name)}",
+                )
+        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
 
 
 def _run(facts: Sequence[SceneFacts], settings: Configuration) -> Findings:

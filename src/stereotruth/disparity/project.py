@@ -204,6 +204,7 @@ def _content(inputs: SceneInputs, code: str) -> str:
             "images": [_identity(left), _identity(right)],
             "epipolar": left["epipolar"],
             "uncertainty": inputs.pair.uncertainty.content,
+            "edge_margin_px": inputs.edge_margin_px,
             "parameters": parameters,
             "code": code,
         }

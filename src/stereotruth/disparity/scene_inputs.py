@@ -127,10 +127,14 @@ class SceneInputs:
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
         if self.alignment is not None:
-            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
-        if self.strips is not None:
-            uncertainty = with_strips(uncertainty, StripOffsets.read(self.strips), model, self.view)
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
+        if self.lidar_strips is not None:
+            how = model, self.view, shared_px
+            uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
         return seen_from(
             self.view,
             Pair(
@@ -144,6 +148,19 @@ class SceneInputs:
                 uncertainty,
             ),
         )
+
+    @cached_property
+    def lidar_strips(self) -> StripOffsets | None:
+        """What the strips of the points are off; None if they count as exact."""
+        return None if self.strips is None else StripOffsets.read(self.strips)
+
+    @cached_property
+    def edge_margin_px(self) -> float:
+        """Distance of a pixel's centre from the edge of its surface below which it has no label:
+        that of the settings, or how far the strips of the points are off in plan; a pixel at most,
+        beyond which points of the pixels around tell no edge."""
+        plan_m = self.lidar_strips.most_in_plan_m if self.lidar_strips else 0.0
+        return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
 
     @property
     def has_masks(self) -> bool:

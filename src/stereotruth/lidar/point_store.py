@@ -52,7 +52,7 @@ Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-FORMAT = 4  # of the files
+FORMAT = 5  # of the files
 POINTS, CELLS, STRIPS, ATTRIBUTES = "points.npy", "cells.npy", "strips.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point

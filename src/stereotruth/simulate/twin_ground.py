@@ -69,10 +69,11 @@ def terrain_of(xyz: np.ndarray, x0: float, y0: float, shape: tuple[int, int]) ->
     ``xyz`` [n, 3]: points on the ground. Linear between them, as under buildings; beyond them the
     median height of the nearest ones. No slope is above MAX_SLOPE.
     """
-    cell = np.floor(xyz[:, :2] / STEP_M).astype(np.int64)
-    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    which = which.reshape(-1)
-    mean = np.column_stack([np.bincount(which, weights=xyz[:, k]) / count for k in range(3)])
+    i, j = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / STEP_M).astype(np.int64).T
+    square = j * (i.max() + 1) + i
+    count = np.bincount(square)
+    mean = np.column_stack([np.bincount(square, weights=xyz[:, k]) for k in range(3)])
+    mean = mean[count > 0] / count[count > 0, None]
     x, y = np.meshgrid(x0 + STEP_M * np.arange(shape[1]), y0 + STEP_M * np.arange(shape[0]))
     z = np.full(shape, np.nan)
     if len(mean) > 3:

@@ -17,6 +17,7 @@ from .geodesy import LocalFrame
 log = logging.getLogger("stereotruth")
 
 NOISE = (7, 18)  # classes of LAS
+POINTS_A_CHUNK = 2_000_000
 CLASSED_SHARE = 0.01  # of the points: less of a class, and its class was not looked for
 TONE = 2.2  # exponent of the tone curve of colours
 MIDDLE = 0.25  # reflectance of a point of median intensity
@@ -105,34 +106,40 @@ def extent_of(file: str | Path, crs: str = "") -> Extent:
 def read_points(twin: Twin, frame: LocalFrame) -> Points:
     """All points of a place but noise and withheld ones."""
     extent = extent_of(twin.file, twin.crs)
-    cloud = laspy.read(twin.file)
-    label = np.asarray(cloud.classification, np.uint8)
-    use = ~np.isin(label, NOISE) & (np.asarray(cloud.withheld) == 0)
-    returns, number = (
-        np.asarray(cloud[name])[use] for name in ("number_of_returns", "return_number")
-    )
-    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[use]
-    points = Points(
-        frame.from_geodetic(extent.to_geodetic(xyz)),
-        label[use],
-        returns <= 1,
-        number <= 1,
-        _tint(cloud, use),
-    )
+    parts = []
+    with laspy.open(twin.file) as source:
+        names = set(source.header.point_format.dimension_names)
+        for cloud in source.chunk_iterator(POINTS_A_CHUNK):
+            label = np.asarray(cloud.classification, np.uint8)
+            use = ~np.isin(label, NOISE) & (np.asarray(cloud.withheld) == 0)
+            xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[use]
+            parts.append((
+                frame.from_geodetic(extent.to_geodetic(xyz)),
+                label[use],
+                np.asarray(cloud.number_of_returns)[use] <= 1,
+                np.asarray(cloud.return_number)[use] <= 1,
+                np.asarray(cloud.intensity)[use],
+                _grey(cloud, names, use),
+            ))  # fmt: skip
+    xyz, label, single, first, echo, grey = (np.concatenate(of) for of in zip(*parts))
     log.info("%s: %.2f million points", Path(twin.file).name, len(xyz) / 1e6)
-    return points
+    return Points(xyz, label, single, first, _tint(echo, grey))
 
 
-def _tint(cloud: laspy.LasData, use: np.ndarray) -> np.ndarray | None:
+def _grey(cloud: laspy.ScaleAwarePointRecord, names: set[str], use: np.ndarray) -> np.ndarray:
+    """Mean of the colours of points; 0 where a file has none."""
+    if not {"red", "green", "blue"} <= names:
+        return np.zeros(int(use.sum()), np.float32)
+    colours = (np.asarray(cloud[c])[use] for c in ("red", "green", "blue"))
+    return (sum(c.astype(np.float32) for c in colours) / 3).astype(np.float32)
+
+
+def _tint(echo: np.ndarray, grey: np.ndarray) -> np.ndarray | None:
     """Reflectance of points by their colours, else by their intensity, else None."""
-    names = set(cloud.point_format.dimension_names)
-    if {"red", "green", "blue"} <= names:
-        colours = np.mean([np.asarray(cloud[c])[use] for c in ("red", "green", "blue")], axis=0)
-        if np.ptp(colours) > 0:
-            full = 65535.0 if colours.max() > 255 else 255.0
-            return np.clip((colours / full) ** TONE, DARKEST, BRIGHTEST).astype(np.float32)
-    echo = np.asarray(cloud.intensity)[use].astype(np.float64)
-    if np.ptp(echo) > 0:
-        scaled = MIDDLE * echo / max(float(np.median(echo)), 1.0)
+    if len(grey) and np.ptp(grey) > 0:
+        full = 65535.0 if grey.max() > 255 else 255.0
+        return np.clip((grey / full) ** TONE, DARKEST, BRIGHTEST).astype(np.float32)
+    if len(echo) and np.ptp(echo) > 0:
+        scaled = MIDDLE * echo.astype(np.float64) / max(float(np.median(echo)), 1.0)
         return np.clip(scaled, DARKEST, BRIGHTEST).astype(np.float32)
     return None

@@ -56,12 +56,12 @@ class Raster(NamedTuple):
 
 def thinned(xyz: np.ndarray, side_m: float = THIN_M) -> np.ndarray:
     """Indices of the highest point in each square of a side, in order."""
-    cell = np.floor(xyz[:, :2] / side_m).astype(np.int64)
-    order = np.lexsort((-xyz[:, 2], cell[:, 0], cell[:, 1]))
-    ordered = cell[order]
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(ordered, axis=0) != 0).any(axis=1)
-    return np.sort(order[first])
+    if not len(xyz):
+        return np.zeros(0, np.int64)
+    i, j = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / side_m).astype(np.int64).T
+    cell = j * (i.max() + 1) + i
+    order = np.lexsort((-xyz[:, 2], cell))
+    return np.sort(order[np.diff(cell[order], prepend=-1) != 0])
 
 
 def local_planes(xyz: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

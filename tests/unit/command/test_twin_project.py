@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from stereotruth.command.check import check_project
+from stereotruth.command.findings import Level
 from stereotruth.command.main import init
 from stereotruth.command.twin_project import Options, with_twin
 from stereotruth.errors import InputError
@@ -29,6 +31,11 @@ def test_its_scene_is_made_by_the_run(tmp_path, monkeypatch):
     assert [path.name for path in lidar_of(scene, settings).values()] == ["Twin-1_0_0.laz"]
     sun, size = options.sun_deg, options.size_px
     assert city_of("Twin") == twin_city("Twin", file, sun_deg=sun, size_px=size)
+    assert not any(findings.failed for findings in check_project())
+    file.rename(tmp_path / "away.laz")
+    (missing,) = (of for findings in check_project() for of in findings if of.level is Level.ERROR)
+    assert "no such file, of which the city is the twin" in missing.text
+    (tmp_path / "away.laz").rename(file)
     file_of("Twin").unlink()
     assert not is_synthetic(scene)
 
