@@ -54,7 +54,7 @@ class LabelledWindow:
     """A ``window`` of a pair whose images are compared by ``labels``; arrays [h, w].
 
     ``labelled``: pixels that are asked about; ``surface_class`` (ASPRS) of what the labels show;
-    ``noise`` of both images, variances in DN².
+    ``noise`` of both images, variances.
     """
 
     window: PairWindow

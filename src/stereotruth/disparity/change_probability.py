@@ -50,7 +50,7 @@ def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) ->
         for around in AROUND
     ]
     means += [
-        alike_mean(known, compared.brightness, *compared.surface, *around, runs)
+        alike_mean(known, compared.brightness, *compared.surface, *around, compared.noise, runs)
         for around in ALIKE_AROUND
     ]
     return [_log_odds(values[doubtful]) for values in (own, *means)]

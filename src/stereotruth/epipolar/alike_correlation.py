@@ -26,6 +26,9 @@ from .surface_correlation import (
 )
 
 ALIKE = 0.1  # share of the centre's brightness by which that of a pixel may differ
+# Standard deviations of the noise: two means of 3 x 3 px differ by 0.5 (of white noise) to 0.9 (of
+# noise whose neighbours correlate by 0.4).
+NOISY = 1.5
 LEAST_PIXELS = 12  # fewer correlate by chance
 
 
@@ -57,14 +60,28 @@ def brightness_of_pair(
 
 @inner
 def alike_of_row(
-    level: Singles, level_warped: Singles, share: float, y: int, x0: int, size: int, c: Singles
+    level: Singles,
+    level_warped: Singles,
+    share: float,
+    least: tuple[float, float],
+    y: int,
+    x0: int,
+    size: int,
+    c: Singles,
 ) -> None:
-    """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and the ``share``
-    of each by which that of a pixel may differ to be alike, see :func:`is_alike`."""
+    """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and by how much
+    that of a pixel may differ to be alike, see :func:`is_alike`: the ``share`` of each, and
+    ``least`` in either image."""
     for k in range(size):
         c[k], c[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
-        c[2 * BLOCK + k] = share * level[y, x0 + k]
-        c[3 * BLOCK + k] = share * level_warped[y, x0 + k]
+        c[2 * BLOCK + k] = max(share * level[y, x0 + k], least[0])
+        c[3 * BLOCK + k] = max(share * level_warped[y, x0 + k], least[1])
+
+
+def least_difference(noise: tuple[float, float]) -> tuple[np.float32, np.float32]:
+    """Of the brightness of both images, within which noise of these variances lets pixels of the
+    same ground look different."""
+    return np.float32(NOISY * noise[0] ** 0.5), np.float32(NOISY * noise[1] ** 0.5)
 
 
 @inner
@@ -85,6 +102,7 @@ def _alike_correlation(
     slope: Singles,
     reach: int,
     noise: tuple[float, float],
+    least: tuple[float, float],
     runs: Steps,
     out: Singles,
 ) -> None:
@@ -99,7 +117,7 @@ def _alike_correlation(
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        alike_of_row(level, level_warped, share, y, x0, size, bright)
+        alike_of_row(level, level_warped, share, least, y, x0, size, bright)
         for k in range(size):
             centre[k], centre[BLOCK + k] = left[y, x0 + k], warped[y, x0 + k]
         sums[:] = zero
@@ -154,11 +172,11 @@ def alike_correlation(
     """Correlation of two images [h, w] over the pixels up to ``reach`` px around that are alike.
 
     These lie on the surface of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], and
-    are as bright as it within the share ALIKE in both images, by their ``brightness``
-    (:func:`brightness_of_pair`). ``left`` is 0 and ``warped`` NaN where an image has no value. The
-    coefficient is as it would be without ``noise`` (variances of both images, DN²), 1 at most. NaN
-    with fewer than LEAST_PIXELS, and where noise leaves so little that chance may do as well. Of
-    the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    are as bright as it in both images, by their ``brightness`` (:func:`brightness_of_pair`), within
+    the share ALIKE or as far as noise tells (:func:`least_difference`). ``left`` is 0 and
+    ``warped`` NaN where an image has no value. The coefficient is as it would be without ``noise``
+    (variances of both images), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves
+    so little that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
     level, level_warped = brightness
     known = np.isfinite(level_warped) & np.isfinite(disparity) & (left != 0.0)
@@ -169,5 +187,6 @@ def alike_correlation(
     ]
     out = np.empty(left.shape, np.float32)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
-    _alike_correlation(*single, level, level_warped, *surface, reach, noise, runs, out)
+    least = least_difference(noise)
+    _alike_correlation(*single, level, level_warped, *surface, reach, noise, least, runs, out)
     return out
