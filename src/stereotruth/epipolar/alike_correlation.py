@@ -63,25 +63,21 @@ def alike_of_row(
     level: Singles,
     level_warped: Singles,
     share: float,
-    least: tuple[float, float],
+    noise: tuple[float, float],
     y: int,
     x0: int,
     size: int,
     c: Singles,
 ) -> None:
     """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and by how much
-    that of a pixel may differ to be alike, see :func:`is_alike`: the ``share`` of each, and
-    ``least`` in either image."""
+    that of a pixel may differ to be alike, see :func:`is_alike`: by the ``share`` of each, or by
+    NOISY standard deviations of the ``noise`` (variances)."""
+    least = np.float32(NOISY * np.sqrt(noise[0]))
+    least_warped = np.float32(NOISY * np.sqrt(noise[1]))
     for k in range(size):
         c[k], c[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
-        c[2 * BLOCK + k] = max(share * level[y, x0 + k], least[0])
-        c[3 * BLOCK + k] = max(share * level_warped[y, x0 + k], least[1])
-
-
-def least_difference(noise: tuple[float, float]) -> tuple[np.float32, np.float32]:
-    """Of the brightness of both images, within which noise of these variances lets pixels of the
-    same ground look different."""
-    return np.float32(NOISY * noise[0] ** 0.5), np.float32(NOISY * noise[1] ** 0.5)
+        c[2 * BLOCK + k] = max(share * level[y, x0 + k], least)
+        c[3 * BLOCK + k] = max(share * level_warped[y, x0 + k], least_warped)
 
 
 @inner
@@ -102,7 +98,6 @@ def _alike_correlation(
     slope: Singles,
     reach: int,
     noise: tuple[float, float],
-    least: tuple[float, float],
     runs: Steps,
     out: Singles,
 ) -> None:
@@ -117,7 +112,7 @@ def _alike_correlation(
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        alike_of_row(level, level_warped, share, least, y, x0, size, bright)
+        alike_of_row(level, level_warped, share, noise, y, x0, size, bright)
         for k in range(size):
             centre[k], centre[BLOCK + k] = left[y, x0 + k], warped[y, x0 + k]
         sums[:] = zero
@@ -173,7 +168,7 @@ def alike_correlation(
 
     These lie on the surface of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], and
     are as bright as it in both images, by their ``brightness`` (:func:`brightness_of_pair`), within
-    the share ALIKE or as far as noise tells (:func:`least_difference`). ``left`` is 0 and
+    the share ALIKE or by NOISY standard deviations of the noise. ``left`` is 0 and
     ``warped`` NaN where an image has no value. The coefficient is as it would be without ``noise``
     (variances of both images), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves
     so little that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
@@ -187,6 +182,5 @@ def alike_correlation(
     ]
     out = np.empty(left.shape, np.float32)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
-    least = least_difference(noise)
-    _alike_correlation(*single, level, level_warped, *surface, reach, noise, least, runs, out)
+    _alike_correlation(*single, level, level_warped, *surface, reach, noise, runs, out)
     return out
