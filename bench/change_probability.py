@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass
 from itertools import product, repeat
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from changes import ALONE, CONDITIONS, SHARES, Case, changed_and_kept, dated_truth, inputs_of
 from numpy.typing import NDArray
+from planted_changes import KINDS, Planted, RealScene
 
 from stereotruth.disparity.change_evidence import LabelledWindow, change_evidence
 from stereotruth.disparity.change_probability import (
@@ -35,6 +37,7 @@ from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window
+from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.numerics.decision_trees import LEAF, DecisionTrees
 from stereotruth.simulate.changes import REASONS, TEXTURE
 
@@ -54,7 +57,8 @@ class Sample(NamedTuple):
 
     Of those whose images do not agree closely: the ``evidence`` [k, n], which have ``changed`` [n]
     or are hidden, which have a new ``texture`` [n] alone, and which are ``rare`` [n]: those of two
-    lights, moved vehicles of one light; of the others the numbers that have changed and have not
+    lights, moved vehicles of one light, and what is small in real scenes; and which lie in the
+    ``upper`` half of their window. Of the others the numbers that have changed and have not
     (``agreed``).
     """
 
@@ -62,6 +66,7 @@ class Sample(NamedTuple):
     changed: NDArray[np.bool_]
     texture: NDArray[np.bool_]
     rare: NDArray[np.bool_]
+    upper: NDArray[np.bool_]
     agreed: NDArray[np.int64]
 
 
@@ -78,15 +83,51 @@ def cases(seeds: list[int], condition: str, fitted: bool) -> list[Case]:
 
 
 def samples(
-    of: list[Case], folder: Path, around: bool, pool: Executor
+    of: list[Case | PlantedCase], folder: Path, around: bool, pool: Executor
 ) -> Iterator[tuple[str, Sample]]:
-    """Of several cities; ``around``: the evidence holds the probabilities of the surroundings,
-    too."""
+    """Of several cities and real scenes; ``around``: the evidence holds the probabilities of the
+    surroundings, too."""
     yield from zip((case.kind for case in of), pool.map(sample, of, repeat(folder), repeat(around)))
 
 
-def sample(case: Case, folder: Path, around: bool) -> Sample:
+@dataclass(frozen=True)
+class PlantedCase:
+    """Changes planted in a real scene, by the number of a draw."""
+
+    scene: RealScene
+    draw: int
+
+    @property
+    def apart(self) -> bool:
+        """Whether the images share no light."""
+        return self.scene.diachronic
+
+    @property
+    def kind(self) -> str:
+        """For tables."""
+        return f"planted in {self.scene.name}"
+
+
+def sample(case: Case | PlantedCase, folder: Path, around: bool) -> Sample:
     """Of the labels that the LiDAR alone would have: facets and crowns."""
+    return sample_of(*compared_of(case, folder), case.apart, around)
+
+
+def compared_of(case: Case | PlantedCase, folder: Path) -> tuple[LabelledWindow, Marked]:
+    """The whole of a case, and what is true there."""
+    return planted_scene(case, folder) if isinstance(case, PlantedCase) else city(case, folder)
+
+
+def planted_scene(case: PlantedCase, folder: Path) -> tuple[LabelledWindow, Marked]:
+    """A real scene."""
+    planted = Planted.of(case.scene, folder, case.draw)
+    changed, kept, kind = planted.truth
+    rare = np.isin(kind, [KINDS.index(name) + 1 for name in ("cars", "grown", "felled")])
+    return planted.compared, Marked(changed, kept, np.zeros_like(changed), rare & changed)
+
+
+def city(case: Case, folder: Path) -> tuple[LabelledWindow, Marked]:
+    """A simulated city."""
     inputs = inputs_of(case, folder)
     rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
     by_lidar = lidar_labels(inputs, *read_window(inputs, rows, cols))
@@ -99,20 +140,36 @@ def sample(case: Case, folder: Path, around: bool) -> Sample:
     moved = np.zeros_like(changed)
     moved[window.inner] = changes["reason"] == MOVED
     rare = texture & kept if case.apart else moved & changed
-    changed |= hidden
     labels = with_crowns(labels, by_lidar.rough, window)
     labelled = is_labelled(labels.status) & (labels.surface_class != WATER_CLASS)
-    noise = by_lidar.comparison.noise
-    of = LabelledWindow(window, labels.labels, labelled, labels.surface_class, noise)
-    doubtful, evidence = change_evidence(of)
+    equal = window.of_equal_noise(inputs.noise)
+    compared = LabelledWindow(equal, labels.labels, labelled, labels.surface_class, EQUAL)
+    return compared, Marked(changed | hidden, kept, texture, rare)
+
+
+class Marked(NamedTuple):
+    """Pixels [h, w] that have changed or not, that have a new texture, and that are rare."""
+
+    changed: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+    texture: NDArray[np.bool_]
+    rare: NDArray[np.bool_]
+
+
+def sample_of(compared: LabelledWindow, of: Marked, apart: bool, around: bool) -> Sample:
+    """Of a window; ``apart``: whether its images share no light."""
+    doubtful, evidence = change_evidence(compared)
     features = [*evidence]
     if around:
-        own = by_itself(evidence, doubtful, case.apart)
-        features += with_surroundings(own, doubtful, of)
-    chosen = (changed | kept)[doubtful]
-    agreed = [int((labelled & ~doubtful & pixels).sum()) for pixels in (changed, kept)]
-    of_chosen = (pixels[doubtful][chosen] for pixels in (changed, texture & kept, rare))
-    return Sample(np.stack(features)[:, chosen], *of_chosen, np.array(agreed))
+        own = by_itself(evidence, doubtful, apart)
+        features += with_surroundings(own, doubtful, compared)
+    chosen = (of.changed | of.kept)[doubtful]
+    agreed = [
+        int((compared.labelled & ~doubtful & pixels).sum()) for pixels in (of.changed, of.kept)
+    ]
+    of_chosen = (pixels[doubtful][chosen] for pixels in (of.changed, of.texture & of.kept, of.rare))
+    upper = np.nonzero(doubtful)[0][chosen] < len(doubtful) // 2
+    return Sample(np.stack(features)[:, chosen], *of_chosen, upper, np.array(agreed))
 
 
 def fit(of: list[Sample]) -> DecisionTrees:

@@ -131,7 +131,9 @@ class Evidence(NamedTuple):
     its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
     GAIN_PX, as a logarithm.
 
-    ``from_step``: px to the next step of the surface, FAR_PX at most; ``slope`` of the disparity.
+    ``from_step``: px to the next step of the surface, FAR_PX at most; ``apart``: share of the
+    surface up to ALIKE_PX that touches no other, without which agreement is lent by what lies
+    beside; ``slope`` of the disparity.
     ``vegetation``, ``young``: 1 where :class:`LabelledWindow` says so.
     """
 
@@ -152,6 +154,7 @@ class Evidence(NamedTuple):
     contrast_right: Singles
     gain: Singles
     from_step: Singles
+    apart: Singles
     slope: Singles
     vegetation: Singles
     young: Singles
@@ -190,6 +193,7 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
         surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
         *_contrasts_and_gain(compared, doubtful),
         _from_step(compared.clear),
+        _apart(compared, doubtful),
         np.abs(compared.labels.slope).sum(axis=0),
         compared.vegetation,
         compared.young,
@@ -235,6 +239,12 @@ def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singl
     ratio = logarithms[0] - logarithms[1]
     wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row)
     return [*contrasts, np.abs(means[0] - means[1] - wide)]
+
+
+def _apart(compared: LabelledWindow, doubtful: Bools) -> Singles:
+    """Share of the surface around [h, w] that touches no other."""
+    of_labels = np.where(compared.labelled, compared.clear, np.nan)
+    return surface_mean(of_labels, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful))
 
 
 def _from_step(clear: Bools) -> Singles:

@@ -53,6 +53,12 @@ class Contradicted(NamedTuple):
     variance: Floats | float
 
 
+def least_probability(compared: LabelledWindow) -> Floats:
+    """Of a change, more than which leaves a pixel [h, w] without a label."""
+    by_ground = np.where(compared.young, YOUNG_CHANGED, CHANGED)
+    return np.where(compared.vegetation, CROWN_CHANGED, by_ground)
+
+
 def contradicted(
     labels: Labels,
     window: PairWindow,
@@ -67,10 +73,7 @@ def contradicted(
     """
     compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
     probability = probability_of_change(compared, comparison.diachronic)
-    limit = np.where(
-        compared.vegetation, CROWN_CHANGED, np.where(compared.young, YOUNG_CHANGED, CHANGED)
-    )
-    changed = labelled & (probability > limit)
+    changed = labelled & (probability > least_probability(compared))
     variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
     return Contradicted(changed, variance)
 
