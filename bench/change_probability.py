@@ -1,11 +1,13 @@
 """The trees by which images tell how probable a change is, and how right they are.
 
-python bench/change_probability.py [--fit 1 2 3 4 5 6 7 8] [--seeds 61 62] [--folder FOLDER]
+python bench/change_probability.py [--fit 1] [--seeds 61 62] [--folder FOLDER]
+                                   [--project RUN --scenes jax-1-2 --apart jax-1-13 --draws 1 3]
 
 Of the simulated cities of changes.py, whose images are of one day or a year apart: the share of
 labels that have changed by the probability that stereotruth.disparity.change_probability tells.
-With --fit the trees are first fitted anew to the cities of these seeds, and written beside that
-module (pip install scikit-learn).
+With --fit the trees are first fitted anew to the cities of these seeds and to changes planted in
+the real scenes of a run (planted_changes.py), and written beside that module (pip install
+scikit-learn).
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ from changes import ALONE, CONDITIONS, SHARES, Case, changed_and_kept, dated_tru
 from numpy.typing import NDArray
 from planted_changes import KINDS, Planted, RealScene
 
-from stereotruth.disparity.change_evidence import LabelledWindow, change_evidence
+from stereotruth.disparity.change_evidence import Evidence, LabelledWindow, change_evidence
 from stereotruth.disparity.change_probability import (
     CHANGED,
+    LEARNED,
     TREES,
     UNCHANGED,
     by_itself,
+    learned,
     probability_by,
     trees,
     with_surroundings,
@@ -49,6 +53,10 @@ BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.15, CHANGED, 0.7, 1.0
 # ones
 OF_CHANGED, FEW, OF_RARE = 0.3, 0.05, 5.0
 MOVED = REASONS.split().index("moved")
+BEYOND, RANGE_EVERY = (
+    0.0005,
+    7,
+)  # share at either end of what has been learned; pixels that are asked
 NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 100  # of the trees
 
 
@@ -121,7 +129,7 @@ def compared_of(case: Case | PlantedCase, folder: Path) -> tuple[LabelledWindow,
 def planted_scene(case: PlantedCase, folder: Path) -> tuple[LabelledWindow, Marked]:
     """A real scene."""
     planted = Planted.of(case.scene, folder, case.draw)
-    changed, kept, kind = planted.truth
+    changed, kept, _, kind = planted.truth
     rare = np.isin(kind, [KINDS.index(name) + 1 for name in ("cars", "grown", "felled")])
     return planted.compared, Marked(changed, kept, np.zeros_like(changed), rare & changed)
 
@@ -206,25 +214,61 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("results/changes"))
     parser.add_argument("--seeds", type=int, nargs="*", default=[61, 62])
     parser.add_argument("--fit", type=int, nargs="+", default=[], help="seeds to fit the trees to")
+    parser.add_argument("--project", type=Path, help="a run whose real scenes are fitted to, too")
+    parser.add_argument(
+        "--scenes", nargs="*", default=[], help="of it, whose images share the light"
+    )
+    parser.add_argument("--apart", nargs="*", default=[], help="of it, whose images do not")
+    parser.add_argument("--draws", type=int, nargs="+", default=[1], help="of planted changes")
     given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
     if given.fit:
-        fit_all(given.fit, given.folder)
+        of = [
+            cases(given.fit, condition, fitted=True)
+            + [
+                PlantedCase(RealScene(given.project, name, condition == APART), draw)
+                for name, draw in product(names, given.draws)
+            ]
+            for condition, names in zip(CONDITIONS, (given.scenes, given.apart))
+        ]
+        fit_all(of, given.folder)
     for condition in CONDITIONS:
         report(cases(given.seeds, condition, fitted=False), given.folder)
 
 
-def fit_all(seeds: list[int], folder: Path) -> None:
-    """Trees of both conditions to a table beside the code: those by a pixel itself from the first
-    half of the seeds, those that ask its surroundings from the others."""
-    halves = seeds[: len(seeds) // 2], seeds[len(seeds) // 2 :]
+def fit_all(of: list[list[Case | PlantedCase]], folder: Path) -> None:
+    """Trees of both conditions to a table beside the code: those by a pixel itself from the upper
+    halves of all images, those that ask its surroundings from the lower ones. To another the range
+    of the evidence."""
     sums: list[DecisionTrees] = []
-    for around, half in zip((False, True), halves):
-        for condition in CONDITIONS:
+    ranges = ["\t".join(("figure", "diachronic", "low", "high"))]
+    for around in (False, True):
+        for diachronic, cases_of in enumerate(of):
             with ProcessPoolExecutor(JOBS) as pool:
-                of = samples(cases(half, condition, fitted=True), folder, around, pool)
-                sums.append(fit([s for _, s in of]))
+                found = [s for _, s in samples(cases_of, folder, around, pool)]
+            sums.append(fit([half(s, not around) for s in found]))
+            if not around:
+                ranges += range_of(found, diachronic)
         DecisionTrees.save(TREES, sums)
         trees.cache_clear()
+    LEARNED.write_text("\n".join(ranges) + "\n", encoding="utf-8")
+    learned.cache_clear()
+
+
+def half(of: Sample, upper: bool) -> Sample:
+    """The pixels of one half of a window."""
+    chosen = of.upper == upper
+    marked = (of.changed, of.texture, of.rare, of.upper)
+    return Sample(of.evidence[:, chosen], *(pixels[chosen] for pixels in marked), of.agreed)
+
+
+def range_of(of: list[Sample], diachronic: int) -> list[str]:
+    """Lines of the table of what has been learned."""
+    values = np.concatenate([s.evidence[:, ::RANGE_EVERY] for s in of], axis=1)
+    low, high = np.nanquantile(values, [BEYOND, 1.0 - BEYOND], axis=1)
+    return [
+        f"{name}\t{diachronic}\t{a:.6g}\t{b:.6g}" for name, a, b in zip(Evidence._fields, low, high)
+    ]
 
 
 def report(of: list[Case], folder: Path) -> None:

@@ -66,6 +66,7 @@ OFF_PX = 1.0  # labels that matching contradicts by more, or within so many px,
 BESIDE_PX = 3  # count for nothing
 # Small things first, while there is room for them.
 ORDER = "cars", "felled", "grown", "raised", "demolished", "built"
+NEAR_PX = 20  # what has changed or has lost its label there is of the kind that is nearest
 HIDDEN = Status.HIDDEN_IN_LEFT, Status.HIDDEN_IN_RIGHT
 
 
@@ -301,11 +302,13 @@ def _write(file: Path, target: Path, draw: list[int]) -> None:
 
 
 class Truth(NamedTuple):
-    """Pixels [h, w] of a window that have ``changed`` (or are hidden by what has), by their
-    ``kind``, 0 where that is unknown; and those that are the ``same``."""
+    """Labelled pixels [h, w] of a window that have ``changed`` (or are hidden by what has) and
+    those that are the ``same``; those that had a label before something was planted beside them
+    and have none now (``unlabelled``); the ``kind`` of what has changed there, 0 for none."""
 
     changed: Bools
     same: Bools
+    unlabelled: Bools
     kind: NDArray[np.uint8]
 
 
@@ -343,9 +346,13 @@ class Planted(NamedTuple):
             changed = labelled & ((kind > 0) | known & (off > ALTERED_M)
                                   | np.isin(before.status, HIDDEN))  # fmt: skip
             same = labelled & known & (off < SAME_M) & ~changed
+        unlabelled = known & ~labelled & (before.surface_class != WATER_CLASS)
+        far, nearest = distance_transform_edt(kind == 0, return_indices=True)
+        kind = np.where(far <= NEAR_PX, kind[tuple(nearest)], 0).astype(np.uint8)
+        unlabelled &= kind > 0
         same &= ~contradicted_by_matching(window, after.labels.disparity)
         equal = window.of_equal_noise(scene.inputs(scene.stores(folder, 0)).noise)
-        return cls(equal, after, labelled, Truth(changed, same, kind))
+        return cls(equal, after, labelled, Truth(changed, same, unlabelled, kind))
 
 
 def _by_lidar(inputs: SceneInputs) -> tuple[PairWindow, WindowLabels]:
@@ -406,8 +413,10 @@ def main() -> None:
             planted = Planted.of(scene, given.folder, draw)
             lost = lost_of(planted, scene.diachronic)
             for number in range(1, len(KINDS) + 1):
-                chosen = planted.truth.changed & (planted.truth.kind == number)
-                counts[number - 1] += (lost & chosen).sum(), chosen.sum()
+                chosen = planted.truth.kind == number
+                left_out = (lost & planted.truth.changed) | planted.truth.unlabelled
+                every = planted.truth.changed | planted.truth.unlabelled
+                counts[number - 1] += (left_out & chosen).sum(), (every & chosen).sum()
             counts[-1] += (lost & planted.truth.same).sum(), planted.truth.same.sum()
             plain = Planted.of(scene, given.folder, 0)
             same = planted.truth.same & plain.labelled
