@@ -35,8 +35,7 @@ UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
 # change more than all else.
 CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.4, 0.15, 0.03
-LEAST_SIGNAL = 0.2  # share of the detail's variance, with less of which noise leaves nothing to
-UNKNOWN = 0.05  # tell by, and the probability is the share that has changed
+UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 TREES = Path(__file__).with_suffix(".tsv")
 LEARNED = Path(__file__).with_name("change_evidence_learned.tsv")
 
@@ -85,7 +84,7 @@ def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
     return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
 
 
-def _as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
+def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
     """The probability [n], nearer to UNKNOWN the more figures lie ``beyond`` what has been learned:
     the difference of the log odds is divided by one more than these."""
     odds, unknown = (
@@ -112,13 +111,10 @@ def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     others = with_surroundings(out, doubtful, compared)
     told = np.stack(evidence)
     found = probability_by(trees(diachronic)[1], np.concatenate([told, others]))
-    out[doubtful] = _as_learned(found, beyond_learned(told, diachronic))
+    out[doubtful] = as_learned(found, beyond_learned(told, diachronic))
     return out
 
 
 def probability_by(fitted: DecisionTrees, features: Singles) -> Floats:
-    """By trees that sum up to log odds, of the ``features`` [k, n], evidence first; UNKNOWN where
-    noise leaves nothing to tell by."""
-    odds = fitted.sum_at(features).astype(np.float64)
-    signal = features[Evidence._fields.index("signal")]
-    return np.where(signal >= LEAST_SIGNAL, 1.0 / (1.0 + np.exp(-odds)), UNKNOWN)
+    """By trees that sum up to log odds, of the ``features`` [k, n], evidence first."""
+    return 1.0 / (1.0 + np.exp(-fitted.sum_at(features).astype(np.float64)))
