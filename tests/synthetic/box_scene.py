@@ -94,7 +94,8 @@ def image_of(surface: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.round(pattern(east + 3.0 * height, north - 2.0 * height)).astype(np.uint16)
 
 
-def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray) -> Path:
+def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray, **delivery: object) -> Path:
+    """``delivery``: attributes, of what it says."""
     with atomic_store(path) as scratch:
         layer = Layer("uint16", 0, {"units": "1", "long_name": "image"})
         array = create_grid(
@@ -103,7 +104,11 @@ def write_image(path: Path, model: EpipolarModel, pixels: np.ndarray) -> Path:
             {"image": layer},
             chunk=256,
             shard=1024,
-            attrs={"epipolar": model.to_dict(), "provenance": {"made": path.name}},
+            attrs={
+                "epipolar": model.to_dict(),
+                "provenance": {"made": path.name},
+                **delivery,
+            },
         )["image"]
         array[:] = pixels
     return path

@@ -440,25 +440,3 @@ def test_scenes_of_images_that_are_no_pair_are_refused(tmp_path, cells, words):
     with pytest.raises(InputError) as caught:
         sheets.read_scenes(write(tmp_path / "s.tsv", scenes_text(row)), cities, images)
     assert all(w in str(caught.value) for w in (*words, "line 2: scene 'Qichun-1'", "s.tsv"))
-
-
-@pytest.mark.parametrize(
-    "first, second, cell, expected",
-    [
-        ("2020-01-01", "2020-03-01", "", "true"),
-        ("2020-01-01", "2020-01-20", "", ""),
-        ("2020-01-01T03:00:00Z", "2020-03-01", "false", "false"),
-        ("", "2020-03-01", "", ""),
-        ("", "", "true", "true"),
-    ],
-)
-def test_images_more_than_a_month_apart_share_no_light(
-    first: str, second: str, cell: str, expected: str
-) -> None:
-    images = {
-        name: sheets.Image(image=name, city="A", file=f"{name}.tif", acquired=acquired)
-        for name, acquired in (("l", first), ("r", second))
-    }
-    cells = dict.fromkeys(("left_mask", "right_mask"), "") | {"city": "A", "diachronic": cell}
-    row = cells | {"left_image": "l", "right_image": "r"}
-    assert sheets.with_images(row, images, "line 2", Path("s.tsv"))["diachronic"] == expected

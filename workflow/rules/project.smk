@@ -8,6 +8,7 @@ rule project:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}.zarr"),
@@ -25,7 +26,8 @@ rule project:
     params:
         script=content_of("../scripts/project.py"),
         view="left",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
@@ -40,6 +42,7 @@ use rule project as project_right with:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_right_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}_right.zarr"),
@@ -50,7 +53,8 @@ use rule project as project_right with:
     params:
         script=content_of("../scripts/project.py"),
         view="right",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
@@ -63,6 +67,7 @@ rule project_strip:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
     output:
         done=temp("results/project/{city}/strips/{scene}{side}_{strip}.json"),
     log:
@@ -79,7 +84,8 @@ rule project_strip:
         script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
-        settings=lambda w: PROJECTION | diachronic_of(w.scene),
+        settings=PROJECTION,
+        light=lambda w: light_of(w.scene),
         code=source_digest("disparity.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"

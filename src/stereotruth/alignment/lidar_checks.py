@@ -35,6 +35,7 @@ CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tel
 AROUND = 12  # points around a control point that are looked at, or all
 WIDEST_M = 5.0  # within this, or none
 FEWEST_GCPS = 3
+MODEL_MARGIN_M, MODEL_MARGIN = 10.0, 0.1  # m, and share of the LiDAR's span: what rises above it
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,23 @@ def control_points_of(alignment: Alignment) -> list[GcpResidual]:
     """The control points that either view uses, by their ids."""
     used = {g.id: g for fit in alignment.fits for g in fit.gcps if g.used}
     return [used[name] for name in sorted(used)]
+
+
+def heights_of_model(
+    stores: Sequence[PointStore], sensors: Sequence[SensorModel]
+) -> tuple[float, float] | None:
+    """Over which heights (ellipsoidal m) an epipolar model serves: the LiDAR's, and a margin.
+
+    None where all of the LiDAR is outside the RPCs' heights; a stray point that is has no say.
+    """
+    low = min(int(store.cell_heights.min()) for store in stores) / PER_M
+    high = max(int(store.cell_heights.max()) for store in stores) / PER_M
+    margin = MODEL_MARGIN_M + MODEL_MARGIN * (high - low)
+    for sensor in sensors:
+        lowest, highest = sensor.rpc.ground_box[4:]
+        spare = (highest - lowest) / 4
+        low, high = max(low, lowest - spare), min(high, highest + spare)
+    return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
 def _heights_around(

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.rpc import RPC
+from ..epipolar.rpc import RPC, SensorModel
 from ..errors import InputError
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from .align import LARGE_SHIFT
 from .aligned_pair import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
 from .image_doubts import HEAVY, image_doubts
+from .plan_frame import plan_slopes
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -65,21 +67,27 @@ def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int
     )
 
 
+def _px_per_m(rpc: RPC, size: tuple[int, int], height: float) -> Floats:
+    """By how much the middle of an image moves for a metre to the east, to the north [2, 2] px."""
+    lon, lat = rpc.localize((size[0] - 1) / 2, (size[1] - 1) / 2, height)
+    return plan_slopes(SensorModel(rpc), float(lon), float(lat), height)
+
+
 def _images(
-    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment]
+    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment], epoch: Epoch
 ) -> dict[str, ImageToFit]:
     """All images by name, with the control points that any pair's file has of them."""
-    starts: dict[str, tuple[ViewFit, RPC]] = {}
+    starts: dict[str, tuple[ViewFit, RPC, float]] = {}
     rows: dict[str, dict[tuple[Any, ...], None]] = {}
     for pair in pairs:
         alignment = alignments[pair.scene]
         for name, fit, sensor in zip(pair.names, alignment.fits, (alignment.left, alignment.right)):
-            starts.setdefault(name, (rpc_alone(fit), sensor.rpc))
+            starts.setdefault(name, (rpc_alone(fit), sensor.rpc, alignment.reference_height))
             rows.setdefault(name, {})
         if pair.gcps is None:
             continue
         try:
-            points = read_gcps(pair.gcps, pair.scene, pair.names)
+            points = read_gcps(pair.gcps, pair.scene, pair.names, epoch)
         except NoPoints:
             continue
         for name, at in zip(pair.names, (points.left, points.right)):
@@ -87,8 +95,10 @@ def _images(
                 ground = float(points.lon[k]), float(points.lat[k]), float(points.height[k])
                 rows[name][(points.ids[k], *ground, *at[k].tolist())] = None
     return {
-        name: ImageToFit(name, fit, _points(rows[name], rpc, fit.size))
-        for name, (fit, rpc) in starts.items()
+        name: ImageToFit(
+            name, fit, _points(rows[name], rpc, fit.size), _px_per_m(rpc, fit.size, height)
+        )
+        for name, (fit, rpc, height) in starts.items()
     }
 
 
@@ -130,6 +140,7 @@ def adjust_site(
     *,
     fixed: Mapping[str, str | Path] | None = None,
     strict: bool = False,
+    epoch: Epoch = DEFAULT_EPOCH,
     provenance: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Adjust the images of a city's pairs that share images; JSON-ready figures and corrections.
@@ -142,7 +153,7 @@ def adjust_site(
     """
     scenes = sorted(scenes, key=lambda pair: pair.scene)
     alignments = {pair.scene: Alignment.load(pair.alignment) for pair in scenes}
-    images = _images(scenes, alignments)
+    images = _images(scenes, alignments, epoch)
     pairs = [
         PairToFit(pair.scene, pair.left, pair.right, *read_equations(pair.equations))
         for pair in scenes

@@ -24,7 +24,8 @@ from ..numerics.robust import huber_weights, robust_sigma, tukey_weights
 from .adjustment import Estimate, Sums, estimate
 from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
 from .aligned_pair import ViewFit
-from .equations import Equations, PairEquations
+from .equations import Equations, PairEquations, PlanObservation
+from .plan_frame import PlanFrame, with_offsets
 from .robust_fit import BLUNDER_FLOOR
 
 Bools = NDArray[np.bool_]
@@ -56,11 +57,13 @@ class PointsOfImage:
 
 @dataclass(frozen=True, eq=False)
 class ImageToFit:
-    """An image: its fit by the RPC alone in coordinates of the image, and its control points."""
+    """An image: its fit by the RPC alone in coordinates of the image, its control points, and
+    ``px_per_m`` [2, 2] as of :func:`.plan_frame.plan_slopes` in its middle."""
 
     name: str
     start: ViewFit
     points: PointsOfImage
+    px_per_m: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,10 +249,15 @@ def fit_site(
         if step > FIRST_STEPS and np.abs(x - last).max() < SETTLED_PX:
             break
     x[free] = np.round(x[free], 8)  # so that the count of threads leaves no trace
-    covariance, formal = _covariances(
+    covariance, of_ties, formal = _covariances(
         normal, prior, points, point_weights / sigma**2, known, pair_weights / scatter**2,
         scatter, free, of_fixed,
     )  # fmt: skip
+    if fixed is None:  # else the place of all is that of the fixed images
+        frame = PlanFrame.of(*zip(*((im.start, im.px_per_m) for im in by_name.values())))
+        seen = _plan_observations(pairs, names)
+        x, covariance = with_offsets(x, frame.widened(covariance, of_ties), seen)
+        x = np.round(x, 8)
     residuals = points.residuals(x)
     one_out = _leave_one_out(points, residuals, point_weights / sigma**2, formal)
     own = points.index[:, 0] // 6
@@ -273,6 +281,19 @@ def fit_site(
         },
         scatter=scatter,
     )
+
+
+def _plan_observations(
+    pairs: Sequence[PairToFit], names: Sequence[str]
+) -> list[tuple[int, PlanObservation]]:
+    """What edges of roofs tell of each image (index, observation), by the surest of its pairs."""
+    best: dict[str, tuple[float, str, PlanObservation]] = {}
+    for pair in pairs:
+        for name, seen in zip((pair.left, pair.right), pair.ties.in_plan if pair.ties else ()):
+            rank = float(np.trace(seen.covariance)), pair.scene, seen
+            if name not in best or rank[:2] < best[name][:2]:
+                best[name] = rank
+    return [(names.index(name), best[name][2]) for name in sorted(best)]
 
 
 def _unknowns(names: Sequence[str], fixed: FixedImages | None) -> tuple[Bools, Floats, Floats]:
@@ -301,15 +322,18 @@ def _covariances(
     scatter: float,
     free: Bools,
     of_fixed: Floats,
-) -> tuple[Floats, Floats]:
-    """Covariance of all parameters under the errors that show, and the inverse normal matrix.
+) -> tuple[Floats, Floats, Floats]:
+    """Covariance of all parameters under the errors that show, its part by the tie points, and the
+    inverse normal matrix.
 
     The fixed images' errors carry over to the others.
     """
     spread = prior.copy()  # of the right side
     points.add_to(spread, np.zeros(len(spread)), point_information)
+    ties = np.zeros_like(spread)
     for pair, weight in zip(pairs, pair_weights):
-        spread[np.ix_(pair.index, pair.index)] += (weight * scatter) ** 2 * pair.spread
+        ties[np.ix_(pair.index, pair.index)] += (weight * scatter) ** 2 * pair.spread
+    spread += ties
     both = np.ix_(free, free)
     inverse = np.zeros_like(normal)
     inverse[both] = np.linalg.inv(normal[both])
@@ -319,7 +343,7 @@ def _covariances(
     covariance[np.ix_(free, ~free)] = carried @ of_fixed
     covariance[np.ix_(~free, free)] = (carried @ of_fixed).T
     covariance[np.ix_(~free, ~free)] = of_fixed
-    return (covariance + covariance.T) / 2.0, inverse
+    return (covariance + covariance.T) / 2.0, inverse @ ties @ inverse, inverse
 
 
 def _leave_one_out(

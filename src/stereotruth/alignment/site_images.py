@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import date, datetime
 from pathlib import Path
 
-from ..epipolar.acquisition import Acquisition, read_acquisition
+from ..epipolar.acquisition import Acquisition, by_sheet, read_acquisition
 from ..epipolar.site_pairs import SiteImage
-from ..epipolar.sun import sun_over
 from ..settings import acquisition_time
 from .gcp_checks import open_view
-
-NOON = time(12, tzinfo=UTC)  # of an image whose date alone is known
-DATES_APART = timedelta(days=1.5)  # between the sheet and the delivery: another time zone is less
 
 
 @dataclass(frozen=True)
@@ -43,18 +39,5 @@ def open_image(given: GivenImage) -> tuple[SiteImage, Acquisition]:
     rpc = sensor.rpc
     place = float(rpc.long_off), float(rpc.lat_off)
     delivery = read_acquisition(given.file, place)
-    taken, sun = delivery.time, delivery.sun
-    if isinstance(given.acquired, datetime):
-        taken, sun = given.acquired, sun_over(given.acquired, *place)
-        if delivery.time is not None and delivery.sun is not None and near(delivery.time, taken):
-            sun = delivery.sun
-    elif given.acquired is not None:
-        noon = datetime.combine(given.acquired, NOON)
-        if delivery.time is None or not near(delivery.time, noon):
-            taken, sun = noon, None
-    return SiteImage(given.name, sensor, size, taken, given.sun or sun), delivery
-
-
-def near(one: datetime, other: datetime) -> bool:
-    """Whether two times may be one, but for the time zone of a clock."""
-    return abs(one - other) <= DATES_APART
+    taken = by_sheet(delivery, given.acquired, given.sun, place)
+    return SiteImage(given.name, sensor, size, taken.time, taken.sun), delivery

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from time import monotonic
 
 from ..configuration import Configuration
 from ..dataset.windows import cell_step
+from ..epochs import epoch_of_city
 from ..errors import InputError
+from ..lidar.frames import Epoch
 from ..project import (
     adjusted_scenes,
     check_fixed,
@@ -20,14 +23,15 @@ from ..project import (
     sheet,
 )
 from ..sheets import Scene
-from .check_scene import SceneFacts, check_scene
+from ..simulate.city_files import city_of, file_of
+from .check_scene import Looked, SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
 from .run_workflow import duration
-from .site import check_images
+from .site import check_images, check_links, scene_pairs
 
-MANY = 10  # scenes whose check takes more than a moment
-SCENE_SECONDS = 2.5  # of one core: images of 100 MB, control points, headers of the LiDAR
+TIMED = 3  # scenes by which the time of the others is known
+MOMENT_S = 10.0  # that needs no word
 
 
 def chosen(
@@ -58,7 +62,7 @@ def check_project(
 ) -> list[Findings]:
     """Findings of the sheets, of each scene, and of what the run will take, in this order.
 
-    ``tell`` is called before scenes are looked at, if that takes more than a moment.
+    ``tell`` is called after the first scenes, if all others take more than a moment.
     """
     project = Findings("project")
     settings = scenes = None
@@ -84,27 +88,63 @@ def check_project(
         project.say("sheets", Level.FACT, _counted(scenes))
     if scenes is None:
         return [project]
-    if len(scenes) > MANY:
-        tell(
-            f"looking at {len(scenes)} scenes, about {duration(SCENE_SECONDS * len(scenes))}; "
-            "stereotruth check SCENE … looks at some"
-        )
     in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
     adjusted = adjusted_scenes(settings, every_scene, in_sheet)
     every, facts = [project], []
-    for name, scene in scenes.items():
+    looked: Looked = {}
+    epochs: dict[str, Epoch] = {}
+    began = monotonic()
+    for k, (name, scene) in enumerate(scenes.items()):
+        if k == TIMED:
+            _tell_time(tell, (monotonic() - began) / TIMED, len(scenes) - TIMED)
         found = Findings(name)
         if is_synthetic(scene):
-            found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
+            _check_synthetic(scene, found)
         else:
             alone = name not in adjusted
-            facts.append(check_scene(scene, settings, found, in_sheet[name], alone=alone))
+            epoch = epochs.get(scene.city)
+            if epoch is None:
+                epoch = epochs[scene.city] = epoch_of_city(cities[scene.city], every_scene, images)
+            names = in_sheet[name]
+            facts.append(
+                check_scene(scene, settings, found, names, alone=alone, looked=looked, epoch=epoch)
+            )
         every.append(found)
     if settings.images:
         towns = sorted({scene.city for scene in scenes.values()})
-        every.insert(1, check_images(settings, images, scenes.values(), towns))
+        of_images = check_images(settings, images, scenes.values(), towns)
+        for town in towns:
+            check_links(town, images, scene_pairs(town, every_scene, images), of_images)
+        every.insert(1, of_images)
     every.append(_run(facts, settings))
     return every
+
+
+def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None:
+    """Say how long the scenes that are left take by those before, if it is more than a moment."""
+    if scene_s * left > MOMENT_S:
+        tell(
+            f"looking at {left} more scenes, about {duration(scene_s * left)}; "
+            "stereotruth check SCENE … looks at some"
+        )
+
+
+def _check_synthetic(scene: Scene, found: Findings) -> None:
+    """What a run makes needs nothing but the files of the place that a city is the twin of."""
+    with found.of("input"):
+        city = city_of(scene.city)
+        words = "images, LiDAR and truth are made by the run"
+        if city.twin is None:
+            found.say("input", Level.FACT, f"synthetic: {words}")
+            return
+        for file in city.twin.files:
+            if not Path(file).is_file():
+                raise InputError(
+                    "there is no such file, of which the city is the twin",
+                    file=file,
+                    remedy=f"put it back, or correct its path in {file_of(city.name)}",
+                )
+        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
 
 
 def _run(facts: Sequence[SceneFacts], settings: Configuration) -> Findings:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -18,24 +19,28 @@ from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..alignment.pair_ground import footprint_of
 from ..configuration import Configuration
-from ..disparity.overlap_check import FAR, Box, apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
-from ..epipolar.image_reader import MAX_PIXELS, Source
+from ..epipolar.image_reader import MAX_PIXELS, Source, bands_of
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.footprint import Footprint
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
+from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
 from ..project import is_synthetic, lidar_of
 from ..sheets import Scene
 from .check_lidar import check_lidar
+from .check_strips import check_strips
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
-from .findings import Findings, Level
+from .findings import Finding, Findings, Level
 
 STRIP_ROWS = 256
 WHOLE_BYTES = 100_000_000  # of a compressed image that is read in full: some seconds
 WHOLE_PIXELS = 200_000_000  # likewise: of one that is compressed well, or has no blocks at all
 PLACES = 8  # along each side of a larger one that are looked at
+
+Looked = dict[tuple[str, str], Findings]  # of images, by file and bands
 
 log = logging.getLogger("stereotruth")
 
@@ -58,18 +63,22 @@ def check_scene(
     names: tuple[str, str] = ("", ""),
     *,
     alone: bool = True,
+    looked: Looked | None = None,
+    epoch: Epoch = DEFAULT_EPOCH,
 ) -> SceneFacts:
     """Add what is found of a scene to ``found``; what one part refuses keeps no other from it.
 
     ``names`` of its images in the images sheet, where they stand in it. ``alone``: the images are
     not adjusted with those of other scenes, which may have the control points that it lacks.
+    ``looked``: of images that scenes before it have, which are not read again. ``epoch``: of the
+    city's places.
     """
     facts = SceneFacts(scene.scene)
     files: dict[str, Path] = {}
     with found.of("files"):
         files = lidar_of(scene, settings)
-    images = _check_images(scene, found)
-    alignment, gcps = _check_alignment(scene, settings, images, names, alone, found)
+    images = _check_images(scene, settings, {} if looked is None else looked, found)
+    alignment, gcps = _check_alignment(scene, settings, images, names, alone, epoch, found)
     model = None
     if alignment is not None:
         with found.of("images"):
@@ -77,7 +86,10 @@ def check_scene(
             facts.pixels = int(np.prod(model.shape))
             check_frame(Nodes.of(model), settings, found)
     footprint = ground_of(scene, settings) if files and images else None
-    surveyed = check_lidar(list(files.values()), scene, found, footprint) if files else []
+    surveyed = []
+    if files:
+        surveyed = check_lidar(list(files.values()), scene, found, footprint, epoch)
+    check_strips(surveyed, scene, found)
     facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
         _hold_against_gcps(surveyed, gcps, found)
@@ -95,9 +107,11 @@ def ground_of(scene: Scene, settings: Configuration) -> Footprint | None:
     return footprint_of([(scene.left_image, scene.right_image)], margin_m)
 
 
-def _check_images(scene: Scene, found: Findings) -> bool:
+def _check_images(scene: Scene, settings: Configuration, looked: Looked, found: Findings) -> bool:
     """Whether both images and their RPCs can be used."""
     good = True
+    with found.of("images"):
+        bands = bands_of((scene.left_image, scene.right_image), settings.rectify)
     for view in ("left", "right"):
         image = Path(getattr(scene, f"{view}_image"))
         before, there = len(found), False
@@ -117,12 +131,24 @@ def _check_images(scene: Scene, found: Findings) -> bool:
         with found.of("images"):
             open_view(view, image, "")
         with found.of("images"):
-            _check_pixels(image)
+            found.extend(_looked_at(image, bands[view == "right"], looked, scene.scene))
         good &= not any(f.level is Level.ERROR for f in found[before:])
     return good
 
 
-def _check_pixels(image: Path) -> None:
+def _looked_at(
+    image: Path, bands: Mapping[str, Any], looked: Looked, scene: str
+) -> Iterator[Finding]:
+    """What is found of the pixels of an image by those of its ``bands`` that are taken."""
+    key = str(image), repr(bands)
+    if key not in looked:
+        looked[key] = Findings()
+        with looked[key].of("images"):
+            _check_pixels(image, bands)
+    yield from (replace(finding, scene=scene) for finding in looked[key])
+
+
+def _check_pixels(image: Path, bands: Mapping[str, Any]) -> None:
     """Raise InputError as rule rectify does; what would take long to read is left to it."""
     try:
         with open_raster(image) as dataset:
@@ -132,7 +158,7 @@ def _check_pixels(image: Path) -> None:
     small = image.stat().st_size <= WHOLE_BYTES and pixels <= WHOLE_PIXELS
     if not small and pixels <= MAX_PIXELS and sampled:
         return
-    with Source(image) as source:
+    with Source(image, **bands) as source:
         source.check_blocks(whole=small)
         _refuse_empty(source, whole=small)
 
@@ -156,7 +182,7 @@ def _refuse_empty(source: Source, *, whole: bool) -> None:
         log.warning("%s: nodata at all of %d places", source.path, PLACES**2)
         return
     raise InputError(
-        f"no pixel but nodata ({source.nodata:g})",
+        f"no pixel but nodata ({source.nodata})",
         file=source.path,
         remedy="check the image and its nodata value",
     )
@@ -185,13 +211,14 @@ def _check_alignment(
     images: bool,
     names: tuple[str, str],
     alone: bool,
+    epoch: Epoch,
     found: Findings,
 ) -> tuple[Alignment | None, ControlPoints | None]:
     """The alignment as rule align makes it, and the control points, if they can be read."""
     alignment = gcps = None
     if scene.gcps and Path(scene.gcps).is_file():
         with found.of("GCPs"), _or_of_others(alone, found):
-            gcps = read_gcps(scene.gcps, scene.scene, names)
+            gcps = read_gcps(scene.gcps, scene.scene, names, epoch)
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"), _or_of_others(alone, found):
@@ -205,6 +232,7 @@ def _check_alignment(
                 model=model,
                 scene=name,
                 strict=settings.strict,
+                epoch=epoch,
                 provenance={},
             )
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]

@@ -3,15 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .findings import Findings, Level
+from .findings import Finding, Findings, Level
 
 STYLES = {Level.FACT: "green", Level.DOUBT: "yellow", Level.ERROR: "bold red"}
+HEADINGS = ("project", "images", "run")  # of findings that are of no scene
 WIDTH = 160  # where the output is no terminal
+
+
+def said_once(every: Sequence[Findings]) -> list[tuple[str, list[Finding]]]:
+    """Headings of the table with their findings. A doubt or an error of several scenes, and a fact
+    of all, stands once, under their number and before the scenes; its ``scene`` names them unless
+    these are all."""
+    of: dict[Finding, list[str]] = {}
+    for findings in every:
+        for found in findings:
+            of.setdefault(replace(found, scene=""), []).append(findings.scene)
+    scenes = [findings.scene for findings in every if findings.scene not in HEADINGS]
+    together: dict[int, list[Finding]] = {}
+    shared = set()
+    for found, names in of.items():
+        if len(names) > max(len(scenes) - 1 if found.level is Level.FACT else 1, 1):
+            shared.add(found)
+            named = replace(found, scene=", ".join(names) if len(names) < len(scenes) else "")
+            together.setdefault(len(names), []).append(named)
+    parts: list[tuple[str, list[Finding]]] = []
+    for findings in every:
+        if scenes and findings.scene == scenes[0]:
+            for count, found in sorted(together.items(), reverse=True):
+                parts.append((f"{'all ' * (count == len(scenes))}{count} scenes", found))
+        own = [found for found in findings if replace(found, scene="") not in shared]
+        parts.append((findings.scene, own))
+    return parts
 
 
 def show(every: Sequence[Findings], console: Console | None = None) -> bool:
@@ -23,15 +51,17 @@ def show(every: Sequence[Findings], console: Console | None = None) -> bool:
     for heading in ("scene", "about", "", "finding"):
         table.add_column(heading, overflow="fold", no_wrap=heading in ("scene", ""))
     counts = dict.fromkeys((Level.ERROR, Level.DOUBT, Level.FACT), 0)
-    for findings in every:
+    for scene, findings in said_once(every):
         for k, found in enumerate(findings):
             counts[found.level] += 1
             style = STYLES[found.level]
             text = escape(found.text)
             if found.remedy:
                 text += f"\n[dim]Remedy:[/dim] {escape(found.remedy)}"
+            if "," in found.scene:
+                text += f"\n[dim]Scenes:[/dim] {escape(found.scene)}"
             mark = f"[{style}]{found.level.value}[/{style}]"
-            table.add_row(escape(found.scene) if k == 0 else "", found.about, mark, text)
+            table.add_row(escape(scene) if k == 0 else "", found.about, mark, text)
     console.print(table)
     failed = any(findings.failed for findings in every)
     verdict = "a run would fail" if failed else "a run can begin"

@@ -11,21 +11,22 @@ from pathlib import Path
 
 from .. import sheets
 from ..configuration import Configuration
+from ..epipolar.linked_images import Links, Names, new_links
+from ..epipolar.pair_light import DIACHRONIC_DAYS
 from ..epipolar.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
 from ..epipolar.site_pairs import SitePair
 from ..errors import InputError
 from ..lidar.point_store import PointStore
 from ..lidar.roughness import roughness_m
 from ..project import configured, names_in_pair, read_images, sheet
-from ..sheets import DIACHRONIC_DAYS
 from .add_scene import append_row
-from .site import images_of
+from .site import images_of, scene_pairs
 
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
-Names = tuple[str, str]  # of a pair's left and right image
 INGESTED = Path("results/ingest")
-OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
+# What a pair takes from its city's other rows.
+OF_CITY = ("lidar", "lidar_crs", "lidar_epoch", "geoid", "gcps")
 
 
 @dataclass(frozen=True)
@@ -58,31 +59,42 @@ class Choice:
     def of(self, pairs: Sequence[RatedPair]) -> list[RatedPair]:
         """The chosen of pairs that are listed best first, in that order.
 
-        First those that join all images, since images that no pair joins are not adjusted together
-        (a spanning forest, Kruskal 1956); then the best. If ``most`` are too few to join all, the
-        best alone.
+        First those that link all images, since images that no pair links are not adjusted together;
+        then the best. Where ``most`` are too few to link all, they link as many as they can.
         """
         allowed = [rated for rated in pairs if self.allows(rated.pair)]
         names = [(rated.pair.left, rated.pair.right) for rated in allowed]
-        used: Counter[str] = Counter()
-        joining = self._joining(names, used)
         most = len(names) if self.most is None else self.most
-        if len(joining) > most:
-            joining = set()
+        used: Counter[str] = Counter()
+        chosen = self._linking(names, used)
+        if len(chosen) > most:
             used.clear()
-        chosen = joining | self._others(names, joining, used, most - len(joining))
+            chosen = self._growing(names, used, most)
+        chosen |= self._others(names, chosen, used, most - len(chosen))
         return [rated for rated, pair in zip(allowed, names) if pair in chosen]
 
-    def _joining(self, pairs: Sequence[Names], used: Counter[str]) -> set[Names]:
-        """The best pairs that join images which those before them have not joined; ``used``: pairs
-        of each image, which are counted on."""
-        group = {name: name for pair in pairs for name in pair}
+    def _linking(self, pairs: Sequence[Names], used: Counter[str]) -> set[Names]:
+        """The best pairs that link all images which a pair is allowed of; ``used``: pairs of each
+        image, which are counted on."""
         chosen: set[Names] = set()
         for pair in pairs:
-            one, other = (group[name] for name in pair)
-            if one != other and self._take(pair, used):
+            if new_links([pair], chosen) and self._take(pair, used):
                 chosen.add(pair)
-                group = {name: one if of == other else of for name, of in group.items()}
+        return chosen
+
+    def _growing(self, pairs: Sequence[Names], used: Counter[str], most: int) -> set[Names]:
+        """The best pair, and ``most`` − 1 more, each the best of those that link one image more to
+        the images before (Prim 1957); where none does, the best of two others."""
+        chosen: set[Names] = set()
+        linked: set[str] = set()
+        while len(chosen) < most:
+            more = [pair for pair in pairs if (pair[0] in linked) != (pair[1] in linked)]
+            others = [pair for pair in pairs if linked.isdisjoint(pair)]
+            taken = next((pair for pair in (*more, *others) if self._take(pair, used)), None)
+            if taken is None:
+                break
+            chosen.add(taken)
+            linked.update(taken)
         return chosen
 
     def _others(
@@ -219,15 +231,40 @@ def list_pairs(
     given: dict[str, str],
     configfiles: Sequence[Path] | None = None,
 ) -> tuple[list[RatedPair], list[str]]:
-    """All pairs of a site, best first; and in words how rough the site is, and what was written:
-    nothing if ``choice`` is None."""
+    """All pairs of a site, best first; and in words how rough the site is, what was written
+    (nothing if ``choice`` is None), and which images the scenes leave unused or without a link."""
     settings, _ = configured(configfiles)
     roughness = roughness_of(city, settings)
     rated = rated_pairs(city, settings, roughness)
     lines = [_in_words(city, roughness)]
     if choice is not None:
         lines += write_pairs(city, choice, rated, settings, given)
-    return rated, lines
+    return rated, lines + _unlinked(city, rated, settings)
+
+
+def _unlinked(city: str, rated: Sequence[RatedPair], settings: Configuration) -> list[str]:
+    """What the scenes of a site leave unused or without a link, and the best pairs that would link
+    it; nothing if the site has no scenes."""
+    cities = sheets.read_cities(sheet(settings, "cities"))
+    images = read_images(settings, cities)
+    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images)
+    made = scene_pairs(city, scenes, images)
+    if not made:
+        return []
+    of_city = [name for name, image in images.items() if image.city == city]
+    lines = Links.of(of_city, made).sentences
+    if not lines:
+        return []
+    pairs = {(one.pair.left, one.pair.right): one for one in rated}
+    missing = [pairs[names] for names in new_links(pairs, made)]
+    told = "; ".join(
+        f"{one.pair.left} and {one.pair.right} ({100 * one.quality.matched:.0f} %, "
+        f"{one.pair.convergence:.0f}°)"
+        for one in missing
+    )
+    if missing:
+        lines.append(f"best pairs that would link them: {told}")
+    return lines
 
 
 def _in_words(city: str, roughness: float | None) -> str:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import filecmp
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 from ..alignment.control_points import images_measured
-from ..alignment.site_images import GivenImage, near, open_image
+from ..alignment.site_images import GivenImage, open_image
 from ..configuration import Configuration
-from ..epipolar.acquisition import Acquisition
-from ..epipolar.site_pairs import SiteImage, between_suns, pair_of
+from ..epipolar.acquisition import Acquisition, near
+from ..epipolar.linked_images import Links, Names
+from ..epipolar.site_pairs import SiteImage, pair_of
+from ..epipolar.sun import between_suns
 from ..errors import InputError
 from ..products.remote_files import bring_image, is_remote
-from ..project import sheet
+from ..project import names_in_pair, sheet
 from ..sheets import Image, Scene
 from .findings import Findings, Level
 
@@ -157,6 +159,31 @@ def _check_ground(
                 f"{city}",
                 "correct its city or its file, or remove the row",
             )
+
+
+def scene_pairs(city: str, scenes: Mapping[str, Scene], images: Mapping[str, Image]) -> list[Names]:
+    """The images of a city's scenes, of those that have both in the images sheet."""
+    of_city = (scene for scene in scenes.values() if scene.city == city)
+    return [names for scene in of_city if all(names := names_in_pair(scene, images))]
+
+
+def check_links(
+    city: str, images: Mapping[str, Image], pairs: Sequence[Names], found: Findings
+) -> None:
+    """Name the images of a site that its scenes leave unused, and groups that they do not link.
+
+    ``pairs``: names of the images of its scenes.
+    """
+    if not pairs:
+        return
+    of_city = [name for name, image in images.items() if image.city == city]
+    for text in Links.of(of_city, pairs).sentences:
+        found.say(
+            "pairs",
+            Level.DOUBT,
+            f"{city}: {text}",
+            f"stereotruth pairs {city} names what links them",
+        )
 
 
 def _refuse_copies(opened: list[OpenedImage], settings: Configuration) -> None:

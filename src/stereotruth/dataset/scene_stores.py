@@ -42,7 +42,8 @@ class SceneStores:
 
     ``doubts``: warnings of the alignment, a refinement that was refused among them.
     ``disparity``, ``status``, and these of the right view (``of_right``), as the tiles have them.
-    ``acquired``: days (ISO) of the left and right image, empty where they are not known.
+    ``acquired``: days (ISO) of the left and right image, empty where they are not known. ``light``:
+    whether the images share it, and what decided that (:mod:`..epipolar.pair_light`).
     """
 
     scene: str
@@ -65,7 +66,13 @@ class SceneStores:
     points_per_px: float | None
     points_per_m2: float | None
     lidar: Mapping[str, Any] | None
+    light: Mapping[str, Any] | None
     doubts: tuple[str, ...]
+
+    @property
+    def lidar_strips(self) -> Mapping[str, Any] | None:
+        """What the strips of its LiDAR are off; None of one strip."""
+        return (self.lidar or {}).get("strips")
 
 
 def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> SceneStores:
@@ -130,6 +137,7 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         points_per_px=disparity.attrs.get("points_per_px"),
         points_per_m2=disparity.attrs.get("points_per_m2"),
         lidar=disparity.attrs.get("lidar"),
+        light=disparity.attrs.get("light"),
         doubts=doubts,
     )
 

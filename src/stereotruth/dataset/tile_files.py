@@ -265,6 +265,8 @@ def write_tile(
         disparity=np.where(known, crop.stored, np.nan),
     )
     head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    if source.lidar and (frame := source.lidar.get("frame")):
+        head["ground_frame"] = frame
     save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
     sums["orientation"] = file_sha256(folder / files["orientation"])
 
@@ -296,6 +298,7 @@ def write_tile(
         "lon": f"{lon:.7f}",
         "lat": f"{lat:.7f}",
         **_lidar_days(source, window, known),
+        **_light(source),
         **check_cells(checks, cut.limits),
     }
     for value, meaning in cut.flags.items():
@@ -329,6 +332,14 @@ def _lidar_days(
             since_1970 = int(np.datetime64(taken, "D").astype(np.int64))
             found[cell] = since_1970 - int(days[days.size // 2])
     return found
+
+
+def _light(source: SceneStores) -> dict[str, str]:
+    """Whether the images share no light, and what decided that; empty where nothing says it."""
+    if source.light is None:
+        return {"diachronic": "", "diachronic_by": ""}
+    told = "yes" if source.light["diachronic"] else "no"
+    return {"diachronic": told, "diachronic_by": source.light["decided_by"]}
 
 
 def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:

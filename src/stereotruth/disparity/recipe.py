@@ -86,7 +86,7 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
         points.by_pixel,
         projection,
         scale.px_per_m,
-        edge_margin_px=settings.edge_margin_px,
+        edge_margin_px=scene.edge_margin_px,
         min_points=settings.min_points,
     )
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,19 @@ from numpy.typing import NDArray
 
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
+from ..alignment.strip_uncertainty import with_strips
+from ..epipolar.acquisition import Acquisition, by_sheet
 from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
+from ..epipolar.pair_light import PairLight, pair_light
+from ..epipolar.rpc import RPC
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_store import PointStore, open_stores
+from ..lidar.strip_offsets import StripOffsets
 from ..products.grids import require_complete
 from ..products.provenance import digest
+from ..settings import acquisition_time
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
@@ -32,6 +40,8 @@ from .right_view import Pair, seen_from
 from .settings import Settings
 from .status import Status
 
+log = logging.getLogger("stereotruth")
+
 DAYS = 256  # of the points of a scene that have a number: 8 bits
 
 
@@ -42,7 +52,9 @@ class SceneInputs:
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
     file whose corrections the images were rectified with; without it, it counts as exact.
-    ``surface``: the store with the surface of the points; the recipe paper needs none.
+    ``surface``: the store with the surface of the points; the recipe paper needs none. ``strips``:
+    the folder with what the strips of the points are off; without it, they count as exact.
+    ``light``: what has decided whether the images share it, None where the settings alone say it.
     """
 
     left_store: Path
@@ -52,6 +64,8 @@ class SceneInputs:
     view: str = "left"
     alignment: Path | None = None
     surface: Path | None = None
+    strips: Path | None = None
+    light: PairLight | None = None
 
     @classmethod
     def of(
@@ -63,13 +77,14 @@ class SceneInputs:
         view: str = "left",
         alignment: str | Path | None = None,
         surface: str | Path | None = None,
+        strips: str | Path | None = None,
     ) -> SceneInputs:
         """With absolute paths, since workers of a Dask cluster live in other folders, and the point
         stores in their order by name."""
         left, right = Path(left_store).absolute(), Path(right_store).absolute()
         points = tuple(sorted(Path(path).absolute() for path in point_stores))
-        aligned, ground = (None if p is None else Path(p).absolute() for p in (alignment, surface))
-        return cls(left, right, points, settings, view, aligned, ground)
+        more = (None if p is None else Path(p).absolute() for p in (alignment, surface, strips))
+        return cls(left, right, points, settings, view, *more)
 
     def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
         """The same with the surface of all its points, which is made in a ``folder`` by the pixel
@@ -81,6 +96,28 @@ class SceneInputs:
         model = EpipolarModel.from_dict(require_complete(self.left_store).attrs["epipolar"])
         make_surface(self.stores, out, cell=Rays.of(model).cell, workers=workers)
         return replace(self, surface=out)
+
+    def in_light(
+        self, diachronic: bool | None, cells: Mapping[str, tuple[str, float | None, float | None]]
+    ) -> SceneInputs:
+        """The same with ``settings.diachronic`` as :func:`.pair_light` decides it: by what the
+        scenes sheet says of ``diachronic``, and by date and sun of both images.
+
+        ``cells`` by view: acquired, sun_azimuth and sun_elevation of the images sheet (empty
+        and None where it has none), which go before the delivery.
+        """
+        stores = {"left": self.left_store, "right": self.right_store}
+        attrs = {view: require_complete(store).attrs for view, store in stores.items()}
+        model = EpipolarModel.from_dict(attrs["left"]["epipolar"])
+        taken = [
+            _taken(attrs[view], cells[view], getattr(model, view).rpc) for view in ("left", "right")
+        ]
+        light = pair_light(*taken, Rays.of(model).pixel_m, diachronic, self.settings.diachronic)
+        log.info(
+            "%s, by the %s", "two lights" if light.diachronic else "one light", light.decided_by
+        )
+        settings = replace(self.settings, diachronic=light.diachronic)
+        return replace(self, settings=settings, light=light)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}
@@ -96,13 +133,32 @@ class SceneInputs:
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
         if self.alignment is not None:
-            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
+        if self.lidar_strips is not None:
+            how = model, self.view, shared_px
+            uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
         images = (
             MaskedImage(group["image"], group["mask"]) if "mask" in group else group["image"]
             for group in (left, right)
         )
         return Pair(tuple(images), model, uncertainty)
+
+    @cached_property
+    def lidar_strips(self) -> StripOffsets | None:
+        """What the strips of the points are off; None if they count as exact."""
+        return None if self.strips is None else StripOffsets.read(self.strips)
+
+    @cached_property
+    def edge_margin_px(self) -> float:
+        """Distance of a pixel's centre from the edge of its surface below which it has no label:
+        that of the settings, or how far the strips of the points are off in plan; a pixel at most,
+        beyond which points of the pixels around tell no edge."""
+        plan_m = self.lidar_strips.most_in_plan_m if self.lidar_strips else 0.0
+        return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
 
     @property
     def has_masks(self) -> bool:
@@ -179,3 +235,18 @@ class SceneInputs:
         first = rows.start - margin, cols.start - margin
         shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
         return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)
+
+
+def _taken(
+    attrs: Mapping[str, Any], cells: tuple[str, float | None, float | None], rpc: RPC
+) -> Acquisition:
+    """When and by which sun a rectified image was taken, by its attributes (see
+    :func:`.rectify.rectify`) and the cells of the images sheet."""
+    time, sun = attrs.get("taken"), attrs.get("sun")
+    delivery = Acquisition(
+        datetime.fromisoformat(time) if time else None, tuple(sun) if sun else None
+    )
+    acquired, azimuth, elevation = cells
+    by_row = None if azimuth is None or elevation is None else (azimuth, elevation)
+    lon_lat = float(rpc.long_off), float(rpc.lat_off)
+    return by_sheet(delivery, acquisition_time(acquired) if acquired else None, by_row, lon_lat)

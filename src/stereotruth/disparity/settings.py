@@ -45,10 +45,10 @@ class Settings:
 
     diachronic: Flag = False
     """with `surface`: whether both images of a pair were taken under different suns or in different
-    seasons. Shadows and leaves change their brightness then where no height has changed, so that
-    the same evidence tells less of a change. Column `diachronic` of the scenes sheet says it of a
-    scene. The `uncertainty` of such labels has the probability of a change that the images do not
-    show"""
+    seasons, where neither the column `diachronic` of the scenes sheet nor dates and suns of the
+    images tell it. Shadows and leaves change their brightness then where no height has changed, so
+    that the same evidence tells less of a change. The `uncertainty` of such labels has the
+    probability of a change that the images do not show"""
 
     @property
     def on_surface(self) -> bool:

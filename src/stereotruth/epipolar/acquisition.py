@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, date, datetime, time, timedelta, timezone
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -34,6 +34,8 @@ WORDS = {  # tags of XML in lower case
     "zenith": ("solarzenith", "sunzenith"),
 }
 IMD_TIME = ("firstLineTime", "TLCTime", "earliestAcqTime")
+NOON = time(12, tzinfo=UTC)  # of an image whose date alone is known
+DATES_APART = timedelta(days=1.5)  # between the sheet and the delivery: another time zone is less
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,34 @@ def read_acquisition(image: str | Path, place: tuple[float, float]) -> Acquisiti
     if found.time is not None and found.sun is None:
         return Acquisition(found.time, sun_over(found.time, *place), found.source)
     return found
+
+
+def by_sheet(
+    delivery: Acquisition,
+    acquired: date | datetime | None,
+    sun: tuple[float, float] | None,
+    place: tuple[float, float],
+) -> Acquisition:
+    """The acquisition as the images sheet says it, and as the delivery does where it does not.
+
+    ``acquired`` and ``sun`` (azimuth, elevation, degrees) of the sheet; ``place``: longitude and
+    latitude, degrees, for the sun of a time. A date alone stands for noon and tells of no sun.
+    """
+    taken, told = delivery.time, delivery.sun
+    if isinstance(acquired, datetime):
+        taken, told = acquired, sun_over(acquired, *place)
+        if delivery.time is not None and delivery.sun is not None and near(delivery.time, taken):
+            told = delivery.sun
+    elif acquired is not None:
+        noon = datetime.combine(acquired, NOON)
+        if delivery.time is None or not near(delivery.time, noon):
+            taken, told = noon, None
+    return Acquisition(taken, sun or told, delivery.source)
+
+
+def near(one: datetime, other: datetime) -> bool:
+    """Whether two times may be one, but for the time zone of a clock."""
+    return abs(one - other) <= DATES_APART
 
 
 def _files_beside(image: Path) -> Iterator[Path]:

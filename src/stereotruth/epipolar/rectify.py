@@ -173,7 +173,7 @@ def rectify_image(
         raise InputError(
             "image has nothing but nodata where the two images overlap",
             file=source.path,
-            remedy=f"check the image (its nodata value is {source.nodata:g}) and its RPC",
+            remedy=f"check the image (its nodata value is {source.nodata}) and its RPC",
         )
     log.info("%s: %.1f %% of the grid has a value", what, 100.0 * valid / (shape[0] * shape[1]))
     bands = {}
@@ -192,13 +192,14 @@ def rectify_image(
 
 
 def _of_delivery(source: Source, sensor: SensorModel) -> dict[str, Any]:
-    """When an image was ``acquired`` (ISO day, UTC) and the ``sun`` (azimuth, elevation, degrees)
-    by its delivery; None: not told."""
+    """When an image was ``acquired`` (ISO day, UTC) and ``taken`` (ISO time, UTC), and the ``sun``
+    (azimuth, elevation, degrees), by its delivery; None: not told."""
     place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
     delivery = read_acquisition(source.path, place)
-    day = None if delivery.time is None else delivery.time.date().isoformat()
+    time = delivery.time
+    day, taken = (None, None) if time is None else (time.date().isoformat(), time.isoformat())
     sun = None if delivery.sun is None else [round(angle, 4) for angle in delivery.sun]
-    return {"acquired": day, "sun": sun}
+    return {"acquired": day, "taken": taken, "sun": sun}
 
 
 def rectify(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..numerics.degrees import DEGREE_M
 from .pair_geometry import ray_upwards, view_order
 from .rpc import SensorModel
-from .sun import toward_sun
+from .sun import between_suns, shadow_shift
 from .virtual_points import frame, inside
 
 Floats = NDArray[np.float64]
@@ -96,18 +96,6 @@ def angles_of(rays: tuple[Floats, Floats]) -> tuple[float, float, float]:
     cosine = float(bisector @ within / np.linalg.norm(within))
     asymmetry = math.acos(min(max(cosine, -1.0), 1.0))
     return tuple(map(math.degrees, (convergence, elevation, asymmetry)))
-
-
-def shadow_shift(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Way of a shadow's end between two suns (azimuth, elevation), in heights of what casts it."""
-    ends = [-direction[:2] / direction[2] for direction in (toward_sun(*one), toward_sun(*other))]
-    return float(np.linalg.norm(ends[0] - ends[1]))
-
-
-def between_suns(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Angle between the directions to two suns, degrees."""
-    cosine = float(toward_sun(*one) @ toward_sun(*other))
-    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 
 
 def pair_of(one: SiteImage, other: SiteImage, height: float) -> SitePair | None:

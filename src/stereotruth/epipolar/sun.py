@@ -49,3 +49,15 @@ def toward_sun(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     level = math.cos(elevation)
     return np.array([level * math.sin(azimuth), level * math.cos(azimuth), math.sin(elevation)])
+
+
+def shadow_shift(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Way of a shadow's end between two suns (azimuth, elevation), in heights of what casts it."""
+    ends = [-direction[:2] / direction[2] for direction in (toward_sun(*one), toward_sun(*other))]
+    return float(np.linalg.norm(ends[0] - ends[1]))
+
+
+def between_suns(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Angle between the directions to two suns, degrees."""
+    cosine = float(toward_sun(*one) @ toward_sun(*other))
+    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))

@@ -13,6 +13,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ..epipolar import site_pairs
+from ..epipolar.linked_images import Links
 from ..epipolar.pair_quality import rate
 from ..numerics.degrees import metres_per_degree
 from ..products.charts import Axis
@@ -114,8 +115,15 @@ def write_site_page(
         "qualities": gradient(DISPARITIES),
         "scenes": [pair.scene for pair in pairs if pair.scene],
         "images": images,
+        "unlinked": _unlinked(images, pairs),
     }
     write_page(out, TEMPLATE, values)
+
+
+def _unlinked(images: Sequence[SiteImage], pairs: Sequence[Pair]) -> list[str]:
+    """Images that no scene uses, and groups that none links."""
+    made = [(pair.left, pair.right) for pair in pairs if pair.scene]
+    return Links.of((image.name for image in images), made).sentences
 
 
 def _map(images: Sequence[SiteImage]) -> dict[str, Any]:

@@ -53,7 +53,8 @@ class Made:
         measured = measured + self.rng.normal(0, 0.25, measured.shape)
         zeros = np.zeros(len(where))
         ids = tuple(f"G{k}" for k in range(len(where)))
-        return ImageToFit(name, start, PointsOfImage(ids, zeros, zeros, zeros, measured, where))
+        seen = PointsOfImage(ids, zeros, zeros, zeros, measured, where)
+        return ImageToFit(name, start, seen, 2.0 * np.eye(2))
 
     def pair(self, left: str, right: str) -> PairToFit:
         """A pair with tie points of 0.03 px."""
@@ -66,7 +67,7 @@ class Made:
         observed = design @ truth + self.rng.normal(0, 1, (TIES, 2)) * own[:, None]
         site = (at // 125).astype(int) @ [8, 1]
         about = truth + self.rng.normal(0, 0.05, 12)
-        ties = PairEquations(Equations(design, observed, own, site, at), about, about, 200, 0.0)
+        ties = PairEquations(Equations(design, observed, own, site, at, at), about, about, 200, 0.0)
         return PairToFit(f"{left}-{right}", left, right, ties)
 
     def errors(self, fit: SiteFit, name: str) -> np.ndarray:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rasterio
 from rich.console import Console
 
+from stereotruth.command import check, check_scene
 from stereotruth.command.check import check_project
 from stereotruth.command.check_table import show
 from stereotruth.command.findings import Level
@@ -105,7 +107,7 @@ def test_files_without_permission_are_findings(folder, monkeypatch):
     assert any("scenes.tsv: no permission" in text for text in texts(Level.ERROR))
 
 
-def test_many_scenes_are_told_before(folder):
+def test_the_time_of_many_scenes_is_told_by_the_first(folder, monkeypatch):
     head, row = Path("scenes.tsv").read_text().splitlines()[:2]
     rows = [row.replace("Good-1", f"Good-{k}", 1) for k in range(1, 1201)]
     Path("scenes.tsv").write_text("\n".join([head, *rows]) + "\n")
@@ -115,9 +117,10 @@ def test_many_scenes_are_told_before(folder):
         said.append(text)
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(check, "monotonic", iter([100.0, 107.5]).__next__)  # 2.5 s each
     with pytest.raises(KeyboardInterrupt):
         check_project(tell=tell)
-    assert said[0].startswith("looking at 1200 scenes, about 50 min")
+    assert said[0].startswith("looking at 1197 more scenes, about 50 min")
 
 
 def test_one_fault_hides_no_other(folder):
@@ -154,6 +157,33 @@ def test_the_table_has_a_line_a_problem_with_its_remedy(folder, capsys):
     assert "no coordinate reference system" in out
     assert "Remedy: set lidar_crs" in out
     assert "1 error, " in out and "a run would fail" in out
+
+
+@pytest.mark.parametrize(("colour", "said"), [("auto", False), (None, True)])
+def test_one_band_is_named_only_where_it_is_taken(folder, colour, said):
+    """By default the mean of red, green and blue is matched."""
+    for view in ("left", "right"):
+        path = folder / f"{view}.tif"
+        with rasterio.open(path) as image:
+            pixels, profile, rpcs = image.read(1), image.profile, image.rpcs
+        with rasterio.open(path, "w", **profile | {"count": 3, "photometric": "rgb"}) as image:
+            image.write(np.stack([pixels] * 3))
+            image.rpcs = rpcs
+    write_settings(folder, rectify={"colour": colour})
+    assert texts(Level.ERROR) == []
+    assert [text.split(";")[1] for text in texts(Level.DOUBT)] == said * 2 * [
+        " band 1 (red) is used. Remedy: "
+    ]
+
+
+def test_images_of_several_scenes_are_read_once(folder, monkeypatch):
+    read: list[Path] = []
+    monkeypatch.setattr(check_scene, "_check_pixels", lambda image, bands: read.append(image))
+    head, row = (folder / "scenes.tsv").read_text().splitlines()
+    rows = (row.replace("Good-1", name, 1) for name in ("Good-1", "Good-2", "Good-3"))
+    (folder / "scenes.tsv").write_text("\n".join([head, *rows]) + "\n")
+    assert len([findings.scene for findings in check_project()]) == 5
+    assert sorted(path.name for path in read) == ["left.tif", "right.tif"]
 
 
 def test_input_errors_name_the_file():

@@ -11,6 +11,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from stereotruth.command import pairs as command
+from stereotruth.command.check import check_project
 from stereotruth.command.example_city import SITE
 from stereotruth.command.main import app
 from stereotruth.command.pairs import Choice, list_pairs, rated_pairs, table
@@ -79,7 +80,7 @@ def test_all_pairs_are_listed_best_first_whatever_the_order_of_the_sheet(rows):
 
 def test_chosen_pairs_become_rows_that_the_sheet_is_read_with(rows):
     rated, lines = list_pairs("Stack", Choice(most=2), LIDAR)
-    assert len(written()) == 2 and "2 of 6 pairs written" in lines[-1]
+    assert len(written()) == 2 and "2 of 6 pairs written" in lines[1]
     row = Path("s.tsv").read_text().splitlines()[1].split("\t")
     assert row[4:] == ["lidar", "", "", "gcps/all.csv"]
     assert all("-" in name and "_" not in name for name in (row[0],))
@@ -99,7 +100,7 @@ def test_points_that_scenes_have_ingested_enter_the_prediction(rows):
     write_las(Path("tall.las"), xyz=xyz)
     ingest(Path("tall.las"), Path(f"results/ingest/Stack/{scene}/tall.points"))
     again, lines = list_pairs("Stack", None, {})
-    assert "steps of" in lines[0] and len(lines) == 1
+    assert "steps of" in lines[0] and not any("written" in line for line in lines)
     names = [[(one.pair.left, one.pair.right) for one in listed] for listed in (rated, again)]
     assert names[0] == names[1]
     assert all(one.quality.matched < two.quality.matched for one, two in zip(again, rated))
@@ -157,11 +158,34 @@ def test_each_image_in_few_or_many(choice, taken):
 
 
 @pytest.mark.parametrize(
-    ("most", "taken"), [(2, ["AB", "AC"]), (3, ["AB", "AC", "CD"]), (4, ["AB", "AC", "BC", "CD"])]
+    ("listed", "most", "taken"),
+    [
+        ("AB AC BC CD", 2, "AB AC"),
+        ("AB AC BC CD", 3, "AB AC CD"),
+        ("AB AC BC CD", 4, "AB AC BC CD"),
+        # too few for all six: as many as they can link, and no islands
+        ("AB CD EF BC DE AC", 3, "AB CD BC"),
+        ("AB CD EF BC DE AC", 4, "AB CD BC DE"),
+        ("AB CD EF BC DE AC", 5, "AB CD EF BC DE"),
+        ("AB CD", 2, "AB CD"),  # no pair links them
+        ("AB CD", 1, "AB"),
+    ],
 )
-def test_chosen_pairs_join_all_images_where_they_are_enough(most, taken):
-    chosen = Choice(most=most).of(rated("AB", "AC", "BC", "CD"))
-    assert [one.pair.left + one.pair.right for one in chosen] == taken
+def test_chosen_pairs_link_as_many_images_as_they_can(listed, most, taken):
+    chosen = Choice(most=most).of(rated(*listed.split()))
+    assert [one.pair.left + one.pair.right for one in chosen] == taken.split()
+
+
+def test_images_without_a_link_are_named_with_the_pairs_that_would_link_them(rows):
+    best = rated_pairs("Stack", configured()[0])[0].pair
+    _, lines = list_pairs("Stack", Choice(most=1), LIDAR)
+    assert lines[-2].startswith("2 images in no pair: ")
+    assert not any(f" {name}" in lines[-2] for name in (best.left, best.right))
+    assert lines[-1].startswith("best pairs that would link them: ") and lines[-1].count("%") == 2
+    (links,) = [findings for findings in check_project() if findings.scene == "images"]
+    assert [f.text for f in links if f.about == "pairs"] == [f"Stack: {lines[-2]}"]
+    _, lines = list_pairs("Stack", Choice(most=3), {})
+    assert "Next: stereotruth check" in lines[-1]
 
 
 def test_the_table_has_a_line_a_pair(capsys):

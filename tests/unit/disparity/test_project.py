@@ -15,8 +15,10 @@ import stereotruth.disparity.recipe as module
 from stereotruth.alignment.label_uncertainty import label_covariance
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
+from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.recipe import label_window
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
@@ -32,6 +34,7 @@ from ...synthetic.box_scene import (
     alignment_of,
     dilated,
     hidden_truth,
+    image_of,
     project_with,
     seen,
     write_image,
@@ -417,6 +420,30 @@ def test_attributes_and_summary(plane) -> None:
         assert pixels[meaning] == int((status.values == value).sum())
     assert plane.summary["points"]["used"] == int(grid["point_count"].values.sum())
     json.dumps(dict(grid.attrs))
+
+
+@pytest.mark.parametrize(
+    ("left_cell", "diachronic", "by"),
+    [
+        ("", False, "configuration"),
+        ("2020-06-01T01:00:00Z", True, "suns"),
+        ("2019-06-01", True, "days"),
+    ],
+)
+def test_the_store_says_what_decided_on_its_light(
+    plane, tmp_path, left_cell, diachronic, by
+) -> None:
+    """The left image has no time but that of the sheet, the right one that of its delivery."""
+    images = [plane.images[0], tmp_path / "right.zarr"]
+    told = {"taken": "2020-06-01T04:00:00+00:00", "sun": [150.0, 75.0]}
+    write_image(images[1], plane.model, image_of(plane.surface), **told)
+    inputs = SceneInputs.of(*images, [plane.store], Settings(recipe="paper"))
+    cells = {"left": (left_cell, None, None), "right": ("", None, None)}
+    project_scene(inputs.in_light(None, cells), tmp_path / "out.zarr", code="test")
+    attrs = open_grid(tmp_path / "out.zarr").attrs
+    assert (attrs["light"]["diachronic"], attrs["light"]["decided_by"]) == (diachronic, by)
+    assert attrs["settings"]["diachronic"] == diachronic
+    assert inputs.in_light(not diachronic, cells).settings.diachronic != diachronic
 
 
 def test_uncertainty_is_the_standard_error_of_the_mean(noisy_box, monkeypatch) -> None:

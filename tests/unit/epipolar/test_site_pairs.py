@@ -7,10 +7,8 @@ from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.epipolar.site_pairs import (
     SiteImage,
     angles_of,
-    between_suns,
     pair_of,
     pairs_of_site,
-    shadow_shift,
 )
 from stereotruth.numerics.degrees import DEGREE_M
 from stereotruth.simulate.camera import rays
@@ -41,12 +39,6 @@ def test_angles_of_a_pair(one, other, angles):
 
 def test_one_direction_has_no_convergence():
     assert angles_of((ray(20, 80), ray(20, 80))) == pytest.approx((0, 70, 0))
-
-
-def test_suns():
-    assert between_suns((180, 40), (180, 60)) == pytest.approx(20)
-    # shadows of one height: 1 / tan 45° north, and as far west
-    assert shadow_shift((180, 45), (90, 45)) == pytest.approx(np.sqrt(2))
 
 
 @pytest.fixture(scope="module")

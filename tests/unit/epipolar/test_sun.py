@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from stereotruth.epipolar.sun import sun_over, toward_sun
+from stereotruth.epipolar.sun import between_suns, shadow_shift, sun_over, toward_sun
 from stereotruth.simulate.sites import sun_at
 
 
@@ -29,3 +29,9 @@ def test_time_zones_are_one_time():
     utc = datetime.fromisoformat("2020-10-25T03:12:45Z")
     here = datetime.fromisoformat("2020-10-25T11:12:45+08:00")
     assert sun_over(utc, 115.0, 30.0) == sun_over(here, 115.0, 30.0)
+
+
+def test_suns():
+    assert between_suns((180, 40), (180, 60)) == pytest.approx(20)
+    # shadows of one height: 1 / tan 45° north, and as far west
+    assert shadow_shift((180, 45), (90, 45)) == pytest.approx(np.sqrt(2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from stereotruth.report.site_page import Pair, SiteImage, write_site_page
@@ -34,10 +35,12 @@ FIGURES = {"count": 90, "rms": 0.015, "median": -0.001, "sigma_rms": 0.016,
 CLOSURE = {"site": {"labels": FIGURES}, "images": {"A": {"labels": FIGURES}, "C": {}}}
 
 
-def written(folder: Path, adjusted: dict, closure: dict, page: str | None) -> Path:
+def written(
+    folder: Path, adjusted: dict, closure: dict, page: str | None, images: list = IMAGES
+) -> Path:
     out = folder / "index.html"
     given = {"adjusted": adjusted, "closure": closure, "page": page, "index": None}
-    write_site_page("City", IMAGES, PAIRS, out, **given)
+    write_site_page("City", images, PAIRS, out, **given)
     return out
 
 
@@ -77,6 +80,13 @@ def test_sections_without_input_are_left_out(tmp_path):
     text = written(tmp_path, {}, {}, None).read_text()
     assert re.findall(r'<section id="(\w+)"', text) == ["map", "pairs"]
     assert "in the table alone: 1." in text
+
+
+def test_images_that_no_scene_uses_are_named(tmp_path):
+    assert 'class="alarm"' not in written(tmp_path, {}, {}, None).read_text()
+    images = [*IMAGES, replace(IMAGES[0], name="C")]
+    text = written(tmp_path, {}, {}, None, images).read_text()
+    assert "<li>1 image in no pair: C</li>" in text
 
 
 @needs_chromium
