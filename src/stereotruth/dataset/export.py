@@ -422,13 +422,13 @@ def _gates(
             remedy="better control points, images or LiDAR for what is named, another limit "
             "(null: none) in quality of the configuration, or strict: false to have it flagged",
         )
-    remarks = [
+    explained = [
         f"scene {scene}: {doubt}"
         for scene, of in in_doubt.items()
         for doubt in of
         if doubt.explained
     ]
-    for problem in problems + remarks:
+    for problem in problems + explained:
         log.warning("%s: %s", city, problem)
     return {
         "limits": asdict(limits),
