@@ -285,6 +285,33 @@ def test_each_kind_at_each_door_is_right_or_refused(door, kind, folder, tmp_path
     assert "Remedy: " in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Kind("classes", dtype="uint8"), ""),
+        (Kind("classes above EGM96", dtype="uint8", declared=f"EPSG:{EPSG}+5773"), ""),
+        (Kind("two bands", dtype="uint8", more={"bands": 2}), "2 bands of uint8 are no raster of"),
+        (Kind("complex", dtype="complex64"), "no raster of classes"),
+        (Kind("codes of another scheme", dtype="int16", unit=0.1), "which is no class of LAS"),
+        (Kind("degrees", dtype="uint8", crs=4326), "another grid"),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_each_kind_of_classes_is_right_or_refused(kind, words, tmp_path):
+    """Values of some 50 to 70, as producers' own classes may be."""
+    truth_file = write(tmp_path / "truth.tif", TOWN.heights())
+    file = write_kind(kind, tmp_path / "classes.tif", moved=False)
+    if not words:
+        reference = RasterReference(truth_file, classes=file)
+        found = reference.classes.window(slice(0, 9), slice(0, 9))
+        np.testing.assert_array_equal(found, np.rint(TOWN.heights()[:9, :9]))
+        return
+    with pytest.raises(InputError, match=words) as error:
+        reference = RasterReference(truth_file, classes=file)
+        reference.classes.window(slice(0, 350), slice(0, 350))
+    assert "classes.tif" in str(error.value) and "Remedy: " in str(error.value)
+
+
 # ------------------------------------------------------------------------------------------ geoids
 
 
