@@ -50,6 +50,7 @@ from .equations import Equations, spread_of
 from .lack_of_fit import SharedErrors, with_shared_errors
 from .lidar_checks import (
     HeightOffset,
+    contradiction,
     control_points_of,
     doubt_at_gcps,
     doubt_by_rpcs,
@@ -60,6 +61,7 @@ from .lidar_checks import (
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
+from .misfit_causes import LabelSigma, remark_of
 from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
@@ -141,8 +143,8 @@ def _chance(found: Estimate) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What tie points tell: the estimate, errors that it shares, lines, the refined alignment, and
-    :func:`agreement_of_halves`."""
+    """What tie points tell: the estimate, errors that it shares, lines, the refined alignment,
+    :func:`agreement_of_halves`, and what all of it means for labels."""
 
     observations: Observations
     estimate: Estimate
@@ -150,6 +152,7 @@ class _Found:
     lines: LineFit
     alignment: Alignment
     halves: tuple[float, float]
+    sigma: LabelSigma
 
 
 def _search(
@@ -213,13 +216,15 @@ def _search(
             break
         radius = FINEST if change < FINEST / 2 or radius == FINEST else FINE
     equations = replace(equations, observed=total - of_lines @ by_line)
-    found, shared = with_shared_errors(found, equations)
+    by_scatter = found.covariance
+    found, shared = with_shared_errors(found, equations, by_line=lines.stands_out)
     current = with_corrections(alignment, found.parameters, lines.corrections)
     observations = Observations(
         ties,
         np.stack(model.left_to_epipolar(*ties.left.T), axis=1),
         total,
         equations.observed - design @ found.parameters,
+        total - design @ found.parameters,
         found.weights > 0.0,
         of_images,
     )
@@ -227,7 +232,10 @@ def _search(
         return reason
     halves = agreement_of_halves(equations, prior)
     log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
-    return _Found(observations, found, shared, lines, current, halves)
+    sigma = LabelSigma.of(
+        design[:, 0], ties.left[:, 1], rows[0], (by_scatter, found.covariance), lines, shared
+    )
+    return _Found(observations, found, shared, lines, current, halves, sigma)
 
 
 def _placed(
@@ -270,7 +278,7 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
             f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
             + (", and the points' heights" if with_gcps else "")
         ]
-    if chdtrc(found.contradiction_freedom, found.contradiction) > DOUBTFUL:
+    if chdtrc(found.contradiction_freedom, contradiction(alignment, found)) > DOUBTFUL:
         return []
     others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
@@ -355,7 +363,7 @@ def refine(
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
-    record |= {"by_line": result.lines.figures(), "shared_by_near_sites": result.shared.figures()}
+    record |= _misfits(result, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
@@ -367,7 +375,9 @@ def refine(
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
-        observations = replace(observations, after=observations.before)
+        observations = replace(
+            observations, after=observations.before, by_affines=observations.before
+        )
         record["after"] = record["before"]
     doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
@@ -397,6 +407,16 @@ def refine(
     return refined, observations
 
 
+def _misfits(result: _Found, reason: str) -> dict[str, Any]:
+    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
+    return {
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+    }
+
+
 def _objection(result: _Found, with_gcps: bool) -> str:
     """Why a refinement is not applied, or an empty string."""
     before, after = result.halves
@@ -422,6 +442,8 @@ def _tell(record: Mapping[str, Any]) -> None:
             record["used"],
             *(pair[figure] for figure in ("median", "rms", "trend_rms") for pair in (a, b)),
         )
+    if remark := record["remark"]:
+        log.info("%s", remark)
     log.info(
         "refinement %s",
         f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "

@@ -176,6 +176,10 @@ def test_a_file_without_coordinate_system_is_refused(tmp_path):
     assert given.twin.half_m == pytest.approx((place.HALF_M, place.HALF_M), abs=0.5)
     with pytest.raises(InputError, match="is no coordinate system"):
         twin_city("None", file, crs="EPSG:1")
+    with pytest.raises(InputError, match="lies outside of what"):
+        twin_city("None", file, crs="EPSG:4326")
+    with pytest.raises(InputError, match=r"would be 4000 x 300 px.*as --size"):
+        twin_city("None", file, crs="EPSG:32631", size_px=(4000, 300))
     (tmp_path / "no.laz").write_text("no points")
     with pytest.raises(InputError, match="cannot be read as LAS"):
         twin_city("None", tmp_path / "no.laz")
