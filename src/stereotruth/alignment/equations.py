@@ -45,6 +45,21 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
+class PlanObservation:
+    """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
+
+    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
+    ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
+    east and to the north moves a place, and so the error that all images have in common.
+    """
+
+    design: Floats
+    observed: Floats
+    covariance: Floats
+    px_per_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class PairEquations:
     """What the tie points of a pair say of its images, whatever alignment they were found with.
 
@@ -52,7 +67,8 @@ class PairEquations:
     first.
     ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
     with which the tie points were matched. ``places``: where the images were compared, with and
-    without a match. ``common_px``: see :func:`.adjustment.estimate`.
+    without a match. ``common_px``: see :func:`.adjustment.estimate`. ``in_plan``: the
+    place of the left and of the right image in plan, if edges of roofs tell it.
     """
 
     equations: Equations
@@ -60,6 +76,7 @@ class PairEquations:
     linearised_at: Floats
     places: int
     common_px: float
+    in_plan: tuple[PlanObservation, ...] = ()
 
 
 def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 
 
 LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
+LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
 FAR_OFF = 4.0  # deviations that no point of the LiDAR around a control point may lie off it
 CHANCE = 1e-4  # probability that heights without a fault are doubted by the tie points
 CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tell about
@@ -76,7 +77,7 @@ def heights_of_model(
         lowest, highest = sensor.rpc.ground_box[4:]
         spare = (highest - lowest) / 4
         low, high = max(low, lowest - spare), min(high, highest + spare)
-    return (round(low - margin, 3), round(high + margin, 3)) if low < high else None
+    return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
 def _heights_around(
@@ -198,6 +199,33 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
     sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
     return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
+
+
+def contradiction(alignment: Alignment, found: Estimate) -> float:
+    """Chi-square of the tie points against what is known of the alignment and of the LiDAR in plan.
+
+    ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
+    moved = []
+    for east, north in ((step[0], 0.0), (0.0, step[1])):
+        ends = [
+            np.stack([
+                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
+                for sensor in (alignment.left, alignment.right)
+            ])
+            for sign in (-0.5, 0.5)
+        ]  # fmt: skip
+        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
+    plan = np.stack(moved, axis=1)
+    values, vectors = np.linalg.eigh(found.normal)
+    seen = values > 1e-9 * values.max()
+    alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
+    known = vectors[:, seen].T @ (np.eye(len(values)) + plan @ plan.T) @ vectors[:, seen]
+    return float(alone @ np.linalg.solve(known + np.diag(1.0 / values[seen]), alone))
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:

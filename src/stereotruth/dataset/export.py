@@ -327,8 +327,9 @@ def _write_tiles(
         rows = [row for row, _ in written]
         splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
         drawn.append(pool.submit(beside.draw, city, rows, windows, scratch, settings.nodata))
+        remarks = {source.scene: source.remark for source in windows.sources if source.remark}
         strips = {s.scene: of["sentence"] for s in windows.sources if (of := s.lidar_strips)}
-        gates = _gates(city, rows, scene_checks, strips, settings.quality, settings.strict)
+        gates = _gates(city, rows, scene_checks, remarks, strips, settings.quality, settings.strict)
         for source in windows.sources:
             gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             gates["scenes"][source.scene]["lidar"] = source.lidar
@@ -388,14 +389,15 @@ def _gates(
     city: str,
     rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
+    remarks: Mapping[str, str],
     strips: Mapping[str, str],
     limits: Limits,
     strict: bool,
 ) -> dict[str, Any]:
     """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
 
-    ``strips``: by scene, what is to be said of the strips of its LiDAR, or nothing. Logs each miss
-    and doubt, or ends a strict run.
+    ``remarks`` of alignments and ``strips``: by scene, what is to be said of the strips of its
+    LiDAR, or nothing. Logs each miss and doubt, or ends a strict run.
     """
     found, problems = {}, []
     in_doubt: dict[str, list[Doubt | StripDoubt]] = {}
@@ -411,7 +413,8 @@ def _gates(
         problems += [f"scene {scene}: {doubt}" for doubt in in_doubt[scene] if not doubt.explained]
     labelled = [row for row in rows if row["complete"] == "yes"]
     for row in labelled:
-        row["doubt"] = "; ".join(map(str, in_doubt[row["scene"]]))
+        told = [remarks[row["scene"]]] if row["scene"] in remarks else []
+        row["doubt"] = "; ".join([*map(str, in_doubt[row["scene"]]), *told])
         figures = {name: float(row[name]) for name in CHECK_COLUMNS if row[name] != ""}
         problems += [
             f"tile {row['tile']} of scene {row['scene']}: {miss}"
@@ -424,13 +427,14 @@ def _gates(
             remedy="better control points, images or LiDAR for what is named, another limit "
             "(null: none) in quality of the configuration, or strict: false to have it flagged",
         )
-    remarks = [
+    explained = [
         f"scene {scene}: {doubt}"
         for scene, of in in_doubt.items()
         for doubt in of
         if doubt.explained
     ]
-    for problem in problems + remarks:
+    explained += [f"scene {scene}: {remark}" for scene, remark in remarks.items()]
+    for problem in problems + explained:
         log.warning("%s: %s", city, problem)
     return {
         "limits": asdict(limits),
@@ -438,4 +442,4 @@ def _gates(
         "surfaces": {s: surface_figures(of.matches.biases) for s, of in scenes.items()},
         "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},
         "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
-    }
+    } | ({"alignment_remarks": dict(remarks)} if remarks else {})

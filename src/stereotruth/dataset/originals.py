@@ -43,7 +43,7 @@ MARGIN_PX = 16  # of the crops around what the tiles show
 HEIGHTS = {
     "height": LayerKind("float32", NODATA, "height above the WGS 84 ellipsoid in m"),
     "sigma": LayerKind("float32", NODATA, "standard uncertainty of the height in m"),
-    "status": LayerKind("uint8", 0, "0: no points, 1: measured, 2: undecided"),
+    "status": LayerKind("uint8", 0, "0: no points, 1: measured, 2: undecided, 3: crown"),
 }
 README = """Crops of the original images, with corrected RPCs
 
@@ -54,7 +54,7 @@ README = """Crops of the original images, with corrected RPCs
                                             asked for and the image has a name in the images sheet:
                                             height and its standard uncertainty (m, float32, nodata
                                             -9999), and why there is one (status, uint8: 0 no
-                                            points, 1 measured, 2 undecided)
+                                            points, 1 measured, 2 undecided, 3 crown)
 
 Pixel values are those of the original images. RPCs are RPC00B; LINE_OFF and SAMP_OFF count from the
 crop's upper-left pixel, whose centre is (0, 0). Ground is WGS 84 longitude and latitude in degrees

@@ -26,6 +26,7 @@ from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
 from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
+from ..surface.vertices import Vertices
 from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
     FacetValues,
@@ -124,45 +125,90 @@ class Crowns:
     tops: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class NearestTops:
+    """What the tops of rough surfaces show in an image, arrays [h, w] px of disparity.
+
+    ``index`` of the nearest gentle triangle of tops, -1 for none, and its ``disparity``, NaN;
+    ``before``: greatest of what else is known there, facets, steep triangles, strips; −∞;
+    ``highest``: greatest of both, NaN for nothing; ``tops``: that of all triangles of tops, −∞.
+    """
+
+    index: NDArray[np.int32]
+    disparity: Floats
+    before: Floats
+    highest: Floats
+    tops: Floats
+
+    @classmethod
+    def of(
+        cls, rough: RoughTops, xy: Floats, first: tuple[int, int], facets: Floats, strips: Floats
+    ) -> NearestTops:
+        """From the positions ``xy`` [4, vertices] of the surface, and the disparity of ``facets``
+        (NaN for none) and ``strips`` (−∞) at pixels from ``first`` on."""
+        shape = facets.shape
+        z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
+        raster_facets(xy, rough.corner[rough.is_gentle], first, z_buffer, index)
+        disparity = np.where(index >= 0, z_buffer, np.nan)
+        before = np.where(np.isnan(facets), -np.inf, facets)
+        steep, unused = rough.corner[~rough.is_gentle], np.empty(shape, np.int32)
+        raster_facets(xy, steep, first, before, unused)
+        tops = z_buffer.copy()
+        raster_facets(xy, steep, first, tops, unused)
+        before = np.maximum(before, strips)
+        highest = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
+        return cls(index, disparity, before, highest, tops)
+
+    def in_front(self) -> Bools:
+        """Where a gentle triangle is nearest, and nothing near it is much higher."""
+        with np.errstate(invalid="ignore"):
+            out = self.disparity > self.before - OCCLUSION_TOLERANCE_PX
+            return out & (_higher(self.highest, HIGHER_REACH) <= HIGHER_PX)
+
+    def values(self, chosen: Bools, facets: FacetValues, first: tuple[int, int]) -> PixelValues:
+        """What the triangles of the ``chosen`` pixels have there; ``facets``: their vertices."""
+        out = PixelValues.none(chosen.shape)
+        interpolate(facets, np.where(chosen, self.index, np.int32(-1)), first, out)
+        return out
+
+    def variance(self, chosen: Bools, rough: RoughTops, scale: PixelScale) -> Floats:
+        """Variance px² [h, w] of what the ``chosen`` pixels show, NaN elsewhere."""
+        out = np.full(chosen.shape, np.nan)
+        higher = _higher(self.highest, 1)[chosen]
+        out[chosen] = _variance(rough, self.index[chosen], higher, scale)
+        return out
+
+
+def vertices_of_tops(vertices: Vertices, rough: RoughTops, xy: Floats) -> FacetValues:
+    """The gentle triangles of tops with what their vertices are; the variance is none of theirs."""
+    corner = rough.corner[rough.is_gentle]
+    none = np.zeros(len(corner), np.float32)
+    of_vertices = vertices.h_q, vertices.surface_class, vertices.day, vertices.count
+    return FacetValues(xy, corner, *of_vertices, none, none)
+
+
 def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
     """The rough surfaces of a window, at pixels of which the facets leave open what they show."""
     surface, first = visible.projected.surface, visible.projected.first
-    shape = visible.visibility.shape
-    rough, tops, xy = surface.tops, surface.vertices, visible.projected.xy
-    corner = rough.corner[rough.is_gentle]
-    z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(xy, corner, first, z_buffer, index)
-    disparity = np.where(index >= 0, z_buffer, np.nan)
-    before = np.where(np.isnan(visible.disparity), -np.inf, visible.disparity)
-    steep, unused = rough.corner[~rough.is_gentle], np.empty(shape, np.int32)
-    raster_facets(xy, steep, first, before, unused)
-    tops_buffer = z_buffer.copy()
-    raster_facets(xy, steep, first, tops_buffer, unused)
-    before = np.maximum(before, visible.strips)
-    all_around = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
+    rough, xy = surface.tops, visible.projected.xy
+    nearest = NearestTops.of(rough, xy, first, visible.disparity, visible.strips)
+    disparity = nearest.disparity
     is_open = np.isin(visible.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
     # what facets show has labels already, as far as it is certain
     with np.errstate(invalid="ignore"):
-        labelled = is_open & (disparity > before - OCCLUSION_TOLERANCE_PX)
+        labelled = is_open & nearest.in_front()
         labelled &= ~(np.abs(disparity - visible.disparity) <= FACET_RESIDUAL_PX)
-        labelled &= _higher(all_around, HIGHER_REACH) <= HIGHER_PX
     spacing_rows = int(np.ceil(scale.spacing_px))
-    labelled &= _clearance(disparity, all_around, spacing_rows) >= CLEARANCE_PX
+    labelled &= _clearance(disparity, nearest.highest, spacing_rows) >= CLEARANCE_PX
     labelled &= ~_hidden_in_right(visible, rough, xy, labelled, disparity)
 
-    index[~labelled] = -1
-    values = PixelValues.none(shape)
-    none = np.zeros(len(corner), np.float32)
-    of_vertices = tops.h_q, tops.surface_class, tops.day, tops.count
-    facets = FacetValues(xy, corner, *of_vertices, none, none)
-    interpolate(facets, index, first, values)
-    variance = np.full(shape, np.nan)
-    higher = _higher(all_around, 1)[labelled]
-    variance[labelled] = _variance(rough, index[labelled], higher, scale)
+    facets = vertices_of_tops(surface.vertices, rough, xy)
+    values = nearest.values(labelled, facets, first)
+    variance = nearest.variance(labelled, rough, scale)
     labelled &= values.surface_class != WATER_CLASS
     labels = Labels(disparity, values.slope, variance)
     of_pixels = values.height * LATTICE_M, values.surface_class, values.day
-    return Crowns(labelled, labels, *of_pixels, tops_buffer)
+    return Crowns(labelled, labels, *of_pixels, nearest.tops)
 
 
 def without_contours(

@@ -15,7 +15,6 @@ from ..epipolar.virtual_points import frame, inside
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..lidar.lattice import cell_key
 from ..lidar.point_store import PointStore
-from ..lidar.strip_offsets import StripOffsets
 from ..numerics.hull import corners_of_hull
 from .scene_inputs import SceneInputs
 
@@ -57,7 +56,7 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
         "not_read_m2": _not_read(inputs),
         "acquired": _days([a["acquired"] for a in attrs]),
         "surfaces": _surfaces([a["crs"]["heights"] for a in attrs]),
-        "strips": None if inputs.strips is None else StripOffsets.read(inputs.strips).report(),
+        "strips": inputs.lidar_strips.report() if inputs.lidar_strips else None,
         "frame": _frame([a["crs"].get("frame") for a in attrs]),
     }
 

@@ -204,6 +204,7 @@ def _content(inputs: SceneInputs, code: str) -> str:
             "images": [_identity(left), _identity(right)],
             "epipolar": left["epipolar"],
             "uncertainty": inputs.pair.uncertainty.content,
+            "edge_margin_px": inputs.edge_margin_px,
             "parameters": parameters,
             "code": code,
         }
@@ -267,6 +268,8 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
+        if tasks and inputs.settings.on_surface:
+            _ = inputs.noise  # once, and not by each of the threads
         with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:

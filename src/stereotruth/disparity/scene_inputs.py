@@ -17,6 +17,7 @@ from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..alignment.strip_uncertainty import with_strips
 from ..epipolar.acquisition import Acquisition, by_sheet
+from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
 from ..epipolar.pair_light import PairLight, pair_light
 from ..epipolar.rpc import RPC
@@ -124,26 +125,40 @@ class SceneInputs:
     @cached_property
     def pair(self) -> Pair:
         """The images with their geometry; its left image is the one that gets labels."""
+        return seen_from(self.view, self._pair)
+
+    @cached_property
+    def _pair(self) -> Pair:
+        """The same, as the images are read."""
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
         if self.alignment is not None:
-            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
-        if self.strips is not None:
-            uncertainty = with_strips(uncertainty, StripOffsets.read(self.strips), model, self.view)
-        return seen_from(
-            self.view,
-            Pair(
-                tuple(
-                    MaskedImage(group["image"], group["mask"])
-                    if "mask" in group
-                    else group["image"]
-                    for group in (left, right)
-                ),
-                model,
-                uncertainty,
-            ),
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
+        if self.lidar_strips is not None:
+            how = model, self.view, shared_px
+            uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
+        images = (
+            MaskedImage(group["image"], group["mask"]) if "mask" in group else group["image"]
+            for group in (left, right)
         )
+        return Pair(tuple(images), model, uncertainty)
+
+    @cached_property
+    def lidar_strips(self) -> StripOffsets | None:
+        """What the strips of the points are off; None if they count as exact."""
+        return None if self.strips is None else StripOffsets.read(self.strips)
+
+    @cached_property
+    def edge_margin_px(self) -> float:
+        """Distance of a pixel's centre from the edge of its surface below which it has no label:
+        that of the settings, or how far the strips of the points are off in plan; a pixel at most,
+        beyond which points of the pixels around tell no edge."""
+        plan_m = self.lidar_strips.most_in_plan_m if self.lidar_strips else 0.0
+        return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
 
     @property
     def has_masks(self) -> bool:
@@ -156,12 +171,10 @@ class SceneInputs:
         return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
 
     @cached_property
-    def noise(self) -> tuple[float, float]:
-        """Variances of the noise of both images of the pair, DN²; 0 of a store that has none."""
-        stores = (self.left_store, self.right_store)
-        facts = [require_complete(path).attrs.get("resampling", {}) for path in stores]
-        left, right = (noise.get("noise_dn", 0.0) ** 2 for noise in facts)
-        return (left, right) if self.view == "left" else (right, left)
+    def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
+        """Of both images of the :attr:`pair`, by brightness."""
+        of_images = pair_noise(*self._pair.images, self._pair.model)
+        return of_images if self.view == "left" else of_images[::-1]
 
     @cached_property
     def rays(self) -> Rays:

@@ -351,8 +351,11 @@ class SensorModel:
 
     def project(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """True image (col, row) in px of ground points (degrees, degrees, m); arrays broadcast."""
-        at = _batch(project_points, self._packed, lon, lat, height)
-        return at if self.by_line is None else self.by_line.add(*at)
+        return self.shown_at(*_batch(project_points, self._packed, lon, lat, height))
+
+    def shown_at(self, col: Floats, row: Floats) -> tuple[Floats, Floats]:
+        """Where the image has what the smooth sensor has at (col, row), px."""
+        return (col, row) if self.by_line is None else self.by_line.add(col, row)
 
     def localize(self, col: ArrayLike, row: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """Ground (lon, lat) in degrees of true image points at ellipsoidal heights in m.

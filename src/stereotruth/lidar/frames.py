@@ -213,19 +213,20 @@ def _is_dynamic(datum: int) -> bool:
     return Datum.from_epsg(datum).type_name.startswith("Dynamic")
 
 
-def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.Transformer | None:
-    """PROJ's best transformation between two frames at a place; None if it knows none.
+def _operation(
+    source: CRS, target: int, place: tuple[float, float] | None
+) -> pyproj.Transformer | None:
+    """PROJ's best transformation between two frames at a place (None: at any), or None.
 
     What it calls a ballpark is none, nor is one that needs a grid which is not installed.
     """
     pyproj.network.set_network_enabled(False)
-    lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
-    around = AreaOfInterest(
-        max(lon - NEAR_DEG, -180.0),
-        max(lat - NEAR_DEG, -90.0),
-        min(lon + NEAR_DEG, 180.0),
-        min(lat + NEAR_DEG, 90.0),
-    )
+    around = None
+    if place is not None:
+        lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
+        west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
+        south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
+        around = AreaOfInterest(west, south, east, north)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of grids that are not installed
@@ -265,7 +266,7 @@ class _Way:
         return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
 
 
-def _way(datum: int, place: tuple[float, float]) -> _Way | None:
+def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
     """How a datum gets to ITRF2020; None where nothing better than WGS 84 is known."""
     own, dynamic, known = _geographic(datum), _is_dynamic(datum), REALISATIONS.get(datum)
     direct = None
@@ -296,7 +297,7 @@ def is_known(system: CRS) -> bool:
         return True
     area = system.area_of_use or geodetic.area_of_use
     east = area.east + 360 * (area.east < area.west) if area else 0.0
-    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else (0.0, 0.0)
+    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else None
     return _way(datum, middle) is not None
 
 

@@ -27,8 +27,9 @@ class Settings:
     strips: Literal["named", "adjusted"] = "named"
     """strips of the LiDAR that disagree beyond noise where they overlap: `named` names them with
     their offsets and leaves the points where they are; the `uncertainty` of labels has what their
-    strip is off. `adjusted` moves the points by the offsets, which count from the strip with most
-    ground; their `uncertainty` has what is left"""
+    strip is off, and pixels nearer to an edge than strips are off in plan have no label. `adjusted`
+    moves the points by the offsets, which count from the strip with most ground; their
+    `uncertainty` has what is left"""
 
     copies_gb: Annotated[Annotated[Number, Field(ge=0)], Unit("GB")] = 20
     """parts of LiDAR files from web servers and buckets that are kept in `results/copies`, so that

@@ -104,6 +104,16 @@ class StripOffsets:
         end = "; points are moved by that" if self.taken_out else ""
         return f"strips of the LiDAR disagree: {some}{more}{end}"
 
+    @property
+    def most_in_plan_m(self) -> float:
+        """How far in plan the strip that is farthest off lies from the mean of all by their ground;
+        0 if no strip is named, or the offsets are taken out of the points."""
+        if not self.named or self.taken_out:
+            return 0.0
+        plan = np.array([strip.offset_m[:2] for strip in self.strips])
+        mean = np.average(plan, axis=0, weights=[strip.ground_m2 for strip in self.strips])
+        return float(np.hypot(*(plan - mean).T).max())
+
     def report(self) -> dict[str, Any] | None:
         """JSON-ready, for people: ``sentence``, and a row for each strip; None of one strip."""
         if len(self.strips) < 2:

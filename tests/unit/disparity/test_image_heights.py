@@ -9,6 +9,7 @@ import pytest
 
 from stereotruth.alignment.aligned_pair import ViewFit
 from stereotruth.disparity.image_heights import (
+    CROWN,
     LAYERS,
     MEASURED,
     NO_POINTS,
@@ -22,10 +23,11 @@ from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.products.grids import open_grid
-from stereotruth.simulate.cities import lidar_files
+from stereotruth.simulate.cities import Canopy, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.site_images import image_truth
 from stereotruth.simulate.sites import drawn_site
+from stereotruth.simulate.surfaces import TREE
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 
@@ -45,14 +47,18 @@ def stores(tmp_path_factory):
     return found
 
 
-@pytest.fixture(scope="module")
-def inputs(stores):
-    image = exact_image(SITE, SITE.images[0])
+def inputs_of(site, stores):
+    image = exact_image(site, site.images[0])
     ground = GroundOfImages([image.sensor], [image.size])
     surface = stores[0].parent / "site.surface"
     cell = ground_cell(ground.pixel_deg)
     make_surface(open_stores(stores), surface, cell=cell, ground=ground)
     return open_inputs(image.sensor, image.size, stores, surface)
+
+
+@pytest.fixture(scope="module")
+def inputs(stores):
+    return inputs_of(SITE, stores)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +100,7 @@ def test_undecided_pixels_are_those_beside_steps(whole, truth):
     undecided = (whole["status"] == UNDECIDED) & (truth["covered"] > 0)
     assert undecided.any() and step[undecided].mean() > 3 * step.mean()
     for name in ("height", "lon", "lat", "sigma"):
-        assert np.isnan(whole[name][whole["status"] != MEASURED]).all()
+        assert np.isnan(whole[name][~np.isin(whole["status"], (MEASURED, CROWN))]).all()
 
 
 def test_blocks_have_the_bytes_of_the_whole(whole, inputs):
@@ -102,6 +108,38 @@ def test_blocks_have_the_bytes_of_the_whole(whole, inputs):
     part = heights_of_block(inputs, rows, cols)
     for name in LAYERS:
         np.testing.assert_array_equal(part[name], whole[name][rows, cols])
+
+
+@pytest.fixture(scope="module")
+def wooded(tmp_path_factory):
+    """Inputs of an image of a wooded city at 2 points/m², and what it shows."""
+    character = replace(SITE.city.character, canopy=Canopy(ground_m2=100.0))
+    site = replace(SITE, city=replace(SITE.city, character=character))
+    folder, image = tmp_path_factory.mktemp("wooded"), site.images[0]
+    stores = []
+    for name in lidar_files(site.city, site.area):
+        simulate_lidar_tile(site.city, site.area, name, folder / name, spacing_m=0.7, seed=1)
+        ingest(folder / name, folder / f"{name}.points")
+        stores.append(folder / f"{name}.points")
+    row, col = np.mgrid[: image.rows, : image.cols].astype(float)
+    return inputs_of(site, stores), image_truth(site, image, col, row)
+
+
+def test_crowns_have_heights_and_the_roughness_in_their_sigma(wooded):
+    inputs, truth = wooded
+    cols, rows = inputs.size
+    found = heights_of_block(inputs, slice(0, rows), slice(0, cols))
+    usable = (truth["covered"] > 0) & (truth["changed"] == 0)
+    crown = usable & (truth["surface"] == TREE)
+    known = crown & np.isin(found["status"], (MEASURED, CROWN))
+    assert known.sum() > 0.5 * crown.sum() > 2000
+    assert (found["status"][crown] == CROWN).mean() > 0.3
+    error = np.abs(found["height"] - truth["height"])
+    assert (error <= 2.0 * found["sigma"])[known].mean() > 0.9
+    assert np.median(found["sigma"][found["status"] == CROWN]) < 0.5
+    part = heights_of_block(inputs, slice(60, 110), slice(40, 120))
+    for name in LAYERS:
+        np.testing.assert_array_equal(part[name], found[name][60:110, 40:120])
 
 
 def test_an_uncertain_correction_tells_on_slopes(inputs, whole):

@@ -237,6 +237,11 @@ def test_other_frames_are_left_to_proj(code) -> None:
     assert not is_known(CRS.from_epsg(code))
 
 
+def test_a_frame_is_known_without_an_area_of_use() -> None:
+    plain = CRS.from_wkt(CRS.from_epsg(6339).to_wkt("WKT1_GDAL"))
+    assert is_known(plain.geodetic_crs)
+
+
 # ------------------------------------------------------------------ plates
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -93,6 +95,16 @@ def test_a_record_is_read_as_it_was_written(made, tmp_path):
     assert sum(row["beyond_noise"] for row in rows) == 2 and rows[0]["off"] == rows[0]["strip"]
 
 
+def test_how_far_strips_are_off_in_plan(made):
+    """From the mean of all by their ground; nothing of points that are moved."""
+    found = compare_strips(made)
+    ground = np.array([strip.ground_m2 for strip in found.strips])
+    plan = OFFSETS[[int(strip.name) - 7320 for strip in found.strips], :2]
+    far = np.hypot(*(plan - ground @ plan / ground.sum()).T).max()
+    assert abs(found.most_in_plan_m - far) < PLAN_M
+    assert replace(found, taken_out=True).most_in_plan_m == 0.0
+
+
 def test_a_part_of_a_file_has_the_strips_of_the_whole(made, tmp_path):
     """Whatever of a file is read, a point has the code that it has in all of it."""
     west, south, east, north = made[0].bounds[:4]
@@ -117,6 +129,9 @@ def test_damaged_strips_are_refused(made, tmp_path):
         with pytest.raises(InputError) as error:
             store.strips_of(store.cell_row.size - 1)
         assert error.value.file == str(file)
+        file.unlink()
+        with pytest.raises(InputError):
+            PointStore(store.path).strips_of(0)
     finally:
         file.write_bytes(data)
 
