@@ -12,12 +12,13 @@
 # make docs           set up, then build the documentation: docs/_build/html/index.html
 # make networks       set up with PyTorch
 # make lint           format, lint, lock file
-# make lock           resolve the pins again (needs uv)
+# make lock           resolve the pins again
 # make clean          remove all that runs have made
 PYTHON ?= python3
 CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or a lock
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
@@ -29,12 +30,15 @@ setup: $(READY)
 help:
 	@sed -n 's/^# \(make\)/\1/p' $(firstword $(MAKEFILE_LIST))
 
+# uv installs what the lock file names in a tenth of pip's time; where uv cannot be had, pip does it.
 $(READY): envs/requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("Python 3.11 or later is needed, this is %d.%d: set PYTHON=/path/to/python3.11" % v[:2])'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r envs/requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	-$(BIN)/python -m compileall -q -j 0 -x '/tests/' .venv/lib src  # by all cores; pip would by one
+	sed -n '/^uv==/,/[^\\]$$/p' envs/requirements.lock > .venv/uv.txt
+	$(PIP) install --require-hashes -r .venv/uv.txt && \
+	  $(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r envs/requirements.lock || \
+	  $(PIP) install --no-compile --require-hashes -r envs/requirements.lock
+	$(PIP) install --no-deps --no-build-isolation -e .
 	-$(MAKE) --no-print-directory -j $(CORES) first-run
 	touch $@
 
@@ -68,7 +72,7 @@ docs: $(READY)
 	$(BIN)/sphinx-build -W --keep-going -n -q -b html docs docs/_build/html
 
 networks: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[networks]'
+	$(PIP) install --no-build-isolation -e '.[networks]'
 
 test-networks: networks
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
@@ -86,9 +90,9 @@ lint: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --lint
 	$(BIN)/python envs/check_lock.py
 
-# Resolves again, keeping the pins that still fit; needs uv.
-lock:
-	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster --extra docs --extra pandora --extra storage \
+# Resolves again, keeping the pins that still fit.
+lock: $(READY)
+	UV_CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/uv pip compile pyproject.toml --extra catalog --extra dev --extra cluster --extra docs --extra pandora --extra storage \
 	  --universal --python-version 3.11 --generate-hashes --no-annotate --quiet \
 	  --output-file envs/requirements.lock
 

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from checkpoints import evaluate_checkpoints
-from drawn_cities import DENSITIES, NAMED, compare_drawn
+from drawn_cities import DENSITIES, NAMED, compare_drawn, compare_twin
 from geometry_errors import geometry_errors
 from synthetic_pairs import label_by, labels_of
+from twin_places import add_place, place_given
 from warped_panels import draw_panels
 
 from stereotruth import sheets
@@ -374,9 +375,12 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         tiles_warped = panels(made, arguments.panels or Path(), 2 if arguments.panels else 0)
         report["warping"].append({"scene": name, **warped, "tiles": tiles_warped})
     settings = labels_of(config)
-    for name in arguments.drawn:
+    place = place_given(arguments)
+    more = [(compare_drawn, name) for name in arguments.drawn]
+    more += [] if place is None else [(compare_twin, place)]
+    for compare, of in more:
         for density in DENSITIES:
-            drawn = compare_drawn(name, density, settings, arguments.workers)
+            drawn = compare(of, density, settings, arguments.workers)
             by_city[drawn.name] = drawn.labels
             report["truth"].append(truth_row(f"{drawn.name} scene", drawn.labels.whole.total))
             report["geometry"] += [
@@ -448,6 +452,7 @@ def main() -> int:
     parser.add_argument(
         "--configfile", nargs="*", type=Path, default=[], help="as given to snakemake"
     )
+    add_place(parser)
     parser.add_argument("--exact", action="store_true", help="again with noise-free GCPs (slow)")
     parser.add_argument("--tiles", action="store_true", help="a row for each tile")
     parser.add_argument("--surfaces", action="store_true", help="a row for each class of surface")

@@ -2,11 +2,12 @@
 
 python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
                         [--without-classes] [--figure docs/changes.png]
+                        [--twin place.laz --crs EPSG:2154]
 
 Cities are drawn by seed, one for each kind of change and one with many (mixed), and each of them is
 made under two conditions: both images of one day three years after the LiDAR; or the right image a
 year after the left one, under another sun. Truth is exact: a ray through each pixel meets the
-worlds of both images and of the LiDAR.
+worlds of both images and of the LiDAR. With a LAS or LAZ file its twin takes the place of cities.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from synthetic_pairs import gain, noise, rectify_by
+from twin_places import Place, add_place, place_given
 
 from stereotruth.alignment.align import align
 from stereotruth.disparity.project import project_scene
@@ -83,6 +85,10 @@ SHARES["woods"] = {}
 SPOILT = "noise", "mixed in noise"  # images of little contrast and much noise
 WOODED = "leaves", "woods"
 CONDITIONS = ("one day", "a year apart")
+OF_TWINS = (
+    "built", "demolished", "raised", "felled", "grown", "nothing", "noise", "sun", "mixed",
+    "mixed in noise",
+)  # fmt: skip
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
 
@@ -90,13 +96,14 @@ LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun 
 @dataclass(frozen=True)
 class Case:
     """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²,
-    whose points have classes or none."""
+    whose points have classes or none; or in the twin of a place."""
 
     kind: str
     condition: str
     seed: int
     density: float
     classed: bool = True
+    twin: Place | None = None
 
     @property
     def apart(self) -> bool:
@@ -107,6 +114,8 @@ class Case:
     def city(self) -> CitySpec:
         """The city, with its one scene."""
         number = FIRST_CITY + list(SHARES).index(self.kind)
+        if self.twin is not None:
+            return self._dated(self.twin.city("Dated", self.seed))
         drawn = training_city(number, self.seed, SIDE_PX)
         is_open = self.kind in ("crops", "noise")
         water = self.kind == "water"
@@ -118,6 +127,12 @@ class Case:
             canopy=Canopy(ground_m2=150.0) if self.kind in WOODED else None,
             ground_look=(1.0, 0.3) if self.kind in SPOILT else (1.0, 1.0),
         )  # fmt: skip
+        scene = replace(drawn.scenes[0], name="Dated", lidar_grid=(1, 1))
+        drawn = replace(drawn, name="Dated", character=character, scenes=(scene,))
+        return self._dated(drawn)
+
+    def _dated(self, drawn: CitySpec) -> CitySpec:
+        """A city with the dates and the light of this case."""
         dates = Dates(3 * YEAR, (4 if self.apart else 3) * YEAR, 0.0, **SHARES[self.kind])
         sun = None
         if self.apart and self.kind != "texture":
@@ -125,11 +140,7 @@ class Case:
             sun = (
                 drawn.sun_azimuth_deg + azimuth, max(drawn.sun_elevation_deg + elevation, 30.0)
             )  # fmt: skip
-        return replace(
-            drawn, name="Dated", character=character, dates=dates,
-            scenes=(replace(drawn.scenes[0], name="Dated", lidar_grid=(1, 1)),),
-            right=ViewSpec(sun, bare=self.kind == "leaves"),
-        )  # fmt: skip
+        return replace(drawn, dates=dates, right=ViewSpec(sun, bare=self.kind == "leaves"))
 
     def make(self, folder: Path) -> None:
         """Images, points and exact control points, aligned and rectified, into a folder."""
@@ -153,7 +164,9 @@ class Case:
     def made(self, folder: Path) -> Path:
         """The folder of :meth:`make`, made once."""
         parts = self.kind, self.condition, str(self.seed), str(self.density)
-        name = "-".join(parts if self.classed else (*parts, "unclassed")).replace(" ", "_")
+        more = () if self.classed else ("unclassed",)
+        more += () if self.twin is None else (self.twin.key,)
+        name = "-".join((*parts, *more)).replace(" ", "_")
         path = folder / name
         if not path.is_dir():
             with atomic_folder(path) as scratch:
@@ -386,19 +399,25 @@ def main() -> None:
     parser.add_argument("--density", type=float, default=4.0)
     parser.add_argument("--without-classes", action="store_true", help="of the LiDAR's points")
     parser.add_argument("--figure", type=Path, help="draw a block of the city mixed, no table")
+    add_place(parser)
     given = parser.parse_args()
+    twin = place_given(given)
+    if given.twin and twin is None:
+        return
+    kinds = given.kinds if twin is None else [kind for kind in given.kinds if kind in OF_TWINS]
     if given.figure:
-        draw(Case("mixed", CONDITIONS[0], given.seeds[0], given.density), given)
+        draw(Case("mixed", CONDITIONS[0], given.seeds[0], given.density, twin=twin), given)
         return
     print("| " + " | ".join(HEADER) + " |")
     print("|---" * len(HEADER) + "|")
-    for kind in given.kinds:
+    for kind in kinds:
         for condition in CONDITIONS:
             if ALONE.get(kind, condition) != condition:
                 continue
             row = Row()
             for seed in given.seeds:
-                case = Case(kind, condition, seed, given.density, not given.without_classes)
+                classed = not given.without_classes
+                case = Case(kind, condition, seed, given.density, classed, twin)
                 row.add(case, Labelled.of(case, given.folder))
             print("| " + " | ".join([kind, condition, *row.cells()]) + " |", flush=True)
 

@@ -1,4 +1,4 @@
-"""Two more cities of accuracy.py, which no workflow makes: a wooded suburb and a park.
+"""More cities of accuracy.py, which no workflow makes: a wooded suburb, a park, twins of places.
 
 They are drawn by seeds that nothing is tuned on, and made, aligned, refined and labelled once.
 """
@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from synthetic_pairs import label_by
+from twin_places import Place, TwinDraw
 from wooded_scenes import MIXED, Draw, Scene
 
 from stereotruth.alignment.aligned_pair import Alignment
@@ -23,6 +24,7 @@ from stereotruth.products.provenance import source_digest
 FOLDER = Path("results/accuracy/drawn")
 DENSITIES = (4.0, 1.0)  # points/m²
 GCPS = 15
+TWIN_SEED = 27
 NAMED = {
     "suburb": Draw(
         61803, zones="suburb", ground_m2=110.0, arrangement="single", brightness=0.4,
@@ -51,9 +53,23 @@ class Compared:
 def compare_drawn(name: str, density: float, settings: Settings, workers: int) -> Compared:
     """Labels and alignment of a city of NAMED at a density of its LiDAR."""
     scene = Scene(replace(NAMED[name], density=density), FOLDER)
+    return _compared(
+        scene, f"{name}-{density:g}", f"{name}, {density:g} points/m²", settings, workers
+    )
+
+
+def compare_twin(place: Place, density: float, settings: Settings, workers: int) -> Compared:
+    """The same of the twin of a place."""
+    scene = Scene(TwinDraw(place, TWIN_SEED, density), FOLDER)
+    title = f"twin of {place.file.stem}, {density:g} points/m²"
+    return _compared(scene, f"{place.key}-{density:g}", title, settings, workers)
+
+
+def _compared(scene: Scene, key: str, title: str, settings: Settings, workers: int) -> Compared:
+    """Labels and alignment of a scene, made once in a folder that has its ``key``."""
     alone = scene.align(GCPS)
     code = source_digest("alignment.refine", "disparity.project")[:8]
-    made = FOLDER / f"{name}-{density:g}-{code}"
+    made = FOLDER / f"{key}-{code}"
     if not made.is_dir():
         with atomic_folder(made) as scratch:
             refined, _ = refine(alone, *scene.images, scene.stores, provenance={})
@@ -61,7 +77,6 @@ def compare_drawn(name: str, density: float, settings: Settings, workers: int) -
             write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",
                              scratch / "truth.zarr", workers=workers)  # fmt: skip
     used = Alignment.load(made / "alignment.json")
-    title = f"{name}, {density:g} points/m²"
     labels = compare_scene(
         made / "disparity.zarr", made / "truth.zarr", None, scene=title, workers=workers
     )

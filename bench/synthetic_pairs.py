@@ -25,6 +25,8 @@ from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
@@ -155,7 +157,9 @@ def label_by(
     rectified = (folder / f"{view}.zarr" for view in VIEWS)
     code = source_digest("disparity.project")
     alignment_file = folder / "alignment.json"
-    inputs = SceneInputs.of(*rectified, stores, settings, alignment=alignment_file)
+    strips = folder / "points.strips"
+    compare_strips([PointStore(path) for path in stores]).write(strips)
+    inputs = SceneInputs.of(*rectified, stores, settings, alignment=alignment_file, strips=strips)
     inputs = inputs.with_surface(folder, workers)
     project_scene(inputs, made, workers=workers, code=code)
     return made

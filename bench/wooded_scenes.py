@@ -26,7 +26,14 @@ from stereotruth.lidar.point_store import open_stores
 from stereotruth.matching.image_faults import as_images
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.cities import Canopy, CitySpec, SceneSpec, ViewSpec, lidar_files
+from stereotruth.simulate.cities import (
+    Canopy,
+    CitySpec,
+    Jitter,
+    SceneSpec,
+    ViewSpec,
+    lidar_files,
+)
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
@@ -56,7 +63,8 @@ class Draw:
     images, as in :mod:`synthetic_pairs`. ``later``: the right image is of an hour later. ``bare``:
     the view without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range of the
     ground. ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built. ``sun_deg``:
-    the sun's elevation, None for one that is drawn.
+    the sun's elevation, None for one that is drawn. ``jitter_px``, ``psf_px`` (left, right),
+    ``saturates``: as in :class:`.cities.Jitter` and :class:`.cities.ViewSpec`.
     """
 
     seed: int
@@ -81,6 +89,9 @@ class Draw:
     buildings: float = 0.7
     side_px: int = 2000
     sun_deg: float | None = None
+    jitter_px: float = 0.0
+    psf_px: tuple[float, float] = (0.42, 0.42)
+    saturates: float | None = None
 
     @property
     def city(self) -> CitySpec:
@@ -111,8 +122,11 @@ class Draw:
             view: ViewSpec(
                 sun_an_hour_later(city) if self.later and view == "right" else None,
                 bare=self.bare == view,
+                jitter=Jitter(self.jitter_px) if self.jitter_px else None,
+                psf_px=psf_px,
+                saturates=self.saturates,
             )
-            for view in VIEWS
+            for view, psf_px in zip(VIEWS, self.psf_px)
         }
         return replace(city, **views)
 
@@ -170,7 +184,10 @@ class Scene:
     @cached_property
     def stores(self) -> list[Path]:
         """Point stores of the draw's density."""
-        looks = "noise", "gain", "later", "brightness", "ground_look"
+        looks = (
+            "noise", "gain", "later", "brightness", "ground_look", "jitter_px", "psf_px",
+            "saturates",
+        )  # fmt: skip
         made = self.folder / "lidar" / self.draw.key(*looks)
         if not _readable(made):
             with atomic_folder(made) as scratch:

@@ -35,15 +35,15 @@ from .products.remote_files import (
     stand_in,
 )
 from .settings import merged
-from .simulate.cities import CITIES as SYNTHETIC
 from .simulate.cities import lidar_files
+from .simulate.city_files import FOLDER as SYNTHETIC_FOLDER
+from .simulate.city_files import city_of, synthetic_city
 
 log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parent
 # Snakefile, workflow/, config/, profiles/ and envs/: of the clone, or what setup.py put into the
 # wheel.
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
-SYNTHETIC_FOLDER = "data/synthetic"
 CONFIG = "config.yaml"  # of a user's own project
 SHARED = Path("config") / CONFIG  # of a clone: the Snakefile reads it
 MOST_BYTES = 1_000_000  # of a configuration
@@ -189,9 +189,13 @@ def _refuse_multiplied(top: yaml.Node | None, file: Path) -> None:
 
 def is_synthetic(scene: sheets.Scene) -> bool:
     """Whether the scene's input is made by the rules of simulate.smk."""
-    city = SYNTHETIC.get(scene.city)
-    made_here = f"{SYNTHETIC_FOLDER}/{scene.city}/{scene.scene}"
-    return city is not None and scene.left_image == f"{made_here}/left.tif"
+    made_here = SYNTHETIC_FOLDER / scene.city / scene.scene / "left.tif"
+    return scene.left_image == str(made_here) and synthetic_city(scene.city) is not None
+
+
+def is_made(path: str) -> bool:
+    """Whether a file is made by the rules of simulate.smk."""
+    return Path(path).is_relative_to(SYNTHETIC_FOLDER)
 
 
 def here_or_shipped(path: str) -> str:
@@ -369,8 +373,9 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
             remedy="name its file of ground control points, or set alignment.refine to true",
         )
     if is_synthetic(scene):
-        sheets.require_files(scene, rows, ["gcps"])
-        made = lidar_files(SYNTHETIC[scene.city], scene.scene)
+        if not is_made(scene.gcps):
+            sheets.require_files(scene, rows, ["gcps"])
+        made = lidar_files(city_of(scene.city), scene.scene)
         return sheets.store_names([Path(scene.lidar) / file for file in made])
     sheets.require_files(scene, rows, sheets.FILES)
     return sheets.store_names(sheets.find_lidar(scene, rows))
@@ -381,14 +386,15 @@ def stores_of(
 ) -> dict[str, list[tuple[str, str]]]:
     """The point stores of each scene: (scene that they are made for, name of the LiDAR file).
 
-    A file is read once by all scenes of a city that take it by the same coordinate system and
-    geoid: its store is that of the first of them in the sheet. ``lidar``: files of each scene by
-    the names of their stores.
+    A file is read once by all scenes of a city that take it by the same system, epoch and geoid:
+    its store is that of the first of them in the sheet. ``lidar``: files of each scene by the names
+    of their stores.
     """
     made: dict[tuple[str, ...], tuple[str, str]] = {}
     found: dict[str, list[tuple[str, str]]] = {}
     for name, scene in scenes.items():
-        how = scene.city, scene.lidar_crs, sheets.file_key(scene.geoid) if scene.geoid else ""
+        geoid = sheets.file_key(scene.geoid) if scene.geoid else ""
+        how = scene.city, scene.lidar_crs, scene.lidar_epoch, geoid
         found[name] = [
             made.setdefault((*how, sheets.file_key(str(file))), (name, store))
             for store, file in lidar[name].items()

@@ -104,6 +104,31 @@ def acquisition_time(text: str) -> datetime | date:
     return time.astimezone(UTC)
 
 
+def decimal_year(time: date) -> float:
+    """Of a day's noon: 2020-07-02 is 2020.5 in a leap year."""
+    first, last = date(time.year, 1, 1), date(time.year + 1, 1, 1)
+    day = date(time.year, time.month, time.day)
+    return time.year + ((day - first).days + 0.5) / (last - first).days
+
+
+def epoch_year(text: str) -> float | None:
+    """The decimal year that a cell names as 2016.4 or as a date; None where it is empty.
+
+    ValueError says what is wrong.
+    """
+    if not text:
+        return None
+    if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
+        year = decimal_year(date.fromisoformat(text))
+    elif re.fullmatch(r"\d{4}(\.\d+)?", text):
+        year = float(text)
+    else:
+        raise ValueError("is neither a decimal year nor a date")
+    if not 1980 <= year < 2100:
+        raise ValueError("is no epoch between 1980 and 2100")
+    return year
+
+
 def name_of(characters: str) -> Any:
     """The type of names that paths are made of: so many of the ``characters`` (of a pattern)."""
     limits = StringConstraints(pattern=f"^[{characters}]+$", max_length=LONGEST_NAME)

@@ -28,6 +28,7 @@ from .settings import (
     Text,
     Whole,
     acquisition_time,
+    epoch_year,
     name_of,
     settings,
 )
@@ -63,6 +64,11 @@ class City:
 
     testing: Count
     """likewise"""
+
+    epoch: Text = ""
+    """optional column: epoch of the city's places in ITRF2020, as `2020.8` or `2020-10-25`; empty:
+    the day of the images of its first scene that tell one, or else 2020.0. Control points without a
+    frame of their own are of this epoch. See docs/explanation/frames.md"""
 
 
 @settings
@@ -103,6 +109,12 @@ class Scene:
     scale and rotation; up to 48 px between the images are found), and slopes alone tell where both
     images lie on the LiDAR: the attribute `alignment_sigma_px` of the scene's disparity store says
     how well"""
+
+    lidar_epoch: Text = ""
+    """optional column: epoch of the LiDAR's coordinates, as `2016.4` or `2016-05-27`, which systems
+    of a dynamic frame (ITRF2014, WGS 84 (G1762)) need where the files do not state it; in WGS 84
+    without a realisation empty means the epoch of the images. Coordinates in a frame that moves
+    with its plate (NAD83(2011), ETRS89, GDA2020) or has an epoch of its own (NZGD2000) need none"""
 
     left_mask: FilePath = ""
     """optional column: a raster on the left image's grid, not zero where the image is not to be
@@ -176,7 +188,20 @@ def _city(cells: Mapping[str, str], number: int, path: Path) -> City:
                 remedy=f"{count} is a number of tiles: a whole number, 0 or more",
             )
         values[count] = int(cells[count])
+    _epoch(cells["epoch"], "epoch", f"line {number}", path)
     return check(values, City, f"{path}, line {number}")
+
+
+def _epoch(text: str, column: str, where: str, path: Path) -> None:
+    """Raise InputError if a cell is no epoch."""
+    try:
+        epoch_year(text)
+    except ValueError as error:
+        raise InputError(
+            f"{where}: {column} {text!r} {error}",
+            file=path,
+            remedy="write the decimal year of the coordinates, 2016.4, or a date, 2016-05-27",
+        ) from None
 
 
 def read_images(
@@ -335,6 +360,7 @@ def read_scenes(
             check(cells, Scene, f"{path}, line {number}")
             where = f"line {number}: scene {cells['scene']!r}"
             _known_city(cells["city"], where, cities, path, cities_sheet)
+            _epoch(cells["lidar_epoch"], "lidar_epoch", where, path)
             completed = with_images(cells, images or {}, where, path)
             scene = check(completed, Scene, f"{path}, line {number}")
             if file_key(scene.left_image) == file_key(scene.right_image):

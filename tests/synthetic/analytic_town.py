@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from stereotruth.evaluation.surface_models.height_raster import HeightRaster
 from stereotruth.evaluation.surface_models.reference import BUILDING, GROUND, TREE
+from stereotruth.lidar.height_raster import HeightRaster
 
 from .exact_surface import write_heights
 

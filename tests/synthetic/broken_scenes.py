@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 import rasterio
 import yaml
+from rasterio.transform import from_origin
 from rasterio.windows import Window
 
 from .las import write_gtx, write_las
@@ -152,6 +153,15 @@ def _pixels(dtype: str, **options: object) -> Callable[[Path], object]:
     return plant
 
 
+def on_grid(folder: Path, gsd: float = 0.7) -> None:
+    """The left image on a map grid, north up, with its RPC; 0.65 m is what that says."""
+    cols, rows = SIZES["left"]
+    x, y = pyproj.Transformer.from_crs(4326, 32650, always_xy=True).transform(LON, LAT)
+    with rasterio.open(folder / "left.tif", "r+") as dataset:
+        dataset.crs = "EPSG:32650"
+        dataset.transform = from_origin(x - cols / 2 * gsd, y + rows / 2 * gsd, gsd, gsd)
+
+
 def _flipped(folder: Path) -> None:
     _pixels("uint16", compress="deflate", tiled=True)(folder)
     data = bytearray((folder / "left.tif").read_bytes())
@@ -220,6 +230,7 @@ FAULTS = [
     Fault("damaged block", "is damaged", _flipped),
     Fault("nothing but nodata", "no pixel but nodata",
           lambda f: write_image(f / "left.tif", RPCS["left"], SIZES["left"])),
+    Fault("map-projected", "map grid and has an RPC", on_grid),
     Fault("no RPC", "no RPC metadata",
           lambda f: (_pixels("uint8")(f), (f / "left.rpb").unlink())),
     Fault("RPC cut short", "malformed RPC", lambda f: (_rpb("left")(f), _cut("left.rpb")(f))),

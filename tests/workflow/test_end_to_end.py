@@ -59,7 +59,11 @@ def test_tiles_are_made_with_all_their_files(made):
     disparity = rioxarray.open_rasterio(next((folder / "disp").iterdir()), masked=True)
     assert disparity.isnull().any() and disparity.notnull().any()
     assert abs(disparity).max() < 200
-    assert len(list((folder / "orientation").iterdir())) >= len(labelled)
+    orientations = sorted((folder / "orientation").iterdir())
+    assert len(orientations) >= len(labelled)
+    ground = json.loads(orientations[0].read_text())["ground_frame"]  # of LiDAR in a zone of UTM
+    assert (ground["frame"], ground["epoch"], ground["by"]) == ("ITRF2020", 2020.0, "")
+    assert [one["legs"] for one in ground["source"]] == [[]]
 
 
 def test_disparity_agrees_with_the_exact_truth(made, tmp_path):
@@ -103,7 +107,8 @@ EDITED = {
     "epipolar/image_reader": {"refine", "rectify", "project", "export"},
     "alignment/align": STAGES,
     "surface/facets": {"surface", "project", "export"},
-    "lidar/ingest": STAGES - {"align"} | {"ingest", "surface"},
+    "lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},
+    "lidar/strip_planes": {"compare_strips", "project", "export"},
     "sheets simulate/render": set(),
 }
 
@@ -141,7 +146,7 @@ def test_a_new_lidar_file_is_the_only_one_read(made, tmp_path):
     other = made.copy(tmp_path / "other")
     new = other.folder / "in/lidar/new.laz"
     shutil.copy(next((other.folder / "in/lidar").glob("*_0_1.laz")), new)
-    after = {"surface": 1, "refine": 1, "rectify": 1, "project": 1, "export": 1}
+    after = dict.fromkeys(["compare_strips", "surface", *STAGES - {"align"}], 1)
     assert plan(other) == {"ingest": 1, **after}
 
 

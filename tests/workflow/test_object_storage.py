@@ -214,6 +214,7 @@ def test_an_input_replaced_on_its_server_is_seen(server, data, from_urls):
     server.put("in/lidar/Tiny-1_0_0.laz", file.read_bytes() + b"\0")
     assert from_urls.plan(*call) == {
         "ingest": 1,
+        "compare_strips": 1,
         "surface": 1,
         "refine": 1,
         "rectify": 1,

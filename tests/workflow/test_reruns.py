@@ -121,7 +121,8 @@ FROM = {
     "rectify": ["rectify", "project", "export"],
     "surface": ["surface", "project", "export"],
     "project": ["project", "export"],
-    "ingest": ["ingest", "surface", "refine", "rectify", "project", "export"],
+    "compare_strips": ["compare_strips", "project", "export"],
+    "ingest": ["ingest", "compare_strips", "surface", "refine", "rectify", "project", "export"],
     "export": ["export"],
 }
 DAMAGE = [
@@ -133,6 +134,7 @@ DAMAGE = [
     ("results/project/Tiny/Tiny-1.zarr/disparity/c/*/*", "project"),
     ("results/surface/Tiny/Tiny-1.surface/blocks/*", "surface"),
     ("results/surface/Tiny/Tiny-1.surface/surface.json", "surface"),
+    ("results/strips/Tiny/Tiny-1.strips/strips.json", "compare_strips"),
     ("results/ingest/Tiny/Tiny-1/Tiny-1_0_0.points/store.json", "ingest"),
     ("results/ingest/Tiny/Tiny-1/Tiny-1_0_0.points/points.npy", "ingest"),
     ("tiles/Tiny/disp/*", "export"),
@@ -140,7 +142,9 @@ DAMAGE = [
     ("tiles/Tiny/export.json", "export"),
     ("results/export/Tiny/summary.json", "export"),
 ]
-ALONE = [file for file, _ in DAMAGE if not re.search(r"\*|\.(zarr|points|surface)/|^tiles/", file)]
+ALONE = [
+    file for file, _ in DAMAGE if not re.search(r"\*|\.(zarr|points|strips|surface)/|^tiles/", file)
+]
 
 
 @pytest.mark.slow

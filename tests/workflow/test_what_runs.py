@@ -28,14 +28,18 @@ FILES: list[tuple[str, set[str]]] = [
     ("in/gcps.csv", {*ALIGN, *RECTIFY}),
     ("in/left.tif", {"surface", *ALIGN, *RECTIFY}),
     ("in/left.tif.msk", {"surface", *ALIGN, *RECTIFY}),  # a new one
-    ("in/lidar/1.laz", {"ingest", "surface", *REFINE, *RECTIFY}),
-    ("in/lidar/3.laz", {"ingest", "surface", *REFINE, *RECTIFY}),  # a new one
-    ("geoid.tif", {"ingest", "surface", *REFINE, *RECTIFY}),
+    ("in/lidar/1.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
+    ("in/lidar/3.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),  # a new one
+    ("geoid.tif", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
     ("mine.py", METHOD),
     ("helper.py", METHOD),  # which mine.py imports
 ]
 KEYS: list[tuple[str, Any, set[str]]] = [
-    ("ingest.drop_classes", [7], {"ingest", "surface", *REFINE, *RECTIFY, *GRID_TRUTH}),
+    (
+        "ingest.drop_classes",
+        [7],
+        {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY, *GRID_TRUTH},
+    ),
     ("alignment.model", "shift", {*ALIGN, *RECTIFY, *GRID_TRUTH}),
     ("alignment.refine", False, {*RECTIFY, *GRID_TRUTH}),
     ("rectify.panchromatic", 1, {*REFINE, *RECTIFY, *GRID_TRUTH}),

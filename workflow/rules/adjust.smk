@@ -24,6 +24,7 @@ rule adjust:
         pairs=lambda w: {s: [*ADJUSTED[s], SCENES[s].gcps] for s in adjusted_pairs(w.city)},
         fixed=lambda w: fixed_images(w),
         strict=SETTINGS.strict,
+        epoch=lambda w: epoch_of(w.city),
         code=source_digest("alignment.site_adjustment"),
     message:
         "Adjusting the images of {wildcards.city} together"

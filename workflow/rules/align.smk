@@ -26,6 +26,7 @@ rule align:
         names=lambda wildcards: IMAGE_NAMES[wildcards.scene],
         model=SETTINGS.alignment.model,
         strict=SETTINGS.strict,
+        epoch=lambda w: epoch_of(w.city),
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         code=source_digest("alignment.align", "alignment.align_report"),
     message:

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from stereotruth.configuration import Configuration
+from stereotruth.epochs import epoch_of_city
 from stereotruth.errors import InputError, in_words
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
 from stereotruth.project import (
@@ -13,6 +14,7 @@ from stereotruth.project import (
     check_fixed,
     days_of_pair,
     file_of_image,
+    is_made,
     is_synthetic,
     lidar_days,
     lidar_of,
@@ -22,6 +24,7 @@ from stereotruth.project import (
     stores_of,
     surfaces_of,
 )
+from stereotruth.simulate import city_files
 
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"

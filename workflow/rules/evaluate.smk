@@ -1,6 +1,8 @@
 rule grid_truth:
     input:
         epipolar=rules.rectify.output.epipolar,
+        city=file_of_city,
+        place=files_of_place,
     output:
         truth=directory("results/truth/{city}/{scene}.zarr"),
     log:
@@ -15,7 +17,7 @@ rule grid_truth:
         runtime=60,
     params:
         script=content_of("../scripts/grid_truth.py"),
-        code=source_digest("evaluation.epipolar_truth"),
+        code=source_digest("evaluation.epipolar_truth", "simulate.city_files"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
     script:

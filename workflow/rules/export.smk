@@ -44,7 +44,7 @@ rule export:
         script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         acquired=lambda w: [days_of_pair(IMAGE_NAMES[s.scene], IMAGES) for s in scenes_of(w.city)],
-        city=lambda w: asdict(CITIES[w.city]),
+        city=lambda w: {k: v for k, v in asdict(CITIES[w.city]).items() if k != "epoch"},
         settings={
             **asdict(SETTINGS.tiles),
             **asdict(SETTINGS.evaluation),

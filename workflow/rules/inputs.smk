@@ -19,6 +19,18 @@ def with_files_beside(scene, view):
     return [given(file) for file in (image, *dict.fromkeys(beside))]
 
 
+def file_of_city(wildcards):
+    """The file of a synthetic city of the project's own; none of the six has one."""
+    file = city_files.file_of(wildcards.city)
+    return [given(file)] if file.is_file() else []
+
+
+def files_of_place(wildcards):
+    """The files of the real place that a synthetic city is the twin of."""
+    city = city_files.synthetic_city(wildcards.city)
+    return [given(file) for file in city.twin.files] if city and city.twin else []
+
+
 def left_image(wildcards):
     return with_files_beside(SCENES[wildcards.scene], "left")
 
@@ -32,6 +44,8 @@ def given_in(column):
 
     def file_of(wildcards):
         path = getattr(SCENES[wildcards.scene], column)
+        if is_made(path):
+            return path
         return given(path) if path else []
 
     return file_of
@@ -134,14 +148,36 @@ def ground_of_stores(scene):
     return None if found is None else found.runs
 
 
+@cache
+def epoch_of(city):
+    """The epoch of a city's places: decimal year, and what tells it."""
+    return list(epoch_of_city(CITIES[city], SCENES, IMAGES))
+
+
 def paths_of_stores(city, stores):
     """Paths of point stores by their (scene, name)."""
     return [f"results/ingest/{city}/{scene}/{lidar}.points" for scene, lidar in stores]
 
 
-def point_stores(wildcards):
+def point_stores_as_read(wildcards):
     """The points of a scene; files that another scene of the city reads, too, are read once."""
     return paths_of_stores(wildcards.city, STORES[wildcards.scene])
+
+
+def point_stores(wildcards):
+    """The points of a scene, moved by the offsets of their strips where this is asked for."""
+    if SETTINGS.ingest.strips != "adjusted":
+        return point_stores_as_read(wildcards)
+    city, scene = wildcards.city, wildcards.scene
+    return [
+        f"results/strips/{city}/{SURFACES[scene]}/{origin}/{lidar}.points"
+        for origin, lidar in STORES[scene]
+    ]
+
+
+def strips_of(wildcards):
+    """What the strips of a scene's points are off, found once for all scenes that take the same."""
+    return f"results/strips/{wildcards.city}/{SURFACES[wildcards.scene]}.strips"
 
 
 def point_stores_of_city(wildcards):

@@ -8,6 +8,7 @@ rule project:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}.zarr"),
@@ -41,6 +42,7 @@ use rule project as project_right with:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
         strips=lambda w: strips_made(w, "results/project/{city}/strips/{scene}_right_{strip}.json"),
     output:
         disparity=directory("results/project/{city}/{scene}_right.zarr"),
@@ -65,6 +67,7 @@ rule project_strip:
         alignment=alignment_of,
         points=point_stores,
         surface=surface_of_labels,
+        lidar_strips=strips_of,
     output:
         done=temp("results/project/{city}/strips/{scene}{side}_{strip}.json"),
     log:

@@ -1,4 +1,7 @@
 rule simulate_city:
+    input:
+        city=file_of_city,
+        place=files_of_place,
     output:
         surfaces="data/synthetic/{city}/surfaces.npz",
     log:
@@ -13,7 +16,7 @@ rule simulate_city:
         runtime=30,
     params:
         script=content_of("../scripts/simulate_city.py"),
-        code=source_digest("simulate.built_city"),
+        code=source_digest("simulate.built_city", "simulate.city_files"),
     message:
         "Building synthetic city {wildcards.city}"
     script:
@@ -22,6 +25,8 @@ rule simulate_city:
 
 rule simulate_image:
     input:
+        city=file_of_city,
+        place=files_of_place,
         surfaces=rules.simulate_city.output.surfaces,
     output:
         image="data/synthetic/{city}/{scene}/{view}.tif",
@@ -38,7 +43,7 @@ rule simulate_image:
     params:
         script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.render"),
+        code=source_digest("simulate.render", "simulate.city_files"),
     message:
         "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
     script:
@@ -47,6 +52,7 @@ rule simulate_image:
 
 rule simulate_lidar:
     input:
+        city=file_of_city,
         surfaces=rules.simulate_city.output.surfaces,
     output:
         lidar="data/synthetic/{city}/{scene}/lidar/{tile}",
@@ -66,7 +72,7 @@ rule simulate_lidar:
         script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
-        code=source_digest("simulate.lidar"),
+        code=source_digest("simulate.lidar", "simulate.city_files"),
     message:
         "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
     script:
@@ -74,8 +80,12 @@ rule simulate_lidar:
 
 
 rule simulate_truth:
+    input:
+        city=file_of_city,
+        place=files_of_place,
     output:
         truth=directory("data/synthetic/{city}/{scene}/truth.zarr"),
+        measured="data/synthetic/{city}/{scene}/gcps.csv",
         gcps="data/synthetic/{city}/{scene}/gcps_exact.csv",
         checkpoints="data/synthetic/{city}/{scene}/checkpoints.csv",
     log:
@@ -91,7 +101,7 @@ rule simulate_truth:
     params:
         script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.truth", "simulate.control_points"),
+        code=source_digest("simulate.truth", "simulate.control_points", "simulate.city_files"),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"
     script:

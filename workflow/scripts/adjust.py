@@ -5,6 +5,7 @@ from pathlib import Path
 from stereotruth.alignment.site_adjustment import adjust_site
 from stereotruth.alignment.site_pair import ScenePair, write_site
 from stereotruth.job import job
+from stereotruth.lidar.frames import Epoch
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import checksums, describe, file_sha256
 
@@ -29,6 +30,9 @@ if __name__ == "__main__":
             pairs,
             fixed=snakemake.params.fixed,
             strict=snakemake.params.strict,
-            provenance=describe(inputs, {}, snakemake.params.code),
+            epoch=Epoch(*snakemake.params.epoch),
+            provenance=describe(
+                inputs, {"epoch": list(snakemake.params.epoch)}, snakemake.params.code
+            ),
         )
         write_site(values, snakemake.output[0])

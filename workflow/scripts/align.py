@@ -8,22 +8,26 @@ from stereotruth.alignment.align_report import write_alignment
 from stereotruth.alignment.control_points import TooFewPoints, read_gcps
 from stereotruth.errors import InputError
 from stereotruth.job import job
+from stereotruth.lidar.frames import Epoch
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     model, strict = snakemake.params.model, snakemake.params.strict
+    epoch = Epoch(*snakemake.params.epoch)
     with (
         job(snakemake.log[0], f"align {scene}"),
         atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
     ):
         images = snakemake.input.left[0], snakemake.input.right[0]
-        provenance = describe(snakemake.input, {"model": model}, snakemake.params.code)
+        provenance = describe(
+            snakemake.input, {"model": model, "epoch": [*epoch]}, snakemake.params.code
+        )
         alignment = None
         if snakemake.input.gcps and not snakemake.params.alone:
             with suppress(TooFewPoints):  # faults of the sheet itself are errors here, too
-                read_gcps(snakemake.input.gcps, scene, snakemake.params.names)
+                read_gcps(snakemake.input.gcps, scene, snakemake.params.names, epoch)
         if snakemake.input.gcps:
             try:
                 alignment = align(
@@ -33,6 +37,7 @@ if __name__ == "__main__":
                     model=model,
                     scene=scene,
                     strict=strict,
+                    epoch=epoch,
                     provenance=provenance,
                 )
             except InputError as error:

@@ -4,10 +4,10 @@ from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.city_files import city_of
 
 if __name__ == "__main__":
-    city = CITIES[snakemake.wildcards.city]
+    city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"truth of {scene.name}"),

@@ -2,16 +2,20 @@
 
 from stereotruth.job import in_own_process, job
 from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.range_copies import prune
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
+from stereotruth.settings import epoch_year
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
     ground = snakemake.params.footprint
     parameters = {
         "lidar_crs": snakemake.params.lidar_crs,
+        "lidar_epoch": snakemake.params.lidar_epoch,
+        "epoch": list(snakemake.params.epoch),
         "drop_classes": snakemake.params.drop_classes,
         "acquired": list(snakemake.params.acquired),
     }
@@ -24,6 +28,7 @@ if __name__ == "__main__":
                 footprint=None if ground is None else Footprint.of_runs(ground),
                 lidar_crs=parameters["lidar_crs"] or None,
                 geoid=geoid,
+                epochs=Epochs(Epoch(*parameters["epoch"]), epoch_year(parameters["lidar_epoch"])),
                 acquired=snakemake.params.acquired,
                 drop_classes=tuple(parameters["drop_classes"]),
                 provenance=describe(snakemake.input, parameters, snakemake.params.code),

@@ -21,6 +21,7 @@ if __name__ == "__main__":
             snakemake.params.view,
             snakemake.input.alignment,
             snakemake.input.surface or None,
+            snakemake.input.lidar_strips,
         ).in_light(**snakemake.params.light)
         project_scene(
             inputs,

@@ -26,6 +26,7 @@ if __name__ == "__main__":
                 left.size,
                 right.size,
                 alignment.reference_height,
+                height_range=alignment.model_heights,
                 names=names,
             )
             stores = snakemake.params.stores

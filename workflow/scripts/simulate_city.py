@@ -3,10 +3,10 @@
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.simulate.built_city import write_surfaces
-from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.city_files import city_of
 
 if __name__ == "__main__":
-    city = CITIES[snakemake.wildcards.city]
+    city = city_of(snakemake.wildcards.city)
     with (
         job(snakemake.log[0], f"simulate {city.name}"),
         atomic_outputs(snakemake.input, snakemake.output, snakemake.params),

@@ -2,11 +2,11 @@
 
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.city_files import city_of
 from stereotruth.simulate.render import simulate_image
 
 if __name__ == "__main__":
-    city = CITIES[snakemake.wildcards.city]
+    city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
     view = snakemake.wildcards.view
     with (

@@ -2,12 +2,12 @@
 
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.simulate.cities import CITIES
+from stereotruth.simulate.city_files import city_of
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.truth import simulate_truth
 
 if __name__ == "__main__":
-    city = CITIES[snakemake.wildcards.city]
+    city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"simulate {scene.name} truth"),
@@ -16,7 +16,7 @@ if __name__ == "__main__":
         simulate_points(
             city,
             scene,
-            None,  # the measured ground control points stand in config/gcps
+            snakemake.output.measured,
             snakemake.output.gcps,
             snakemake.output.checkpoints,
             seed=snakemake.params.seed,

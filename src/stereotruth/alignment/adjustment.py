@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.fit import fit_epipolar
+from ..epipolar.line_correction import LineCorrection
 from ..epipolar.model import EpipolarModel
 from ..epipolar.rpc import SensorModel
 from ..numerics.robust import TUKEY, robust_sigma, tukey_weights
@@ -44,6 +45,7 @@ class Observations:
     at: Floats
     before: Floats
     after: Floats
+    by_affines: Floats
     used: Bools
     of_images: PairEquations
 
@@ -107,7 +109,7 @@ def prior_of(alignment: Alignment) -> Floats:
     return prior
 
 
-def _root(covariance: Floats) -> Floats:
+def root_of(covariance: Floats) -> Floats:
     """[12, r] with covariance = root · rootᵀ, without the directions that are fixed."""
     values, vectors = np.linalg.eigh(covariance)
     keep = values > 1e-12 * values.max()
@@ -226,7 +228,7 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
     show.
     """
     design, observed, own = equations.design, equations.observed, equations.own
-    root = _root(prior)
+    root = root_of(prior)
     sites = np.unique(equations.site, return_inverse=True)[1]
     counts = np.bincount(sites)[sites]
     expected = np.hypot(own, MATCHING)[:, None]
@@ -327,10 +329,12 @@ def pair_equations(
     ties: TiePoints,
     places: int,
     common_px: float,
+    by_line: Floats | float = 0.0,
 ) -> PairEquations:
     """The equations of tie points that were matched with an alignment ``current``.
 
-    ``start``: that by control points or RPCs; ``model``: of the current one.
+    ``start``: that by control points or RPCs; ``model``: of the current one; ``by_line`` [n, 2] px:
+    what its corrections by line have changed, along and across.
     """
 
     def parameters(alignment: Alignment) -> Floats:
@@ -339,25 +343,36 @@ def pair_equations(
     left, right = (over_the_image(fit) for fit in current.fits)
     design, slopes = linearised_at(replace(current, left_fit=left, right_fit=right), model, ties)
     at = parameters(current)
-    observed = np.einsum("nab,nb->na", slopes, ties.shift) + design @ at
-    equations = Equations(design, observed, ties.sigma, ties.site, ties.left)
+    observed = np.einsum("nab,nb->na", slopes, ties.shift) + design @ at + by_line
+    equations = Equations(design, observed, ties.sigma, ties.site, ties.left, ties.right)
     return PairEquations(equations, parameters(start), at, places, common_px)
 
 
-def with_corrections(alignment: Alignment, parameters: Floats) -> Alignment:
-    """The alignment with both affines moved by parameters [12]."""
-    fits = []
-    for fit, own in zip(alignment.fits, (parameters[:6], parameters[6:])):
+def with_corrections(
+    alignment: Alignment,
+    parameters: Floats,
+    by_line: tuple[LineCorrection | None, LineCorrection | None] = (None, None),
+) -> Alignment:
+    """The alignment with both affines moved by parameters [12], and corrections by line."""
+    fits, sensors = [], []
+    for fit, sensor, own, lines in zip(
+        alignment.fits,
+        (alignment.left, alignment.right),
+        (parameters[:6], parameters[6:]),
+        by_line,
+    ):
         affine = fit.moved(own)
+        sensors.append(SensorModel(sensor.rpc, affine, lines))
         gcps = []
         for gcp in fit.gcps:
-            after = np.array(gcp.measured) - affine @ (*gcp.predicted, 1.0)
+            at = affine @ (*gcp.predicted, 1.0)
+            after = np.array(gcp.measured) - (at if lines is None else np.array(lines.add(*at)))
             gcps.append(replace(gcp, after=tuple(after.tolist())))
         fits.append(replace(fit, affine=affine, gcps=tuple(gcps)))
     return replace(
         alignment,
-        left=SensorModel(alignment.left.rpc, fits[0].affine),
-        right=SensorModel(alignment.right.rpc, fits[1].affine),
+        left=sensors[0],
+        right=sensors[1],
         left_fit=fits[0],
         right_fit=fits[1],
     )
@@ -371,12 +386,13 @@ def epipolar_model(alignment: Alignment) -> EpipolarModel:
         alignment.left_fit.size,
         alignment.right_fit.size,
         alignment.reference_height,
+        height_range=alignment.model_heights,
     )
 
 
 def pull_of(design: Floats, observed: Floats, prior: Floats) -> Floats:
     """Parameters [12] for places [n] that all together tell one shift, to a pixel."""
-    root = _root(prior)
+    root = root_of(prior)
     inner = (design @ root).reshape(-1, root.shape[1])
     normal = np.eye(root.shape[1]) + inner.T @ inner / len(design)
     return root @ np.linalg.solve(normal, inner.T @ observed.ravel() / len(design))

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.rpc import SensorModel
 from ..errors import InputError
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..products.provenance import describe, source_digest
 from .aligned_pair import Alignment, GcpResidual, ViewFit
 from .control_points import ControlPoints, read_gcps
@@ -141,6 +142,7 @@ def align(
     scene: str = "",
     seed: int = 0,
     strict: bool = False,
+    epoch: Epoch = DEFAULT_EPOCH,
     provenance: Mapping[str, Any] | None = None,
 ) -> Alignment:
     """Correct the RPCs of a pair by ground control points.
@@ -149,7 +151,8 @@ def align(
     A GCP is left out of a view if its studentised residual exceeds :data:`BLUNDER_FLOOR` px and 4.5
     times the GCPs' robust deviation; up to a third of a view's GCPs. ``names`` of both images in
     the images sheet are what control points of the long form name. ``seed`` is for the samples
-    among more than 23 GCPs. The result does not depend on the order of the GCPs. ``strict`` makes
+    among more than 23 GCPs. ``epoch``: of the city's places, see :func:`.control_points.read_gcps`.
+    The result does not depend on the order of the GCPs. ``strict`` makes
     warnings errors.
 
     Raises InputError, naming scene, file and remedy: unreadable input, GCPs outside the images or
@@ -162,13 +165,14 @@ def align(
         )
     of = f" (scene {scene})" if scene else ""
     images = Path(left_image), Path(right_image)
-    points = read_gcps(gcps_csv, scene, names)
+    points = read_gcps(gcps_csv, scene, names, epoch)
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
     near = check_ground(points, [footprint(*item) for item in opened], images, of)
     check_swapped(points, sensors, near, of)
 
-    doubts = [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]
+    doubts = list(points.remarks)
+    doubts += [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]
     for name, ok in zip(points.ids, near):
         if not ok:
             doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
@@ -183,6 +187,9 @@ def align(
         view = View(name, image, size, sensor, index, projected[index], measured[index])
         check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
         trials.append(_Trial.of(model, view, points, seed, of))
+    if points.frame and points.frame["source"]["legs"]:
+        legs = "; ".join(points.frame["source"]["legs"])
+        log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
     _leave_out_of_both(trials)
     out = [trial.left_out for trial in trials]
     fits = [trial.fit(model, points, other, of) for trial, other in zip(trials, reversed(out))]

@@ -25,10 +25,19 @@ UNITS = {
     "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
     "lon, lat": "degrees, WGS 84",
     "height": "m above the WGS 84 ellipsoid",
+    "model_heights": "m above the WGS 84 ellipsoid, lowest and highest that the epipolar model "
+    "is fitted to",
     "affine": "(col, row)_image = affine @ (col_rpc, row_rpc, 1); px",
     "covariance": "px^2, of (a_u, a_v, a_1, b_u, b_v, b_1) in col = … + a_u u + a_v v + a_1, "
     "row = … + b_u u + b_v v + b_1 with (u, v) = ((col, row)_rpc - origin) / scale",
     "cross_covariance": "px^2, of the left image's parameters (rows) with the right's",
+}
+OF_MISFITS = {
+    "lines_covariance": "px^2, at equal steps of the left image from its first line to its last: "
+    "of the corrections by line (col, row) of the left image's line, and (col, row) of the right "
+    "image's that shows the same ground",
+    "shared_px": "px, standard deviation of disparity by errors that near tie points share and no "
+    "correction fits",
 }
 
 
@@ -125,7 +134,10 @@ class Alignment:
     ``reference_height``: mean of the GCPs that are used in either view (without any: of the RPCs,
     after refinement of the tie points), ellipsoidal m.
     ``cross_covariance`` float64[6, 6] of the left fit's parameters with the right's, px²;
-    ``refinement``: what `refine` observed and changed, empty before.
+    ``model_heights``: ellipsoidal m, over which the pair's epipolar model is fitted: those of the
+    LiDAR that `refine` saw, and a margin; None: all that both RPCs cover;
+    ``refinement``: what `refine` observed and changed, empty before. ``lines_covariance`` [k, 4, 4]
+    and ``shared_px``: see OF_MISFITS; None and 0 without any.
     """
 
     scene: str
@@ -138,13 +150,23 @@ class Alignment:
     warnings: tuple[str, ...]
     provenance: dict[str, Any]
     cross_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    model_heights: tuple[float, float] | None = None
     refinement: dict[str, Any] = field(default_factory=dict)
+    lines_covariance: Floats | None = None
+    shared_px: float = 0.0
 
     @property
     def covariance(self) -> Floats:
         """float64[12, 12] px² of the parameters of both fits, left first."""
         left, right = (fit.covariance for fit in self.fits)
         return np.block([[left, self.cross_covariance], [self.cross_covariance.T, right]])
+
+    def of_lines(self, view: str) -> Floats:
+        """float64[2, 2] px² of the (col, row) of a view by its correction by line, mean of all."""
+        if self.lines_covariance is None:
+            return np.zeros((2, 2))
+        own = slice(0, 2) if view == "left" else slice(2, 4)
+        return self.lines_covariance[:, own, own].mean(axis=0)
 
     @property
     def fits(self) -> tuple[ViewFit, ViewFit]:
@@ -160,14 +182,21 @@ class Alignment:
                 ("right", self.right, self.right_fit),
             )
         }
+        misfits: dict[str, Any] = {}
+        if self.lines_covariance is not None:
+            misfits["lines_covariance"] = self.lines_covariance.tolist()
+        if self.shared_px:
+            misfits["shared_px"] = self.shared_px
         return {
             "what": "RPCs of a stereo pair, corrected by ground control points",
-            "units": UNITS,
+            "units": UNITS | {name: OF_MISFITS[name] for name in misfits},
             "scene": self.scene,
             "model": self.model,
             "reference_height": self.reference_height,
+            "model_heights": None if self.model_heights is None else list(self.model_heights),
             **views,
             "cross_covariance": self.cross_covariance.tolist(),
+            **misfits,
             "refinement": self.refinement,
             "warnings": list(self.warnings),
             "provenance": self.provenance,
@@ -176,6 +205,7 @@ class Alignment:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Alignment:
         """The inverse of :meth:`to_dict`."""
+        heights = values.get("model_heights")  # which a file that a user made may do without
         return cls(
             scene=values["scene"],
             model=values["model"],
@@ -187,7 +217,12 @@ class Alignment:
             warnings=tuple(values["warnings"]),
             provenance=values["provenance"],
             cross_covariance=np.array(values["cross_covariance"]),
+            model_heights=None if heights is None else tuple(heights),
             refinement=values["refinement"],
+            lines_covariance=(
+                np.array(values["lines_covariance"]) if "lines_covariance" in values else None
+            ),
+            shared_px=values.get("shared_px", 0.0),
         )
 
     def save(self, path: str | Path) -> None:

@@ -5,6 +5,11 @@ and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each o
 (0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
 see the point.
 
+Lines with ``#`` above the header are remarks. ``# frame: EPSG:6318`` names the geographic system of
+the ground coordinates where this is not WGS 84, ``# epoch: 2016.4`` their epoch where the frame is
+dynamic, or WGS 84 (ITRF) at another date than that of the images. Points are brought to ITRF2020 at
+the epoch of the city's images (:mod:`stereotruth.lidar.frames`).
+
 Or the long form, one line per point and image, which serves all pairs of a site: ``id,lon,lat,
 height,image,col,row``, ``image`` being a name of the images sheet.
 """
@@ -12,16 +17,22 @@ height,image,col,row``, ``image`` being a name of the images sheet.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
+from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
 from ..products.files import of_text
+from ..settings import epoch_year
 
 Floats = NDArray[np.float64]
 
@@ -30,6 +41,7 @@ COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "r
 LONG = ("id", "lon", "lat", "height", "image", "col", "row")  # one line per point and image
 MOST_POINTS = 20_000  # lines; nobody measures as many
 MOST_BYTES = 20_000_000  # of their file
+REMARK = re.compile(r"#\s*(frame|epoch)\s*:\s*(.*?)[\s,]*$", re.IGNORECASE)
 LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
 
@@ -48,7 +60,8 @@ class ControlPoints:
 
     ``lon``, ``lat`` degrees and ``height`` ellipsoidal m, float64[n]; ``left``, ``right``
     float64[n, 2] measured (col, row) px, NaN where the view does not see the point; ``line``:
-    line of the file.
+    line of the file; ``frame``: record of the frame and epoch of the ground coordinates, and of
+    those that the file has; ``remarks`` for the user about them.
     """
 
     file: Path
@@ -59,6 +72,8 @@ class ControlPoints:
     height: Floats
     left: Floats
     right: Floats
+    frame: dict[str, Any] | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def in_left(self) -> NDArray[np.bool_]:
@@ -72,12 +87,16 @@ class ControlPoints:
 
 
 def read_gcps(
-    file: str | Path, scene: str = "", images: tuple[str, str] | None = None
+    file: str | Path,
+    scene: str = "",
+    images: tuple[str, str] | None = None,
+    epoch: Epoch = DEFAULT_EPOCH,
 ) -> ControlPoints:
     """Read and check the ground control points (or check points) of a scene.
 
     Takes a byte-order mark, CRLF, blank lines, spaces around cells and columns in any order. Of the
     long form, the points that the scene's ``images`` (names of the left and the right one) show.
+    Ground coordinates of another frame than WGS 84, or of another ``epoch``, are brought there.
 
     Raises InputError, naming the file and the line, for anything else that is not as it should be.
     """
@@ -87,7 +106,7 @@ def read_gcps(
     def fail(problem: str, remedy: str, kind: type[InputError] = InputError) -> InputError:
         return kind(problem + of, file=file, remedy=remedy)
 
-    rows = _rows(file, fail)
+    rows, declared = _rows(file, fail)
     if rows and "image" in rows[0][1]:
         rows = _as_pair(rows, images, fail)
     points: dict[str, tuple[int, list[float]]] = {}
@@ -111,7 +130,7 @@ def read_gcps(
     _refuse_copies(points, fail)
     ids = sorted(points)
     values = np.array([points[name][1] for name in ids])
-    return ControlPoints(
+    found = ControlPoints(
         file=file,
         ids=tuple(ids),
         line=tuple(points[name][0] for name in ids),
@@ -120,6 +139,49 @@ def read_gcps(
         height=values[:, 2].copy(),
         left=values[:, 3:5].copy(),
         right=values[:, 5:7].copy(),
+    )
+    return _in_itrf(found, declared, epoch, fail)
+
+
+def _in_itrf(points: ControlPoints, declared: dict[str, str], epoch: Epoch, fail) -> ControlPoints:
+    """The points at an epoch in ITRF2020, where their file declares a frame or an epoch."""
+    remedy = "write it as in '# frame: EPSG:6318' or '# epoch: 2016.4', or leave it out"
+    try:
+        system = CRS.from_user_input(declared.get("frame") or "EPSG:4979")
+        own = epoch_year(declared.get("epoch", ""))
+    except CRSError as error:
+        raise fail(f"its frame {declared['frame']!r} cannot be used ({error})", remedy) from None
+    except ValueError as error:
+        raise fail(f"its epoch {declared['epoch']!r} {error}", remedy) from None
+    if not system.is_geographic:
+        raise fail(
+            f"its frame '{system.name}' is no geographic system",
+            "name that of its longitudes and latitudes, as EPSG:6318 of NAD83(2011)",
+        )
+    place = float(np.median(points.lon)), float(np.median(points.lat))
+    try:
+        change = frame_change(system, place, epoch, own)
+    except InputError as error:
+        raise fail(
+            error.problem,
+            error.remedy.replace("lidar_epoch", "'# epoch:' in it (gcps import: --epoch)"),
+        ) from None
+    if change is None:
+        record = taken_as_it_is(system, epoch)
+        if record["source"]["epoch"] is None:
+            raise fail(
+                f"how its frame '{system.name}' gets to ITRF2020 is not known to centimetres",
+                "transform the points to ITRF2020 by the country's own service",
+            )
+        return replace(points, frame=record)
+    lon, lat, height = change(points.lon, points.lat, points.height)
+    return replace(
+        points,
+        lon=lon,
+        lat=lat,
+        height=height,
+        frame=change.describe(),
+        remarks=change.notes,
     )
 
 
@@ -133,7 +195,7 @@ def images_measured(file: str | Path) -> dict[str, int]:
         return InputError(problem, file=file, remedy=remedy)
 
     found: dict[str, int] = {}
-    for line, cells in _rows(Path(file), fail):
+    for line, cells in _rows(Path(file), fail)[0]:
         if "image" in cells:
             found.setdefault(of_text(cells["image"]), line)
     return found
@@ -203,8 +265,9 @@ def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
                 )
 
 
-def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
-    """(line number, stripped cells by column) of each line that holds anything."""
+def _rows(file: Path, fail) -> tuple[list[tuple[int, dict[str, str]]], dict[str, str]]:
+    """(line number, stripped cells by column) of each line that holds anything, and what remarks
+    above the header declare (frame, epoch)."""
     try:
         if file.stat().st_size > MOST_BYTES:
             raise fail(
@@ -218,7 +281,15 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
         raise fail(f"cannot be read as text ({error})", "save it as CSV in UTF-8") from None
     header: list[str] | None = None
     rows = []
-    reader = csv.reader(text.splitlines())
+    lines, declared = text.splitlines(), {}
+    for k, line in enumerate(lines):
+        remark = line.strip().strip('"')
+        if remark and not remark.startswith("#"):
+            break
+        if found := REMARK.match(remark):
+            declared[found[1].lower()] = found[2].strip('"')
+        lines[k] = ""  # counted all the same
+    reader = csv.reader(lines)
     expected = f"the header is {','.join(COLUMNS)}, or {','.join(LONG)}"
     for cells in _readable(reader, fail):
         cells = [cell.strip() for cell in cells]
@@ -252,7 +323,7 @@ def _rows(file: Path, fail) -> list[tuple[int, dict[str, str]]]:
             )
     if header is None:
         raise fail("the file is empty", expected)
-    return rows
+    return rows, declared
 
 
 def _readable(reader, fail) -> Iterator[list[str]]:

@@ -20,7 +20,7 @@ class Equations:
     ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
     matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
     and biased where the surface is not what the points say). Observations of one ``site`` int[n]
-    share errors. ``at`` [n, 2] px: place in the left image.
+    share errors. ``at``, ``there`` [n, 2] px: place in the left and in the right image.
     """
 
     design: Floats
@@ -28,6 +28,12 @@ class Equations:
     own: Floats
     site: NDArray[np.int64]
     at: Floats
+    there: Floats
+
+    @property
+    def lines(self) -> Floats:
+        """[n, 2] px: lines of the left and of the right image."""
+        return np.column_stack([self.at[:, 1], self.there[:, 1]])
 
     def part(self, chosen: Bools) -> Equations:
         """Those that are ``chosen`` [n]."""
@@ -39,6 +45,21 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
+class PlanObservation:
+    """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
+
+    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
+    ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
+    east and to the north moves a place, and so the error that all images have in common.
+    """
+
+    design: Floats
+    observed: Floats
+    covariance: Floats
+    px_per_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class PairEquations:
     """What the tie points of a pair say of its images, whatever alignment they were found with.
 
@@ -46,7 +67,8 @@ class PairEquations:
     first.
     ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
     with which the tie points were matched. ``places``: where the images were compared, with and
-    without a match. ``common_px``: see :func:`.adjustment.estimate`.
+    without a match. ``common_px``: see :func:`.adjustment.estimate`. ``in_plan``: the
+    place of the left and of the right image in plan, if edges of roofs tell it.
     """
 
     equations: Equations
@@ -54,6 +76,7 @@ class PairEquations:
     linearised_at: Floats
     places: int
     common_px: float
+    in_plan: tuple[PlanObservation, ...] = ()
 
 
 def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:

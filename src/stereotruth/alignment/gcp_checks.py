@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
+from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 
 from ..epipolar.rpc import SensorModel
 from ..epipolar.rpc_files import read_rpc, rpc_file
 from ..errors import InputError, in_number
-from ..numerics.degrees import metres_per_degree
+from ..numerics.degrees import metres_per_degree, turn
 from ..products.ungeoreferenced import open_raster
 from .control_points import ControlPoints, TooFewPoints
 from .robust_fit import MINIMAL, System
@@ -32,6 +35,8 @@ MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
 PIXEL_M = (0.01, 1000.0)  # m on the ground
 PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
+GRID_SHIFT_M = 100.0  # between an image's map grid and its RPC: rounded corners and a loose RPC
+GRID_BENT = 0.01  # of the image's diagonal likewise, without the shift
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
@@ -100,12 +105,21 @@ def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, 
     try:
         with open_raster(image) as dataset:
             size = dataset.width, dataset.height
+            apart = _apart_of_grid(dataset, sensor)
     except RasterioError as error:
         raise InputError(
             f"cannot be opened as the {name} image{of} ({error})",
             file=image,
             remedy="check the file",
         ) from None
+    if apart:
+        raise InputError(
+            f"the {name} image {image.name} is on a map grid and has an RPC, which put its pixels "
+            f"{apart:.0f} m apart: it was map-projected, or cut, and kept the RPC from before{of}",
+            file=image,
+            remedy="give the image as the sensor saw it, with its RPC; if it is that, take the "
+            "grid away (gdal_edit.py -unsetgt -a_srs '')",
+        )
     if defect := _blindness(sensor, size):
         raise InputError(
             f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
@@ -114,6 +128,35 @@ def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, 
             "image's supplier",
         )
     return sensor, size
+
+
+def _apart_of_grid(dataset: Any, sensor: SensorModel) -> float:
+    """Metres by which an image's map grid and its RPC contradict each other; 0 if they do not.
+
+    Images that were projected to a plane (ortho-ready) have RPCs of their own, which agree with the
+    grid at one height. Corners of NITF are rounded to a second of arc: GRID_SHIFT_M is allowed.
+    """
+    if dataset.crs is None or dataset.transform == dataset.transform.identity():
+        return 0.0
+    try:
+        to_degrees = pyproj.Transformer.from_crs(dataset.crs.to_wkt(), 4326, always_xy=True)
+    except ProjError:
+        return 0.0
+    axes = (np.linspace(0, n - 1, 5) for n in (dataset.width, dataset.height))
+    col, row = (v.ravel() for v in np.meshgrid(*axes))
+    lon, lat = to_degrees.transform(*(dataset.transform * (col + 0.5, row + 0.5)))
+    best = np.inf, np.inf
+    for share in np.linspace(-1.0, 1.0, 21):
+        height = sensor.rpc.height_off + share * sensor.rpc.height_scale
+        at = np.array(sensor.localize(col, row, height)) - (lon, lat)
+        east, north = np.stack([turn(at[0]), at[1]]) * metres_per_degree(lat)
+        whole = np.hypot(east, north)
+        bent = np.hypot(east - east.mean(), north - north.mean())
+        if np.isfinite(whole).all():
+            best = min(best, (float(np.sqrt(np.mean(whole**2))), float(np.sqrt(np.mean(bent**2)))))
+    east, north = (np.ptp(v) for v in np.array([lon, lat]) * metres_per_degree(lat))
+    is_other = best[0] > GRID_SHIFT_M or best[1] > GRID_BENT * np.hypot(east, north)
+    return best[0] if is_other and np.isfinite(best[0]) else 0.0
 
 
 def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:

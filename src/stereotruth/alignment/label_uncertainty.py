@@ -54,11 +54,13 @@ def label_covariance(
         right = np.stack(model.epipolar_to_right(x, y), axis=-1)
         ground = model.right.localize(right[..., 0], right[..., 1], height)
         left = np.stack(model.left.project(*ground, height), axis=-1)
+    slopes = [
+        image.slopes(at[..., 0], at[..., 1])
+        for image, at in zip((model.left_image, model.right_image), (left, right))
+    ]
     of_left, of_right = (
-        image.slopes(at[..., 0], at[..., 1]) @ fit.design(at[..., 0], at[..., 1])
-        for image, at, fit in zip(
-            (model.left_image, model.right_image), (left, right), alignment.fits
-        )
+        slope @ fit.design(at[..., 0], at[..., 1])
+        for slope, at, fit in zip(slopes, (left, right), alignment.fits)
     )
     effects = np.zeros((*x.shape, 3, 12))  # of the alignment's parameters on (d, x, y)
     effects[..., 0, :6], effects[..., 0, 6:] = of_left[..., 0, :], -of_right[..., 0, :]
@@ -67,7 +69,32 @@ def label_covariance(
     else:
         effects[..., 1:, 6:] = of_right
     weighted = np.einsum("...ip,pq->...iq", effects, alignment.covariance)
-    return np.einsum("...iq,...jq->...ij", weighted, effects)
+    found = np.einsum("...iq,...jq->...ij", weighted, effects)
+    found[..., 0, 0] += alignment.shared_px**2
+    if alignment.lines_covariance is not None:
+        found += _of_lines(alignment, left[..., 1], *slopes, view)
+    return found
+
+
+def _of_lines(
+    alignment: Alignment, line: Floats, of_left: Floats, of_right: Floats, view: str
+) -> Floats:
+    """Covariance [..., 3, 3] px² of (d, x, y) by the corrections of both images by line.
+
+    ``line`` [...] px of the left image; ``of_left``, ``of_right`` [..., 2, 2]: change of each
+    image's (x, y) with its (col, row).
+    """
+    nodes = alignment.lines_covariance
+    at = line / (alignment.left_fit.size[1] - 1.0) * (len(nodes) - 1)
+    at = np.clip(np.nan_to_num(at), 0.0, len(nodes) - 1.0)
+    low = np.minimum(at.astype(np.int64), len(nodes) - 2)
+    share = (at - low)[..., None, None]
+    covariance = (1.0 - share) * nodes[low] + share * nodes[low + 1]
+    effects = np.zeros((*line.shape, 3, 4))
+    effects[..., 0, :2], effects[..., 0, 2:] = of_left[..., 0, :], -of_right[..., 0, :]
+    own = slice(0, 2) if view == "left" else slice(2, 4)
+    effects[..., 1:, own] = of_left if view == "left" else of_right
+    return effects @ covariance @ np.swapaxes(effects, -1, -2)
 
 
 def label_sigma(

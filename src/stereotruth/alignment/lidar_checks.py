@@ -29,12 +29,14 @@ Floats = NDArray[np.float64]
 
 
 LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
+LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
 FAR_OFF = 4.0  # deviations that no point of the LiDAR around a control point may lie off it
 CHANCE = 1e-4  # probability that heights without a fault are doubted by the tie points
 CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tell about
 AROUND = 12  # points around a control point that are looked at, or all
 WIDEST_M = 5.0  # within this, or none
 FEWEST_GCPS = 3
+MODEL_MARGIN_M, MODEL_MARGIN = 10.0, 0.1  # m, and share of the LiDAR's span: what rises above it
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,23 @@ def control_points_of(alignment: Alignment) -> list[GcpResidual]:
     """The control points that either view uses, by their ids."""
     used = {g.id: g for fit in alignment.fits for g in fit.gcps if g.used}
     return [used[name] for name in sorted(used)]
+
+
+def heights_of_model(
+    stores: Sequence[PointStore], sensors: Sequence[SensorModel]
+) -> tuple[float, float] | None:
+    """Over which heights (ellipsoidal m) an epipolar model serves: the LiDAR's, and a margin.
+
+    None where all of the LiDAR is outside the RPCs' heights; a stray point that is has no say.
+    """
+    low = min(int(store.cell_heights.min()) for store in stores) / PER_M
+    high = max(int(store.cell_heights.max()) for store in stores) / PER_M
+    margin = MODEL_MARGIN_M + MODEL_MARGIN * (high - low)
+    for sensor in sensors:
+        lowest, highest = sensor.rpc.ground_box[4:]
+        spare = (highest - lowest) / 4
+        low, high = max(low, lowest - spare), min(high, highest + spare)
+    return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
 def _heights_around(
@@ -180,6 +199,33 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
     sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
     return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
+
+
+def contradiction(alignment: Alignment, found: Estimate) -> float:
+    """Chi-square of the tie points against what is known of the alignment and of the LiDAR in plan.
+
+    ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
+    moved = []
+    for east, north in ((step[0], 0.0), (0.0, step[1])):
+        ends = [
+            np.stack([
+                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
+                for sensor in (alignment.left, alignment.right)
+            ])
+            for sign in (-0.5, 0.5)
+        ]  # fmt: skip
+        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
+    plan = np.stack(moved, axis=1)
+    values, vectors = np.linalg.eigh(found.normal)
+    seen = values > 1e-9 * values.max()
+    alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
+    known = vectors[:, seen].T @ (np.eye(len(values)) + plan @ plan.T) @ vectors[:, seen]
+    return float(alone @ np.linalg.solve(known + np.diag(1.0 / values[seen]), alone))
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:

@@ -5,13 +5,14 @@ LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative 
 both images have in common they see on slopes only, as LiDAR strips are co-registered by their
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it.
+settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
+open, edges of roofs settle it (:mod:`.plan_place`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
 by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if the tie
-points do not contradict it, or if the corrections from one half of the sites do not improve the
+from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
+points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
 other half.
 """
 
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,6 @@ from .adjustment import (
     Observations,
     agreement_of_halves,
     epipolar_model,
-    estimate,
     linearised_at,
     pair_equations,
     prior_of,
@@ -47,15 +47,22 @@ from .adjustment import (
 )
 from .aligned_pair import Alignment, ViewFit
 from .equations import Equations, spread_of
+from .lack_of_fit import SharedErrors, with_shared_errors
 from .lidar_checks import (
     HeightOffset,
+    contradiction,
     control_points_of,
     doubt_at_gcps,
     doubt_by_rpcs,
     height_by_images,
     height_by_rpcs,
+    heights_of_model,
     pixel_m,
 )
+from .line_fit import UNKNOWNS as LINE_UNKNOWNS
+from .line_fit import LineFit, estimate_with_lines, line_design
+from .misfit_causes import LabelSigma, remark_of
+from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -125,7 +132,8 @@ def _record(
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
-        "lidar_height: m, of LiDAR minus images, and from what on a fault is told",
+        "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
+        "m (east, north), see plan_place",
     }
 
 
@@ -133,15 +141,30 @@ def _chance(found: Estimate) -> float:
     return float(f"{chdtrc(found.freedom, found.statistic):.3g}")
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What tie points tell: the estimate, errors that it shares, lines, the refined alignment,
+    :func:`agreement_of_halves`, and what all of it means for labels."""
+
+    observations: Observations
+    estimate: Estimate
+    shared: SharedErrors
+    lines: LineFit
+    alignment: Alignment
+    halves: tuple[float, float]
+    sigma: LabelSigma
+
+
 def _search(
     alignment: Alignment,
     sources: tuple[Source, Source],
     stores: Sequence[PointStore],
     prior: Floats,
-) -> tuple[Observations, Estimate, Alignment, tuple[float, float]] | str:
+) -> _Found | str:
     """Tie points, estimate, refined alignment and :func:`agreement_of_halves`; or why not."""
     sizes = sources[0].size, sources[1].size
-    parameters = np.zeros(12)
+    rows = sizes[0][1], sizes[1][1]
+    parameters, by_line = np.zeros(12), np.zeros(LINE_UNKNOWNS)
     places, found_at = None, parameters
     radius = FINE
     current = alignment
@@ -177,41 +200,69 @@ def _search(
             return f"only {len(ties)} tie points in {np.unique(ties.site).size} parts of the scene"
         design, slopes = linearised_at(current, model, ties)
         observed = np.einsum("nab,nb->na", slopes, ties.shift)
-        equations = Equations(
-            design, observed + design @ parameters, ties.sigma, ties.site, ties.left
-        )
-        found = estimate(equations, prior, places.guard.common_px)
-        change = float(np.abs(design @ (found.parameters - parameters)).max())
-        log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
+        of_lines = line_design(design, np.column_stack([ties.left[:, 1], ties.right[:, 1]]), rows)
+        total = observed + design @ parameters + of_lines @ by_line
+        equations = Equations(design, total, ties.sigma, ties.site, ties.left, ties.right)
+        found, lines = estimate_with_lines(equations, prior, places.guard.common_px, rows)
         of_images = pair_equations(
-            alignment, current, model, ties, len(places), places.guard.common_px
+            alignment, current, model, ties, len(places), places.guard.common_px, of_lines @ by_line
         )
-        last, parameters = parameters, found.parameters
-        current = with_corrections(alignment, parameters)
+        moved = design @ (found.parameters - parameters) + of_lines @ (lines.coefficients - by_line)
+        change = float(np.abs(moved).max())
+        log.info("round %d: %d tie points, change %.3f px", number + 1, len(ties), change)
+        parameters, by_line = found.parameters, lines.coefficients
+        current = with_corrections(alignment, parameters, lines.corrections)
         if change < SETTLED and radius == FINEST:
             break
         radius = FINEST if change < FINEST / 2 or radius == FINEST else FINE
+    equations = replace(equations, observed=total - of_lines @ by_line)
+    by_scatter = found.covariance
+    found, shared = with_shared_errors(found, equations, by_line=lines.stands_out)
+    current = with_corrections(alignment, found.parameters, lines.corrections)
     observations = Observations(
         ties,
         np.stack(model.left_to_epipolar(*ties.left.T), axis=1),
-        observed + design @ last,
-        observed + design @ (last - parameters),
+        total,
+        equations.observed - design @ found.parameters,
+        total - design @ found.parameters,
         found.weights > 0.0,
         of_images,
     )
-    scatter = max(
-        robust_sigma(observations.after[found.weights > 0.0, k], LEAST_SIGMA) for k in (0, 1)
-    )
-    used = float(np.mean(found.weights > 0.0))
-    if scatter > LOOSE or used < MIN_USED:
-        return (
-            f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used):.0f} % "
-            "blunders): LiDAR and images do not show the same ground, or not at the same height"
-        )
-    equations = replace(equations, design=design, observed=observations.before)
+    if reason := _discord(observations):
+        return reason
     halves = agreement_of_halves(equations, prior)
     log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
-    return observations, found, current, halves
+    sigma = LabelSigma.of(
+        design[:, 0], ties.left[:, 1], rows[0], (by_scatter, found.covariance), lines, shared
+    )
+    return _Found(observations, found, shared, lines, current, halves, sigma)
+
+
+def _placed(
+    start: Alignment, result: _Found, sources: tuple[Source, Source], stores: Sequence[PointStore]
+) -> tuple[_Found, dict[str, Any]]:
+    """What tie points tell, with the place in plan, and the figures of it."""
+    found, figures, seen = place_pair(result.alignment, result.estimate, sources, stores)
+    of_images = replace(result.observations.of_images, in_plan=seen)
+    placed = replace(
+        result,
+        observations=replace(result.observations, of_images=of_images),
+        estimate=found,
+        alignment=with_corrections(start, found.parameters, result.lines.corrections),
+    )
+    return placed, figures
+
+
+def _discord(observations: Observations) -> str:
+    """Why tie points tell nothing, or an empty string."""
+    used = observations.used
+    scatter = max(robust_sigma(observations.after[used, k], LEAST_SIGMA) for k in (0, 1))
+    if scatter <= LOOSE and used.mean() >= MIN_USED:
+        return ""
+    return (
+        f"the tie points contradict each other ({scatter:.2f} px, {100 * (1 - used.mean()):.0f} % "
+        "blunders): LiDAR and images do not show the same ground, or not at the same height"
+    )
 
 
 def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) -> list[str]:
@@ -227,7 +278,7 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
             f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
             + (", and the points' heights" if with_gcps else "")
         ]
-    if chdtrc(found.contradiction_freedom, found.contradiction) > DOUBTFUL:
+    if chdtrc(found.contradiction_freedom, contradiction(alignment, found)) > DOUBTFUL:
         return []
     others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
@@ -288,7 +339,10 @@ def refine(
             doubt_by_rpcs(stores, sensors),
         ]
         doubts = [text for text in doubts if text]
+        alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
+        if not isinstance(result, str):
+            result, in_plan = _placed(alignment, result, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:
@@ -306,20 +360,24 @@ def refine(
             provenance=record_of,
         )
         return unrefined, None
-    observations, found, refined, halves = result
-    reason = _objection(found, halves, bool(gcps))
+    observations, found, refined = result.observations, result.estimate, result.alignment
+    reason = _objection(result, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
+    record |= _misfits(result, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
+    record["place_in_plan"] = in_plan
     record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
     covariance = found.covariance
-    misfits = [round(misfit, 3) for misfit in halves]
+    misfits = [round(misfit, 3) for misfit in result.halves]
     record["misfit_of_one_half_by_the_other"] = dict(zip(("before", "after"), misfits))
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
-        observations = replace(observations, after=observations.before)
+        observations = replace(
+            observations, after=observations.before, by_affines=observations.before
+        )
         record["after"] = record["before"]
     doubts += _doubts(alignment, record, found)
     _warn(doubts, strict, left_image, of)
@@ -340,6 +398,8 @@ def refine(
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],
+        lines_covariance=None if reason else result.lines.used_covariance,
+        shared_px=result.shared.label_px,
         refinement=record,
         provenance=record_of,
     )
@@ -347,13 +407,22 @@ def refine(
     return refined, observations
 
 
-def _objection(found: Estimate, halves: tuple[float, float], with_gcps: bool) -> str:
-    """Why a refinement is not applied, or an empty string.
+def _misfits(result: _Found, reason: str) -> dict[str, Any]:
+    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
+    return {
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+    }
 
-    ``halves``: misfit of one half of the sites, before and by the other half.
-    """
-    before, after = halves
-    if _chance(found) > SIGNIFICANT:
+
+def _objection(result: _Found, with_gcps: bool) -> str:
+    """Why a refinement is not applied, or an empty string."""
+    before, after = result.halves
+    # what roofs tell of the place of both images, tie points need not contradict
+    told = result.lines.stands_out or bool(result.observations.of_images.in_plan)
+    if _chance(result.estimate) > SIGNIFICANT and not told:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (
@@ -373,6 +442,8 @@ def _tell(record: Mapping[str, Any]) -> None:
             record["used"],
             *(pair[figure] for figure in ("median", "rms", "trend_rms") for pair in (a, b)),
         )
+    if remark := record["remark"]:
+        log.info("%s", remark)
     log.info(
         "refinement %s",
         f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.rpc import RPC
+from ..epipolar.line_correction import LineCorrection, of_record, read_correction
+from ..epipolar.rpc import RPC, SensorModel
 from ..errors import InputError
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from .align import LARGE_SHIFT
 from .aligned_pair import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
 from .image_doubts import HEAVY, image_doubts
+from .plan_frame import plan_slopes
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -65,21 +68,27 @@ def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int
     )
 
 
+def _px_per_m(rpc: RPC, size: tuple[int, int], height: float) -> Floats:
+    """By how much the middle of an image moves for a metre to the east, to the north [2, 2] px."""
+    lon, lat = rpc.localize((size[0] - 1) / 2, (size[1] - 1) / 2, height)
+    return plan_slopes(SensorModel(rpc), float(lon), float(lat), height)
+
+
 def _images(
-    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment]
+    pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment], epoch: Epoch
 ) -> dict[str, ImageToFit]:
     """All images by name, with the control points that any pair's file has of them."""
-    starts: dict[str, tuple[ViewFit, RPC]] = {}
+    starts: dict[str, tuple[ViewFit, RPC, float]] = {}
     rows: dict[str, dict[tuple[Any, ...], None]] = {}
     for pair in pairs:
         alignment = alignments[pair.scene]
         for name, fit, sensor in zip(pair.names, alignment.fits, (alignment.left, alignment.right)):
-            starts.setdefault(name, (rpc_alone(fit), sensor.rpc))
+            starts.setdefault(name, (rpc_alone(fit), sensor.rpc, alignment.reference_height))
             rows.setdefault(name, {})
         if pair.gcps is None:
             continue
         try:
-            points = read_gcps(pair.gcps, pair.scene, pair.names)
+            points = read_gcps(pair.gcps, pair.scene, pair.names, epoch)
         except NoPoints:
             continue
         for name, at in zip(pair.names, (points.left, points.right)):
@@ -87,8 +96,10 @@ def _images(
                 ground = float(points.lon[k]), float(points.lat[k]), float(points.height[k])
                 rows[name][(points.ids[k], *ground, *at[k].tolist())] = None
     return {
-        name: ImageToFit(name, fit, _points(rows[name], rpc, fit.size))
-        for name, (fit, rpc) in starts.items()
+        name: ImageToFit(
+            name, fit, _points(rows[name], rpc, fit.size), _px_per_m(rpc, fit.size, height)
+        )
+        for name, (fit, rpc, height) in starts.items()
     }
 
 
@@ -100,6 +111,7 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
     if not files:
         return None
     parameters: dict[str, Floats] = {}
+    by_line: dict[str, LineCorrection] = {}
     blocks = []
     for file in sorted({Path(path) for path in files.values()}):
         names = sorted(name for name, path in files.items() if Path(path) == file)
@@ -112,6 +124,8 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
                     remedy="name a copy of results/adjust/<city>.json that has it",
                 )
             parameters[name] = np.array(values["images"][name]["parameters"])
+            if (lines := read_correction(values["images"][name])) is not None:
+                by_line[name] = lines
         order = values["covariance"]["images"]
         index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
         blocks.append(np.array(values["covariance"]["values"])[np.ix_(index, index)])
@@ -121,7 +135,7 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
         end = start + len(block)
         covariance[start:end, start:end] = block
         start = end
-    return FixedImages(parameters, covariance)
+    return FixedImages(parameters, covariance, by_line)
 
 
 def adjust_site(
@@ -130,6 +144,7 @@ def adjust_site(
     *,
     fixed: Mapping[str, str | Path] | None = None,
     strict: bool = False,
+    epoch: Epoch = DEFAULT_EPOCH,
     provenance: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Adjust the images of a city's pairs that share images; JSON-ready figures and corrections.
@@ -142,7 +157,7 @@ def adjust_site(
     """
     scenes = sorted(scenes, key=lambda pair: pair.scene)
     alignments = {pair.scene: Alignment.load(pair.alignment) for pair in scenes}
-    images = _images(scenes, alignments)
+    images = _images(scenes, alignments, epoch)
     pairs = [
         PairToFit(pair.scene, pair.left, pair.right, *read_equations(pair.equations))
         for pair in scenes
@@ -183,6 +198,9 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
     if pair.ties is None or fit is None:
         return figures | {"places": 0, "tie_points": 0, "used": 0, "matched": 0.0}
     used = int(fit.used.sum())
+    misfits: dict[str, Any] = {"shared_px": round(fit.shared_px, 6)} if fit.shared_px else {}
+    if fit.lines_covariance is not None:
+        misfits["lines_covariance"] = fit.lines_covariance.tolist()
     return figures | {
         "places": pair.ties.places,
         "tie_points": len(fit.used),
@@ -190,6 +208,7 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
         "matched": round(used / pair.ties.places, 3),
         "misfit": round(fit.misfit, 3),
         "weight": round(fit.weight, 3),
+        **misfits,
         **residual_figures(fit.residuals[fit.used]),
     }
 
@@ -230,6 +249,7 @@ def _image_figures(
         "fixed": is_fixed,
         "parameters": parameters.tolist(),
         "affine": image.start.moved(parameters).tolist(),
+        **of_record(fit.by_line.get(name)),
         "correction": {
             "col": round(float(parameters[2]), 4),
             "row": round(float(parameters[5]), 4),

@@ -195,7 +195,7 @@ def _parallax(left: SensorModel, right: SensorModel, col: float, row: float, h: 
     return np.linalg.solve(carry, at[1] - at[0]) / 10.0
 
 
-def _query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
+def query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
     """(west, south, east, north) of all points that either image may show in a site, degrees."""
     col0, row0, low, high = site
     corner_cols, corner_rows = (
@@ -216,7 +216,7 @@ def _site_points(
 ) -> SitePoints | None:
     """The points of a site and MARGIN around it; None where there are too few."""
     col0, row0 = site[:2]
-    box = _query_box(left, right, site)
+    box = query_box(left, right, site)
     if box is None:
         return None
     points = query_points(stores, *box)

@@ -13,11 +13,11 @@ import numpy as np
 from .. import sheets
 from ..alignment.control_points import ControlPoints, read_gcps
 from ..alignment.gcp_checks import fit_exchanged, misfits_of_sides
-from ..disparity.overlap_check import apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.catalogue_list import is_catalogue, write_list
+from ..lidar.overlap_check import apart, refuse_apart
 from ..products.files import atomic_file
 from ..project import configured, sheet, with_stand_ins
 from .check_lidar import check_lidar

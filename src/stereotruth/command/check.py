@@ -8,7 +8,9 @@ from time import monotonic
 
 from ..configuration import Configuration
 from ..dataset.windows import cell_step
+from ..epochs import epoch_of_city
 from ..errors import InputError
+from ..lidar.frames import Epoch
 from ..project import (
     adjusted_scenes,
     check_fixed,
@@ -21,6 +23,7 @@ from ..project import (
     sheet,
 )
 from ..sheets import Scene
+from ..simulate.city_files import city_of, file_of
 from .check_scene import Looked, SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources
@@ -89,17 +92,22 @@ def check_project(
     adjusted = adjusted_scenes(settings, every_scene, in_sheet)
     every, facts = [project], []
     looked: Looked = {}
+    epochs: dict[str, Epoch] = {}
     began = monotonic()
     for k, (name, scene) in enumerate(scenes.items()):
         if k == TIMED:
             _tell_time(tell, (monotonic() - began) / TIMED, len(scenes) - TIMED)
         found = Findings(name)
         if is_synthetic(scene):
-            found.say("input", Level.FACT, "synthetic: images, LiDAR and truth are made by the run")
+            _check_synthetic(scene, found)
         else:
             alone = name not in adjusted
+            epoch = epochs.get(scene.city)
+            if epoch is None:
+                epoch = epochs[scene.city] = epoch_of_city(cities[scene.city], every_scene, images)
+            names = in_sheet[name]
             facts.append(
-                check_scene(scene, settings, found, in_sheet[name], alone=alone, looked=looked)
+                check_scene(scene, settings, found, names, alone=alone, looked=looked, epoch=epoch)
             )
         every.append(found)
     if settings.images:
@@ -119,6 +127,24 @@ def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None
             f"looking at {left} more scenes, about {duration(scene_s * left)}; "
             "stereotruth check SCENE … looks at some"
         )
+
+
+def _check_synthetic(scene: Scene, found: Findings) -> None:
+    """What a run makes needs nothing but the files of the place that a city is the twin of."""
+    with found.of("input"):
+        city = city_of(scene.city)
+        words = "images, LiDAR and truth are made by the run"
+        if city.twin is None:
+            found.say("input", Level.FACT, f"synthetic: {words}")
+            return
+        for file in city.twin.files:
+            if not Path(file).is_file():
+                raise InputError(
+                    "there is no such file, of which the city is the twin",
+                    file=file,
+                    remedy=f"put it back, or correct its path in {file_of(city.name)}",
+                )
+        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
 
 
 def _run(facts: Sequence[SceneFacts], settings: Configuration) -> Findings:

@@ -9,9 +9,11 @@ from pathlib import Path
 
 from ..errors import InputError, in_number, in_words
 from ..lidar.footprint import Footprint
+from ..lidar.frames import Epoch, Epochs
 from ..lidar.geoid_candidates import candidates_at, named
 from ..lidar.survey import SurveyedFile, survey
 from ..products.remote_files import url_of
+from ..settings import epoch_year
 from ..sheets import Scene
 from .findings import Findings, Level
 
@@ -23,13 +25,19 @@ NO_DATUM = (
 
 
 def check_lidar(
-    files: Sequence[Path], scene: Scene, found: Findings, footprint: Footprint | None = None
+    files: Sequence[Path],
+    scene: Scene,
+    found: Findings,
+    footprint: Footprint | None = None,
+    epoch: Epoch | None = None,
 ) -> list[SurveyedFile]:
     """The files that can be read, after what is to be said of all of them was added.
 
-    ``footprint``: the ground of which a run reads them; None: all.
+    ``footprint``: the ground of which a run reads them; None: all. ``epoch``: of the city's places.
     """
     how = {"lidar_crs": scene.lidar_crs or None, "geoid": scene.geoid or None}
+    if epoch is not None:
+        how["epochs"] = Epochs(epoch, epoch_year(scene.lidar_epoch))
 
     def look(file: Path) -> SurveyedFile | InputError:
         try:

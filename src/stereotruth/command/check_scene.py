@@ -19,17 +19,19 @@ from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..alignment.pair_ground import footprint_of
 from ..configuration import Configuration
-from ..disparity.overlap_check import FAR, Box, apart, refuse_apart
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import MAX_PIXELS, Source, bands_of
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..lidar.footprint import Footprint
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
+from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
 from ..lidar.survey import SurveyedFile
 from ..products.ungeoreferenced import open_raster
 from ..project import is_synthetic, lidar_of
 from ..sheets import Scene
 from .check_lidar import check_lidar
+from .check_strips import check_strips
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
 from .findings import Finding, Findings, Level
 
@@ -62,19 +64,21 @@ def check_scene(
     *,
     alone: bool = True,
     looked: Looked | None = None,
+    epoch: Epoch = DEFAULT_EPOCH,
 ) -> SceneFacts:
     """Add what is found of a scene to ``found``; what one part refuses keeps no other from it.
 
     ``names`` of its images in the images sheet, where they stand in it. ``alone``: the images are
     not adjusted with those of other scenes, which may have the control points that it lacks.
-    ``looked``: of images that scenes before it have, which are not read again.
+    ``looked``: of images that scenes before it have, which are not read again. ``epoch``: of the
+    city's places.
     """
     facts = SceneFacts(scene.scene)
     files: dict[str, Path] = {}
     with found.of("files"):
         files = lidar_of(scene, settings)
     images = _check_images(scene, settings, {} if looked is None else looked, found)
-    alignment, gcps = _check_alignment(scene, settings, images, names, alone, found)
+    alignment, gcps = _check_alignment(scene, settings, images, names, alone, epoch, found)
     model = None
     if alignment is not None:
         with found.of("images"):
@@ -82,7 +86,10 @@ def check_scene(
             facts.pixels = int(np.prod(model.shape))
             check_frame(Nodes.of(model), settings, found)
     footprint = ground_of(scene, settings) if files and images else None
-    surveyed = check_lidar(list(files.values()), scene, found, footprint) if files else []
+    surveyed = []
+    if files:
+        surveyed = check_lidar(list(files.values()), scene, found, footprint, epoch)
+    check_strips(surveyed, scene, found)
     facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
     if surveyed and gcps is not None:
         _hold_against_gcps(surveyed, gcps, found)
@@ -175,7 +182,7 @@ def _refuse_empty(source: Source, *, whole: bool) -> None:
         log.warning("%s: nodata at all of %d places", source.path, PLACES**2)
         return
     raise InputError(
-        f"no pixel but nodata ({source.nodata:g})",
+        f"no pixel but nodata ({source.nodata})",
         file=source.path,
         remedy="check the image and its nodata value",
     )
@@ -204,13 +211,14 @@ def _check_alignment(
     images: bool,
     names: tuple[str, str],
     alone: bool,
+    epoch: Epoch,
     found: Findings,
 ) -> tuple[Alignment | None, ControlPoints | None]:
     """The alignment as rule align makes it, and the control points, if they can be read."""
     alignment = gcps = None
     if scene.gcps and Path(scene.gcps).is_file():
         with found.of("GCPs"), _or_of_others(alone, found):
-            gcps = read_gcps(scene.gcps, scene.scene, names)
+            gcps = read_gcps(scene.gcps, scene.scene, names, epoch)
     pair = scene.left_image, scene.right_image
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"), _or_of_others(alone, found):
@@ -224,6 +232,7 @@ def _check_alignment(
                 model=model,
                 scene=name,
                 strict=settings.strict,
+                epoch=epoch,
                 provenance={},
             )
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -39,7 +40,7 @@ DEMO = CitySpec(
 )
 SPACING_M = 0.4
 SEED = 1
-TILE_PX = 256
+TILES = "tiles: # the example's images are small", "  size: 256"
 
 
 SITE_CITY = replace(
@@ -69,9 +70,9 @@ def make_example(folder: Path) -> str:
         "lidar": f"{inside}/lidar",
         "gcps": f"gcps/{scene.name}.csv",
     }
-    _append(folder / "scenes.tsv", row)
-    _append(folder / "cities.tsv", _city_row(DEMO.name, "DM"))
-    _add_settings(folder, [])
+    append_row(folder / "scenes.tsv", row)
+    append_row(folder / "cities.tsv", city_row(DEMO.name, "DM"))
+    append_settings(folder, TILES)
     return "stereotruth check"
 
 
@@ -92,9 +93,9 @@ def make_site(folder: Path) -> str:
             "file": file.relative_to(folder),
             "acquired": acquired,
         }
-        _append(sheet, row)
-    _append(folder / "cities.tsv", _city_row(SITE.city.name, "ST"))
-    _add_settings(folder, ["images: images.tsv"])
+        append_row(sheet, row)
+    append_row(folder / "cities.tsv", city_row(SITE.city.name, "ST"))
+    append_settings(folder, ["images: images.tsv", *TILES])
     return (
         f"stereotruth pairs {SITE.city.name} --most 4 --lidar data/lidar "
         f"--gcps gcps/{SITE.city.name}.csv"
@@ -111,19 +112,19 @@ def _make_lidar(city: CitySpec, folder: Path) -> None:
         simulate_lidar_tile(city, scene, file, folder / file, spacing_m=SPACING_M, seed=SEED)
 
 
-def _city_row(name: str, prefix: str) -> dict[str, object]:
+def city_row(name: str, prefix: str) -> dict[str, object]:
+    """The row of the cities sheet for a small city."""
     return {"city": name, "prefix": prefix, "training": 6, "validation": 1, "testing": 3}
 
 
-def _append(sheet: Path, values: dict[str, object]) -> None:
+def append_row(sheet: Path, values: dict[str, object]) -> None:
     """One more line of a sheet, in the order of its header."""
     header = sheet.read_text(encoding="utf-8").splitlines()[0].split("\t")
     with sheet.open("a", newline="", encoding="utf-8") as stream:
         csv.DictWriter(stream, header, delimiter="\t", lineterminator="\n").writerow(values)
 
 
-def _add_settings(folder: Path, lines: list[str]) -> None:
-    """The settings of an example at the end of its configuration."""
-    lines = [*lines, "tiles: # the example's images are small", f"  size: {TILE_PX}"]
+def append_settings(folder: Path, lines: Sequence[str]) -> None:
+    """More lines at the end of a new project's configuration."""
     with (folder / "config.yaml").open("a", encoding="utf-8") as stream:
         stream.write("\n" + "\n".join(lines) + "\n")

@@ -1,7 +1,8 @@
 """Control points of other programs in the form of the project.
 
 Pixels: (0, 0) is the centre of the upper-left pixel here and in Ames Stereo Pipeline; QGIS counts
-from the corner of that pixel, rows downward as negative numbers.
+from the corner of that pixel, rows downward as negative numbers. Places and heights mean what the
+file's system says, by the reader of systems that serves LiDAR.
 """
 
 from __future__ import annotations
@@ -10,21 +11,20 @@ import csv
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import pyproj
-from pyproj.exceptions import CRSError
 
 from ..alignment.control_points import COLUMNS, read_gcps
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
-from ..lidar.geoid import GeoidGrid
-from ..numerics.bilinear import bilinear
-from ..numerics.degrees import metres_per_degree
+from ..lidar.declared_crs import LidarCRS, parse_crs
+from ..lidar.frames import is_known
+from ..lidar.height_raster import HeightRaster
+from ..lidar.to_wgs84 import check_area, transformation
+from ..numerics.degrees import metres_per_degree, turn
 from ..products.files import as_text
-from ..products.ungeoreferenced import open_raster
 
 SAME_PLACE_M = 0.01  # points of two .points files within this are one
 NAMES = {  # column: what others call it
@@ -43,13 +43,19 @@ NAMES = {  # column: what others call it
 }
 
 
+NO_SYSTEM = "EPSG:4326"  # of degrees
+
+
 @dataclass(frozen=True)
 class Point:
-    """A control point; NaN where a view does not show it, or nothing is known of its height."""
+    """A control point; NaN where a view does not show it, or nothing is known of its height.
+
+    ``x``, ``y``, ``height`` in the system of its file, or longitude, latitude and ellipsoidal m.
+    """
 
     id: str
-    lon: float
-    lat: float
+    x: float
+    y: float
     height: float
     left: tuple[float, float] = (math.nan, math.nan)
     right: tuple[float, float] = (math.nan, math.nan)
@@ -64,8 +70,12 @@ def import_gcps(
     geoid: Path | None = None,
     left: str = "",
     right: str = "",
+    epoch: str = "",
 ) -> list[str]:
     """Write ``to`` from the files of another program; returns what was done, line by line.
+
+    Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
+    lines, as ``epoch`` of the coordinates where it is given (:mod:`..alignment.control_points`).
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -74,105 +84,185 @@ def import_gcps(
         raise InputError("is there already", file=to, remedy="name another file, or remove it")
     kinds = {file.suffix.lower() for file in files}
     if kinds == {".points"}:
-        points, lines = from_qgis(files, crs)
+        points, crs, lines = from_qgis(files, crs)
     elif kinds == {".gcp"} and len(files) == 1:
-        points, lines = from_asp(files[0], left, right)
+        points, crs, lines = from_asp(files[0], crs, left, right)
     elif len(files) == 1:
-        points, lines = from_csv(files[0], crs)
+        points, crs, lines = from_csv(files[0], crs)
     else:
         raise InputError(
             f"{len(files)} files of {', '.join(sorted(kinds))}",
             file=files[0],
             remedy="give two .points (left, right), one .gcp, or one .csv",
         )
-    if heights is not None:
-        points = with_heights(points, heights)
+    raster = heights
+    if heights is not None and heights.suffix.lower() in TABLES:
+        ground, _ = to_wgs84(points, crs, None, files[0], places_only=True)
+        points, raster = with_heights(points, ground, heights), None
+    points, notes = to_wgs84(points, crs, geoid, files[0])
+    frame = _own_frame(parse_crs(crs)) if crs else ""
+    if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
+        lon, lat = (np.array([getattr(p, axis) for p in without]) for axis in "xy")
+        surface = HeightRaster.open(raster, geoid, whole=False)
+        found = dict(zip((p.id for p in without), surface.heights_at(lon, lat)))
+        points = [replace(p, height=float(found.get(p.id, p.height))) for p in points]
+        notes += [f"{raster.name}: {note}" for note in surface.to_wgs84.notes]
     if unknown := [point.id for point in points if math.isnan(point.height)]:
         raise InputError(
             f"no height for {len(unknown)} of {len(points)} points ({', '.join(unknown[:6])})",
             file=files[0],
             remedy="give --heights: a CSV with id and height (or lon, lat, height), or a raster",
         )
-    if geoid is not None:
-        lon, lat = (np.array([getattr(p, name) for p in points]) for name in ("lon", "lat"))
-        lift = GeoidGrid(geoid)(lon, lat)
-        points = [replace(p, height=p.height + float(n)) for p, n in zip(points, lift)]
-        lines.append(f"heights brought to the ellipsoid by {geoid.name}")
-    _write(points, to)
+    _write(points, to, frame, epoch)
     try:
         read = read_gcps(to)
     except InputError:
         to.unlink()
         raise
     both = int((read.in_left & read.in_right).sum())
-    lines.append(f"{to}: {len(read.ids)} points, {both} of them in both views")
-    return lines
+    return [*lines, *notes, f"{to}: {len(read.ids)} points, {both} of them in both views"]
 
 
-def _write(points: Sequence[Point], to: Path) -> None:
+def to_wgs84(
+    points: Sequence[Point], crs: str, geoid: Path | None, file: Path, *, places_only: bool = False
+) -> tuple[list[Point], list[str]]:
+    """Points in longitude, latitude and ellipsoidal m, and remarks.
+
+    In their own frame where that is known to centimetres, else in WGS 84.
+
+    ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``places_only``: heights are
+    left as they are. Raises InputError as for LiDAR: see :func:`.to_wgs84.transformation`.
+    """
+    if not points:
+        return [], []
+    x, y, height = (np.array([getattr(p, name) for p in points]) for name in ("x", "y", "height"))
+    if not crs and ((np.abs(x) > 360).any() or (np.abs(y) > 90).any()):
+        raise InputError(
+            f"ground coordinates such as {x[0]:g}, {y[0]:g} are no degrees, and the file "
+            "names no system",
+            file=file,
+            remedy="give --crs, as in --crs EPSG:32650",
+        )
+    system = parse_crs(crs or NO_SYSTEM, "the coordinate system (--crs)", file)
+    known = np.isfinite(height)
+    if places_only or not known.any():  # what heights count from is of no account
+        system = replace(system, vertical_datum=None, ellipsoidal=True)
+        geoid = None
+    ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
+    keep_frame = bool(_own_frame(system))
+    transform = transformation(system, file, ends, geoid=geoid, keep_frame=keep_frame)
+    lon, lat, lifted = transform(x, y, np.where(known, height, 0.0))
+    bad = ~(np.isfinite(lon) & np.isfinite(lat))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(
+            f"point {points[k].id} at {x[k]:g}, {y[k]:g} has no place on Earth in '{system.name}'",
+            file=file,
+            remedy="correct its coordinates, or give another --crs",
+        )
+    spans = ((float(v.min()), float(v.max())) for v in (lon, lat))
+    notes = [*transform.notes, check_area(system, *spans, file)]
+    if transform.is_orthometric:
+        notes.append(f"heights brought to the ellipsoid by {geoid.name}")
+    height = height if places_only else np.where(known, lifted, np.nan)
+    placed = zip(points, lon, lat, height)
+    found = [replace(p, x=float(a), y=float(b), height=float(h)) for p, a, b, h in placed]
+    return found, [note for note in notes if note]
+
+
+def _own_frame(system: LidarCRS) -> str:
+    """EPSG code of the geographic system that points keep; empty: WGS 84."""
+    geodetic = system.horizontal.geodetic_crs
+    if geodetic is None or not is_known(geodetic):
+        return ""
+    code = geodetic.to_2d().to_epsg(min_confidence=20)
+    return f"EPSG:{code}" if code else ""
+
+
+def _write(points: Sequence[Point], to: Path, frame: str, epoch: str) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     with to.open("w", newline="", encoding="utf-8") as stream:
+        for name, value in (("frame", frame), ("epoch", epoch)):
+            if value:
+                stream.write(f"# {name}: {value}\n")
         writer = csv.writer(stream)
         writer.writerow(COLUMNS)
         for p in points:
             pixels = ["" if math.isnan(v) else f"{v:.4f}" for v in (*p.left, *p.right)]
             writer.writerow(
-                [as_text(p.id), f"{p.lon:.10f}", f"{p.lat:.10f}", f"{p.height:.4f}", *pixels]
+                [as_text(p.id), f"{p.x:.10f}", f"{p.y:.10f}", f"{p.height:.4f}", *pixels]
             )
 
 
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("no such file", file=file, remedy="correct the path") from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(
-            f"cannot be read as text ({error})", file=file, remedy="save it in UTF-8"
-        ) from None
+@dataclass
+class _Text:
+    """Lines [(number, text)] of a file that hold anything, and what its comments declare."""
 
+    file: Path
+    lines: list[tuple[int, str]] = field(default_factory=list)
+    declared: dict[str, str] = field(default_factory=dict)
 
-def _number(text: str, what: str, line: int, file: Path) -> float:
-    try:
-        return decimal_number(text.strip())
-    except ValueError:
-        raise InputError(
-            f"line {line}: {what} {text[:40]!r} is no number",
-            file=file,
-            remedy="write a decimal number",
-        ) from None
-
-
-def to_degrees(x: np.ndarray, y: np.ndarray, crs: str, file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """lon, lat of coordinates of a system (EPSG code or WKT; empty: they are degrees)."""
-    if not crs:
-        if (np.abs(x) > 360).any() or (np.abs(y) > 90).any():
+    @classmethod
+    def read(cls, file: Path) -> _Text:
+        """Raises InputError if it is missing or no text."""
+        try:
+            text = file.read_text(encoding="utf-8-sig")
+        except FileNotFoundError:
+            raise InputError("no such file", file=file, remedy="correct the path") from None
+        except (UnicodeDecodeError, OSError) as error:
             raise InputError(
-                f"ground coordinates such as {x[0]:g}, {y[0]:g} are no degrees, and the file "
-                "names no system",
-                file=file,
-                remedy="give --crs, as in --crs EPSG:32650",
+                f"cannot be read as text ({error})", file=file, remedy="save it in UTF-8"
+            ) from None
+        found = cls(file)
+        for number, line in enumerate(text.splitlines(), 1):
+            if said := re.match(r"#\s*(CRS|WKT|EPSG)\s*[:=]\s*(.+)", line, re.IGNORECASE):
+                found.declared.setdefault("crs", said[2].strip())
+            elif line.strip() and not line.startswith("#"):
+                found.lines.append((number, line))
+        return found
+
+    def number(self, text: str, what: str, line: int) -> float:
+        """A decimal number, NaN for an empty cell. Raises InputError that names the line."""
+        if not text.strip():
+            return math.nan
+        try:
+            return decimal_number(text.strip())
+        except ValueError:
+            raise InputError(
+                f"line {line}: {what} {text[:40]!r} is no number",
+                file=self.file,
+                remedy="write a decimal number",
+            ) from None
+
+    def table(self) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+        """Names of columns, in small letters, and (line, cells by column); any usual separator."""
+        if not self.lines:
+            raise InputError(
+                "there are no points in it", file=self.file, remedy="write a line a point"
             )
-        return x, y
-    try:
-        system = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs)
-        transform = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
-    except CRSError as error:
-        raise InputError(
-            f"its coordinate system cannot be used ({error})",
-            file=file,
-            remedy="give --crs, as in --crs EPSG:32650",
-        ) from None
-    return transform.transform(x, y)
+        separator = max(",;\t", key=self.lines[0][1].count)
+        parsed = csv.reader([line for _, line in self.lines], delimiter=separator)
+        header, *rows = [[cell.strip() for cell in cells] for cells in parsed]
+        header = [name.lower() for name in header]
+        if separator != ",":
+            rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
+        of = [dict(zip(header, [*cells, *[""] * len(header)])) for cells in rows]
+        return header, [(number, cells) for (number, _), cells in zip(self.lines[1:], of)]
+
+
+def _called(header: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
+    """What a header calls columns of ours; none of those that it lacks."""
+    found = {c: next((n for n in NAMES[c] if n in header), "") for c in columns}
+    return {column: name for column, name in found.items() if name}
 
 
 # ------------------------------------------------------------------------------------------- QGIS
 
 
-def from_qgis(files: Sequence[Path], crs: str = "") -> tuple[list[Point], list[str]]:
+def from_qgis(files: Sequence[Path], crs: str = "") -> tuple[list[Point], str, list[str]]:
     """Points of the georeferencer, one file a view; without a column id joined by their place.
 
-    Points that are switched off there are left out.
+    Points that are switched off there are left out. Also their system, and what was done.
     """
     if len(files) != 2:
         raise InputError(
@@ -180,93 +270,98 @@ def from_qgis(files: Sequence[Path], crs: str = "") -> tuple[list[Point], list[s
             file=files[0],
             remedy="give two, that of the left image first",
         )
-    views = [_qgis_view(file, crs) for file in files]
-    named = all(name for view in views for name, *_ in view)
-    joined: dict[object, dict[str, tuple]] = {}
-    for view, rows in zip(("left", "right"), views):
-        for name, lon, lat, height, pixel in rows:
-            key = name if named else _same_place(joined, lon, lat)
-            entry = joined.setdefault(key, {"ground": (name, lon, lat, height)})
-            if view in entry:
-                raise InputError(
-                    f"point {name or (lon, lat)} stands twice in it",
-                    file=files[view == "right"],
-                    remedy="remove one of the two",
-                )
-            entry[view] = pixel
-    points = []
-    for k, entry in enumerate(joined.values(), 1):
-        name, lon, lat, height = entry["ground"]
-        pixels = {view: entry[view] for view in ("left", "right") if view in entry}
-        points.append(Point(name if named else f"G{k:02d}", lon, lat, height, **pixels))
+    texts = [_Text.read(file) for file in files]
+    views = [_qgis_view(text) for text in texts]
+    every = [point for view in views for point in view]
+    systems = [crs or text.declared.get("crs", "") for text in texts]
+    placed = [
+        point
+        for text, view, system in zip(texts, views, systems)
+        for point in to_wgs84(view, system, None, text.file, places_only=True)[0]
+    ]
+    if len(set(systems)) > 1:
+        raise InputError(
+            "names another coordinate system than the other file",
+            file=files[1],
+            remedy="save both in one system, or give --crs",
+        )
+    named = all(point.id for point in every)
+    joined: dict[object, Point] = {}
+    at: dict[object, tuple[float, float]] = {}
+    for k, (point, ground) in enumerate(zip(every, placed)):
+        view = "left" if k < len(views[0]) else "right"
+        key = point.id if named else _same_place(at, ground.x, ground.y)
+        at.setdefault(key, (ground.x, ground.y))
+        entry = joined.setdefault(key, replace(point, left=Point.left, right=Point.right))
+        if not math.isnan(getattr(entry, view)[0]):
+            raise InputError(
+                f"point {point.id or (ground.x, ground.y)} stands twice in it",
+                file=files[view == "right"],
+                remedy="remove one of the two",
+            )
+        joined[key] = replace(entry, **{view: point.left})
+    points = [
+        point if named else replace(point, id=f"G{k:02d}")
+        for k, point in enumerate(joined.values(), 1)
+    ]
     how = "their ids" if named else "their map coordinates"
     counts = f"{len(views[0])} points of {files[0].name}, {len(views[1])} of {files[1].name}"
-    return points, [f"{counts}, joined by {how}"]
+    return points, systems[0], [f"{counts}, joined by {how}"]
 
 
-def _same_place(joined: dict, lon: float, lat: float) -> object:
+def _same_place(at: dict, lon: float, lat: float) -> object:
     """The key of a point that lies there already, or a new one."""
-    for key, entry in joined.items():
-        _, there_lon, there_lat, _ = entry["ground"]
-        east, north = metres_per_degree(lat) * (lon - there_lon, lat - there_lat)
+    for key, (there_lon, there_lat) in at.items():
+        east, north = metres_per_degree(lat) * (turn(lon - there_lon), lat - there_lat)
         if math.hypot(east, north) <= SAME_PLACE_M:
             return key
-    return len(joined)
+    return len(at)
 
 
-def _qgis_view(file: Path, crs: str) -> list[tuple[str, float, float, float, tuple[float, float]]]:
-    """(id or nothing, lon, lat, height or NaN, (col, row)) of each point that is switched on."""
-    lines = _text(file).splitlines()
-    if lines and (found := re.match(r"#\s*CRS:\s*(.+)", lines[0])):
-        crs = crs or found[1].strip()
-    body = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
-    if not body:
-        raise InputError("there are no points in it", file=file, remedy="save the points of QGIS")
-    header = [cell.strip().lower() for cell in next(csv.reader([body[0][1]]))]
+def _qgis_view(text: _Text) -> list[Point]:
+    """Each point that is switched on, its pixel (col, row) in ``left``."""
+    header, rows = text.table()
     axes = ("sourcex", "sourcey") if "sourcex" in header else ("pixelx", "pixely")
     for column in ("mapx", "mapy", *axes):
         if column not in header:
             raise InputError(
                 f"column {column!r} is missing",
-                file=file,
+                file=text.file,
                 remedy="save the points by QGIS: mapX,mapY,sourceX,sourceY,enable",
             )
-    rows = []
-    for number, line in body[1:]:
-        cells = dict(zip(header, next(csv.reader([line]))))
-        if cells.get("enable", "1").strip() == "0":
+    called = _called(header, ("id", "height"))
+    points = []
+    for line, cells in rows:
+        if cells.get("enable", "1") == "0":
             continue
-        values = [_number(cells.get(c) or "", c, number, file) for c in ("mapx", "mapy", *axes)]
-        tall = next((cells[c] for c in NAMES["height"] if cells.get(c)), None)
-        height = math.nan if tall is None else _number(tall, "height", number, file)
-        name = next((cells[c].strip() for c in NAMES["id"] if cells.get(c)), "")
-        if values[3] > 0:
+        x, y, col, row = (text.number(cells[c] or "-", c, line) for c in ("mapx", "mapy", *axes))
+        height = text.number(cells[called["height"]], "height", line) if "height" in called else 0
+        height = height if "height" in called else math.nan
+        if row > 0:
             raise InputError(
-                f"line {number}: sourceY is {values[3]:g}, above the image's first row",
-                file=file,
+                f"line {line}: sourceY is {row:g}, above the image's first row",
+                file=text.file,
                 remedy="georeference the image without a world file or a coordinate system of its "
                 "own: QGIS then counts rows as 0, -1, -2 …",
             )
-        rows.append((name, *values, height))
-    x, y = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
-    lon, lat = to_degrees(x, y, crs, file) if rows else (x, y)
-    return [
-        (name, float(here), float(there), height, (col - 0.5, -row - 0.5))
-        for (name, _, _, col, row, height), here, there in zip(rows, lon, lat)
-    ]
+        name = cells[called["id"]] if "id" in called else ""
+        points.append(Point(name, x, y, height, (col - 0.5, -row - 0.5)))
+    return points
 
 
 # ---------------------------------------------------------------------------- Ames Stereo Pipeline
 
 
-def from_asp(file: Path, left: str = "", right: str = "") -> tuple[list[Point], list[str]]:
+def from_asp(
+    file: Path, crs: str = "", left: str = "", right: str = ""
+) -> tuple[list[Point], str, list[str]]:
     """A .gcp file: id lat lon height, three sigmas, then image col row sigma sigma of each image.
 
     ``left``, ``right`` name the images, whole or by a part that only one has; else there have to be
     two, in the order in which they first appear.
     """
-    rows, images = [], {}
-    for number, line in enumerate(_text(file).splitlines(), 1):
+    text, rows, images = _Text.read(file), [], {}
+    for number, line in text.lines:
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
@@ -277,11 +372,11 @@ def from_asp(file: Path, left: str = "", right: str = "") -> tuple[list[Point], 
                 remedy="write id lat lon height, three sigmas, and image col row sigma sigma of "
                 "each image",
             )
-        ground = [_number(words[k], "coordinate", number, file) for k in (1, 2, 3)]
+        ground = [text.number(words[k], "coordinate", number) for k in (1, 2, 3)]
         seen = {}
         for k in range(7, len(words), 5):
             images.setdefault(words[k], len(images))
-            seen[words[k]] = tuple(_number(words[k + j], "pixel", number, file) for j in (1, 2))
+            seen[words[k]] = tuple(text.number(words[k + j], "pixel", number) for j in (1, 2))
         rows.append((words[0], ground, seen))
     views = _views_of(file, list(images), left, right)
     points = []
@@ -290,7 +385,8 @@ def from_asp(file: Path, left: str = "", right: str = "") -> tuple[list[Point], 
         if pixels:
             points.append(Point(name, lon, lat, height, **pixels))
     said = ", ".join(f"{view}: {image}" for view, image in views.items())
-    return points, [f"{len(points)} of {len(rows)} points; {said}"]
+    done = [f"{len(points)} of {len(rows)} points; {said}"]
+    return points, crs or text.declared.get("crs", ""), done
 
 
 def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str, str]:
@@ -322,101 +418,60 @@ def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str,
 # -------------------------------------------------------------------------------------------- CSV
 
 
-def from_csv(file: Path, crs: str = "") -> tuple[list[Point], list[str]]:
-    """A table with a header, of any of the names and separators that are common."""
-    lines = [line for line in _text(file).splitlines() if line.strip() and line[0] != "#"]
-    if not lines:
-        raise InputError("there are no points in it", file=file, remedy="write a line a point")
-    separator = max(",;\t", key=lines[0].count)
-    header = [cell.strip().lower() for cell in next(csv.reader([lines[0]], delimiter=separator))]
-    at = {
-        column: next((header.index(name) for name in names if name in header), None)
-        for column, names in NAMES.items()
-    }
-    missing = [column for column in COLUMNS if at[column] is None and column != "height"]
+def from_csv(file: Path, crs: str = "") -> tuple[list[Point], str, list[str]]:
+    """A table with a header, of any of the names and separators that are common; its system."""
+    text = _Text.read(file)
+    header, rows = text.table()
+    called = _called(header, COLUMNS)
+    missing = [column for column in COLUMNS if column not in called and column != "height"]
     if missing:
         raise InputError(
             f"no column for {', '.join(missing)} among {', '.join(header)}",
             file=file,
             remedy=f"call them {','.join(COLUMNS)}",
         )
-    points, ground = [], []
-    for number, cells in enumerate(csv.reader(lines[1:], delimiter=separator), 2):
-        if len(cells) < len(header):
-            cells += [""] * (len(header) - len(cells))
-
-        def value(column: str, cells: list[str] = cells, number: int = number) -> float:
-            text = "" if at[column] is None else cells[at[column]].strip()
-            text = text.replace(",", ".") if separator != "," else text
-            return _number(text, column, number, file) if text else math.nan
-
-        ground.append((value("lon"), value("lat")))
-        left, right = ((value(f"{v}_col"), value(f"{v}_row")) for v in ("left", "right"))
-        name = cells[at["id"]].strip()
-        points.append(Point(name, *ground[-1], value("height"), left, right))
-    lon, lat = to_degrees(*np.array(ground).T, crs, file)
-    points = [replace(p, lon=float(x), lat=float(y)) for p, x, y in zip(points, lon, lat)]
-    return points, [f"{len(points)} points of {file.name}"]
+    points = []
+    for line, cells in rows:
+        value = {c: text.number(cells[n], c, line) for c, n in called.items() if c != "id"}
+        pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
+        ground = value["lon"], value["lat"], value.get("height", math.nan)
+        points.append(Point(cells[called["id"]], *ground, *pixels))
+    return points, crs or text.declared.get("crs", ""), [f"{len(points)} points of {file.name}"]
 
 
-def with_heights(points: Sequence[Point], source: Path) -> list[Point]:
-    """Points with heights of a CSV (by id, or by place), or of a raster (bilinear).
+TABLES = (".csv", ".txt", ".tsv")
 
-    Points that have one keep it.
+
+def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path) -> list[Point]:
+    """Points with heights of a table, by id, or by longitude and latitude (those of ``ground``).
+
+    Heights are in the points' own system. Points that have one keep it.
     """
-    if source.suffix.lower() not in (".csv", ".txt", ".tsv"):
-        return _heights_of_raster(points, source)
-    lines = [line for line in _text(source).splitlines() if line.strip()]
-    separator = max(",;\t", key=lines[0].count) if lines else ","
-    header = [cell.strip().lower() for cell in lines[0].split(separator)] if lines else []
-    at = {
-        column: next((header.index(name) for name in NAMES[column] if name in header), None)
-        for column in ("id", "lon", "lat", "height")
-    }
-    if at["height"] is None or (at["id"] is None and at["lon"] is None):
+    text = _Text.read(source)
+    header, rows = text.table()
+    called = _called(header, ("id", "lon", "lat", "height"))
+    if "height" not in called or not ("id" in called or {"lon", "lat"} <= set(called)):
         raise InputError(
             f"columns {', '.join(header)} are no heights of points",
             file=source,
             remedy="write id,height or lon,lat,height",
         )
-    by_id, by_place = {}, {}
-    for number, line in enumerate(lines[1:], 2):
-        cells = [cell.strip() for cell in line.split(separator)]
-        height = _number(cells[at["height"]], "height", number, source)
-        if at["id"] is not None:
-            by_id[cells[at["id"]]] = height
-        if at["lon"] is not None and at["lat"] is not None:
-            place = [_number(cells[at[axis]], axis, number, source) for axis in ("lon", "lat")]
-            by_place[number] = {"ground": ("", *place, height)}
+    by_id, at, height_at = {}, {}, {}
+    for line, cells in rows:
+        height = text.number(cells[called["height"]], "height", line)
+        if "id" in called:
+            by_id[cells[called["id"]]] = height
+        if {"lon", "lat"} <= set(called):
+            at[line] = tuple(
+                text.number(cells[called[axis]], axis, line) for axis in ("lon", "lat")
+            )
+            height_at[line] = height
     found = []
-    for point in points:
+    for point, place in zip(points, ground):
         height = point.height
         if math.isnan(height):
             height = by_id.get(point.id, math.nan)
-        if math.isnan(height) and by_place:
-            key = _same_place(by_place, point.lon, point.lat)
-            height = by_place[key]["ground"][3] if key in by_place else math.nan
+        if math.isnan(height) and at:
+            height = height_at.get(_same_place(at, place.x, place.y), math.nan)
         found.append(replace(point, height=height))
-    return found
-
-
-def _heights_of_raster(points: Sequence[Point], source: Path) -> list[Point]:
-    if not source.is_file():
-        raise InputError("no such file", file=source, remedy="correct the path")
-    with open_raster(source) as raster:
-        if raster.crs is None:
-            raise InputError(
-                "a raster without a coordinate system", file=source, remedy="give it one"
-            )
-        transform = pyproj.Transformer.from_crs("EPSG:4326", raster.crs.to_wkt(), always_xy=True)
-        x, y = transform.transform([p.lon for p in points], [p.lat for p in points])
-        band = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-        to_pixel = ~raster.transform
-        found = []
-        for point, east, north in zip(points, x, y):
-            col, row = to_pixel * (east, north)
-            height = point.height
-            if math.isnan(height):
-                height = float(bilinear(band, col - 0.5, row - 0.5))
-            found.append(replace(point, height=height))
     return found

@@ -74,6 +74,7 @@ def _callback(
         "stereotruth init my-project",
         "stereotruth init --example demo",
         "stereotruth init --example site",
+        "stereotruth init --twin place.laz --crs EPSG:2154 twin",
     )
 )
 def init(
@@ -87,13 +88,54 @@ def init(
             help="Simulate a small city in it, to try: demo (a pair) or site (a stack of images)."
         ),
     ] = "",
+    twin: Annotated[
+        Path | None,
+        typer.Option(
+            help="LAS or LAZ file of a real place: the project's images, LiDAR and exact truth are "
+            "simulated over its ground, roofs and crowns."
+        ),
+    ] = None,
+    crs: Annotated[str, typer.Option(help="CRS of a --twin without one.")] = "",
+    density: Annotated[
+        float | None, typer.Option(help="Points per m² of the twin's LiDAR; default 6.25.")
+    ] = None,
+    sun: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Azimuth and elevation of the twin's sun, degrees; default 148 54."),
+    ] = None,
+    size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            help="Columns and rows of the twin's left image, about the middle of the place; "
+            "default: all of it."
+        ),
+    ] = None,
+    rpc: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            help="Images with RPCs, or texts of RPCs: the twin's left and right image see the "
+            "place as they do; default: GaoFen-7."
+        ),
+    ] = None,
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     from .new_project import begin, with_example
 
-    folder = folder or Path(example)
-    next_step = with_example(folder, example) if example else begin(folder)
-    typer.echo(f"{folder}: a project. Next: cd {folder}, then {next_step}")
+    if twin is not None:
+        from .twin_project import DENSITY, SUN_DEG, Options, with_twin
+
+        to: Path | str = folder or Path("twin")
+        options = Options(crs, density or DENSITY, sun or SUN_DEG, size, rpc)
+        next_step = with_twin(Path(to), twin, options)
+    else:
+        if crs or density or sun or size or rpc:
+            raise InputError(
+                "--crs, --density, --sun, --size and --rpc are of a twin", remedy="add --twin FILE"
+            )
+        to = example if folder is None else folder
+        next_step = with_example(to, example) if example else begin(to)
+    go = "" if Path(to) == Path() else f"cd {to}, then "
+    typer.echo(f"{to}: a project. Next: {go}{next_step}")
 
 
 @scene_app.command(
@@ -183,12 +225,15 @@ def gcps_import(
     ] = None,
     left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
     right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
+    epoch: Annotated[
+        str, typer.Option(help="Epoch of the coordinates, 2016.4 or a date; empty: of the images.")
+    ] = "",
 ) -> None:
     """Bring control points of QGIS, Ames Stereo Pipeline or a CSV into the project's form."""
     from .import_gcps import import_gcps
 
     for line in import_gcps(
-        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right
+        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
     ):
         typer.echo(line)
 

@@ -46,14 +46,14 @@ def configuration_text() -> str:
 def begin(folder: str | Path) -> str:
     """Write the files of a new project; returns the next step.
 
-    Raises InputError if the folder has anything in it.
+    Raises InputError if the folder has anything in it, or has no name.
     """
-    folder = Path(folder)
-    if folder.name == "":
+    if not str(folder):
         raise InputError(
             "no folder is named",
             remedy="stereotruth init FOLDER, or stereotruth init --example demo",
         )
+    folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             "is there already, and not empty", file=folder, remedy="name a folder that is not there"

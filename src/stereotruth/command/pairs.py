@@ -25,7 +25,8 @@ from .site import images_of, scene_pairs
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
 LEAST_SHARED = 0.05  # of the smaller image's ground
 INGESTED = Path("results/ingest")
-OF_CITY = ("lidar", "lidar_crs", "geoid", "gcps")  # what a pair takes from its city's other rows
+# What a pair takes from its city's other rows.
+OF_CITY = ("lidar", "lidar_crs", "lidar_epoch", "geoid", "gcps")
 
 
 @dataclass(frozen=True)

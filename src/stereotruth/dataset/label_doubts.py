@@ -108,6 +108,22 @@ class Doubt:
         return f"{what}, {word} the {b.stated:.2f} px that the alignment states"
 
 
+@dataclass(frozen=True)
+class StripDoubt:
+    """Strips of the LiDAR that disagree, by their ``sentence``; labels state it in their
+    uncertainty."""
+
+    sentence: str
+    explained: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {"of": "strips", "text": self.sentence, "explained_by_alignment": self.explained}
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
 def location(values: Floats) -> tuple[float, Floats, float]:
     """Robust location of values with tails to one side; each one's influence; its sum's slope.
 

@@ -265,6 +265,8 @@ def write_tile(
         disparity=np.where(known, crop.stored, np.nan),
     )
     head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    if source.lidar and (frame := source.lidar.get("frame")):
+        head["ground_frame"] = frame
     save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
     sums["orientation"] = file_sha256(folder / files["orientation"])
 

@@ -32,7 +32,8 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
     lat, degrees): the middle of the largest such place, or None. ``not_read_m2``: ground whose
     points labels may follow from, and which the footprint left out. ``acquired``: first and last
     day of the points, None unless all files tell them; ``surfaces``: what heights count from, by
-    number of files. What is missing is logged, and files of different surfaces.
+    number of files; ``strips``: what they are off, None of one strip; ``frame`` and epoch of the
+    places, and those of the files. What is missing is logged, and files of different surfaces.
     """
     attrs = [PointStore(path).attrs for path in inputs.point_stores]
     nodes = [a["nodes"] for a in attrs if a["nodes"]]
@@ -55,7 +56,18 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
         "not_read_m2": _not_read(inputs),
         "acquired": _days([a["acquired"] for a in attrs]),
         "surfaces": _surfaces([a["crs"]["heights"] for a in attrs]),
+        "strips": inputs.lidar_strips.report() if inputs.lidar_strips else None,
+        "frame": _frame([a["crs"].get("frame") for a in attrs]),
     }
+
+
+def _frame(frames: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
+    """Frame and epoch of the places, and the frames and epochs that files have them in."""
+    known = [frame for frame in frames if frame is not None]
+    if len(known) < len(frames) or not known:
+        return None
+    sources = {tuple((k, str(v)) for k, v in f["source"].items()): f["source"] for f in known}
+    return {**known[0], "source": [sources[key] for key in sorted(sources)]}
 
 
 def _days(acquired: Sequence[Mapping[str, str] | None]) -> list[str] | None:

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..job import block_progress
+from ..lidar.overlap_check import apart, refuse_apart
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
-from .overlap_check import apart, refuse_apart
 from .recipe import label_window
 from .scene_inputs import SceneInputs
 from .status import Status, is_labelled
@@ -204,6 +204,7 @@ def _content(inputs: SceneInputs, code: str) -> str:
             "images": [_identity(left), _identity(right)],
             "epipolar": left["epipolar"],
             "uncertainty": inputs.pair.uncertainty.content,
+            "edge_margin_px": inputs.edge_margin_px,
             "parameters": parameters,
             "code": code,
         }
@@ -267,6 +268,8 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
+        if tasks and inputs.settings.on_surface:
+            _ = inputs.noise  # once, and not by each of the threads
         with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:

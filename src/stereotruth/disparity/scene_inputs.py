@@ -15,13 +15,16 @@ from numpy.typing import NDArray
 
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
+from ..alignment.strip_uncertainty import with_strips
 from ..epipolar.acquisition import Acquisition, by_sheet
+from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
 from ..epipolar.pair_light import PairLight, pair_light
 from ..epipolar.rpc import RPC
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_store import PointStore, open_stores
+from ..lidar.strip_offsets import StripOffsets
 from ..products.grids import require_complete
 from ..products.provenance import digest
 from ..settings import acquisition_time
@@ -49,8 +52,9 @@ class SceneInputs:
     Plain values, so that it can go to another process; what they stand for is opened when it is
     asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
     file whose corrections the images were rectified with; without it, it counts as exact.
-    ``surface``: the store with the surface of the points; the recipe paper needs none. ``light``:
-    what has decided whether the images share it, None where the settings alone say it.
+    ``surface``: the store with the surface of the points; the recipe paper needs none. ``strips``:
+    the folder with what the strips of the points are off; without it, they count as exact.
+    ``light``: what has decided whether the images share it, None where the settings alone say it.
     """
 
     left_store: Path
@@ -60,6 +64,7 @@ class SceneInputs:
     view: str = "left"
     alignment: Path | None = None
     surface: Path | None = None
+    strips: Path | None = None
     light: PairLight | None = None
 
     @classmethod
@@ -72,13 +77,14 @@ class SceneInputs:
         view: str = "left",
         alignment: str | Path | None = None,
         surface: str | Path | None = None,
+        strips: str | Path | None = None,
     ) -> SceneInputs:
         """With absolute paths, since workers of a Dask cluster live in other folders, and the point
         stores in their order by name."""
         left, right = Path(left_store).absolute(), Path(right_store).absolute()
         points = tuple(sorted(Path(path).absolute() for path in point_stores))
-        aligned, ground = (None if p is None else Path(p).absolute() for p in (alignment, surface))
-        return cls(left, right, points, settings, view, aligned, ground)
+        more = (None if p is None else Path(p).absolute() for p in (alignment, surface, strips))
+        return cls(left, right, points, settings, view, *more)
 
     def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
         """The same with the surface of all its points, which is made in a ``folder`` by the pixel
@@ -119,24 +125,40 @@ class SceneInputs:
     @cached_property
     def pair(self) -> Pair:
         """The images with their geometry; its left image is the one that gets labels."""
+        return seen_from(self.view, self._pair)
+
+    @cached_property
+    def _pair(self) -> Pair:
+        """The same, as the images are read."""
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
         if self.alignment is not None:
-            uncertainty = LabelUncertainty.of(Alignment.load(self.alignment), model, self.view)
-        return seen_from(
-            self.view,
-            Pair(
-                tuple(
-                    MaskedImage(group["image"], group["mask"])
-                    if "mask" in group
-                    else group["image"]
-                    for group in (left, right)
-                ),
-                model,
-                uncertainty,
-            ),
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
+        if self.lidar_strips is not None:
+            how = model, self.view, shared_px
+            uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
+        images = (
+            MaskedImage(group["image"], group["mask"]) if "mask" in group else group["image"]
+            for group in (left, right)
         )
+        return Pair(tuple(images), model, uncertainty)
+
+    @cached_property
+    def lidar_strips(self) -> StripOffsets | None:
+        """What the strips of the points are off; None if they count as exact."""
+        return None if self.strips is None else StripOffsets.read(self.strips)
+
+    @cached_property
+    def edge_margin_px(self) -> float:
+        """Distance of a pixel's centre from the edge of its surface below which it has no label:
+        that of the settings, or how far the strips of the points are off in plan; a pixel at most,
+        beyond which points of the pixels around tell no edge."""
+        plan_m = self.lidar_strips.most_in_plan_m if self.lidar_strips else 0.0
+        return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
 
     @property
     def has_masks(self) -> bool:
@@ -149,12 +171,10 @@ class SceneInputs:
         return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
 
     @cached_property
-    def noise(self) -> tuple[float, float]:
-        """Variances of the noise of both images of the pair, DN²; 0 of a store that has none."""
-        stores = (self.left_store, self.right_store)
-        facts = [require_complete(path).attrs.get("resampling", {}) for path in stores]
-        left, right = (noise.get("noise_dn", 0.0) ** 2 for noise in facts)
-        return (left, right) if self.view == "left" else (right, left)
+    def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
+        """Of both images of the :attr:`pair`, by brightness."""
+        of_images = pair_noise(*self._pair.images, self._pair.model)
+        return of_images if self.view == "left" else of_images[::-1]
 
     @cached_property
     def rays(self) -> Rays:

@@ -4,7 +4,8 @@ A pushbroom pair has no single epipolar line per point, but over the height rang
 epipolar curves pair up so well that two smooth functions describe them: the epipolar row y as a
 function of the left image's (col, row) and as a function of the right image's. They are uniform
 bicubic B-splines on top of an affine part, fitted by least squares so that virtual ground points,
-projected by both sensor models, get equal rows. No image content is used.
+projected by both sensor models, get equal rows. No image content is used. A correction by line
+is no part of the functions: they map the smooth sensors' positions (:mod:`.line_correction`).
 
 - Left: the affine part is a rotation (no mirroring), x is linear along the epipolar direction in
   left px, and d = x_left - x_right increases with height.
@@ -20,6 +21,7 @@ of the upper-left pixel.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -142,6 +144,7 @@ def fit_epipolar(
     Raises InputError if the images do not overlap or see the ground from one direction.
     """
     sizes = (left_size, right_size)
+    sensors, left, right = (left, right), left.smooth, right.smooth
     box, rpc_heights = common_box(left, right)
     low, high = height_range or rpc_heights
     low, high = min(low, reference_height - 10.0), max(high, reference_height + 10.0)
@@ -186,10 +189,10 @@ def fit_epipolar(
     reach = in_frames if defect else in_frames + in_box
     low_high = np.concatenate([reach.ground[:2].min(axis=1), reach.ground[:2].max(axis=1)])
     model = EpipolarModel(
-        left=left,
-        right=right,
-        left_image=images[0],
-        right_image=images[1],
+        left=sensors[0],
+        right=sensors[1],
+        left_image=replace(images[0], by_line=sensors[0].by_line),
+        right_image=replace(images[1], by_line=sensors[1].by_line),
         shape=shape,
         left_size=left_size,
         right_size=right_size,

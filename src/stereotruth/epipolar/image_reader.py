@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from ..errors import InputError
+from ..products.raster_values import MASK, Hidden, refuse_bands
 from ..products.ungeoreferenced import open_raster
 from .settings import Settings
 from .tiff_blocks import damaged_block
@@ -39,9 +40,10 @@ class Source:
 
     The image is the mean of its bands by the weights of ``mix`` (of sum 1; by default band 1);
     ``colour``: numbers of further bands that are read beside it. Nodata is where all of these have
-    the file's nodata value, or exactly 0 if it names none; what the file's own mask or alpha band
-    hides; and, as no sensor counts below zero, negative values (of real numbers those below
-    :data:`BELOW` of the largest value), since fill values are often not declared. ``mask`` is a
+    the file's nodata value, or exactly 0 if it names none and has neither mask nor alpha band; what
+    the file's own mask or alpha band hides; and, as no sensor counts below zero, negative values
+    (of real numbers those below :data:`BELOW` of the largest value), since fill values are often
+    not declared. ``mask`` is a
     raster on the image's grid whose non-zero pixels hide the image's, too. Integer images keep
     their digital numbers. Others, and integers of more than 16 bits, keep theirs if their maximum
     lies in [256, 65535] (of integers: below), else they are multiplied by ``gain`` = 10000 /
@@ -70,15 +72,15 @@ class Source:
         self._refuse_shape(dataset)
         self._refuse_bands(dataset)
         dtype = np.dtype(dataset.dtypes[self._bands[0] - 1])
-        self.nodata = 0.0 if dataset.nodata is None else float(dataset.nodata)
-        alpha = [i for i, c in enumerate(dataset.colorinterp, 1) if c == ColorInterp.alpha]
-        self._alpha = alpha[0] if alpha and alpha[0] not in self._bands else None
-        self._own_mask = self._alpha is None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]
-        self.masks = self._alpha is not None or self._own_mask or self.mask_path is not None
+        self._hidden = Hidden(dataset)
+        self.nodata = dataset.nodata
+        if self.nodata is None and not self._hidden.declared:
+            self.nodata = 0.0
+        self.masks = self._hidden.declared or self.mask_path is not None
         if self.mask_path is not None:
             self._refuse_mask(self._mask())
         self.band_count = dataset.count
-        if dataset.count > (1 if self._alpha is None else 2) and self._bands == [1]:
+        if dataset.count > (1 if self._hidden.alpha is None else 2) and self._bands == [1]:
             log.warning(
                 "%s has %d bands; band 1 (%s) is used",
                 self.path.name,
@@ -133,6 +135,7 @@ class Source:
                 file=self.mask_path,
                 remedy="a mask has the pixels of its image (left_mask, right_mask in scenes.tsv)",
             )
+        refuse_bands(mask, self.mask_path, MASK)
 
     def _scale(self, dataset: rasterio.DatasetReader, real: bool) -> None:
         """Set the gain, and below what values are fill values."""
@@ -140,7 +143,8 @@ class Source:
         with self._readable("the image"):
             sample = dataset.read(self._bands, out_shape=(len(self._bands), *shape))
         sample = sample.astype(np.float64)
-        sample = sample[np.isfinite(sample) & (sample != self.nodata) & (sample > 0)]
+        sample = sample[np.isfinite(sample) & (sample > 0)]
+        sample = sample if self.nodata is None else sample[sample != self.nodata]
         top = float(sample.max()) if sample.size else 0.0
         if top > OUTLIER * (most := float(np.percentile(sample, 99.9)) if sample.size else 0.0):
             log.warning(
@@ -196,15 +200,9 @@ class Source:
 
     def _hidden_by_itself(self, window: Window) -> NDArray[np.bool_] | None:
         """What the file's own mask or alpha band hides; None if it has none."""
-        dataset = self._dataset()
-        with self._readable(
-            f"the mask of rows {window.row_off} to {window.row_off + window.height}"
-        ):
-            if self._alpha is not None:
-                return dataset.read(self._alpha, window=window) == 0
-            if self._own_mask:
-                return dataset.read_masks(1, window=window) == 0
-        return None
+        end = window.row_off + window.height
+        with self._readable(f"the mask of rows {window.row_off} to {end}"):
+            return self._hidden.read(self._dataset(), window=window)
 
     def read_layers(
         self, col: int, row: int, cols: int, rows: int
@@ -236,7 +234,9 @@ class Source:
             raw = dataset.read(self._bands, window=window)
         values = raw.astype(np.float32)
         # a band may be dark where others are not
-        missing = (raw == self.nodata).all(axis=0)
+        missing = np.zeros(raw.shape[1:], np.bool_)
+        if self.nodata is not None:
+            missing = (raw == self.nodata).all(axis=0)
         if hidden is not None:
             missing |= hidden
         below = (values < self._lowest).any(axis=0) & ~missing

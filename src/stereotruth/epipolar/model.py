@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..products.files import atomic_file, read_record, sealed
+from .line_correction import LineCorrection, of_record, read_correction
 from .rpc import SensorModel
 from .spline_kernels import POWERS, ground_points_to_epipolar, map_points
 
@@ -33,6 +34,12 @@ FORMULA = (
 )
 
 
+BY_LINE = (
+    " (col, row) is that of the smooth sensor: the image shows it at (col, row) + (C(row), R(row)) "
+    "of by_line."
+)
+
+
 def _cells(spline: Floats) -> Floats:
     """[n - 3, n - 3, 4, 4]: the polynomials of a spline's cells, by powers of g and f."""
     windows = np.lib.stride_tricks.sliding_window_view(spline, (4, 4))
@@ -44,13 +51,16 @@ class ImageModel:
     """Map between one image's (col, row) and epipolar (x, y); see FORMULA for the meaning.
 
     ``affine`` float64[2, 3] rows x, y; ``domain`` (col_min, row_min, col_max, row_max) px;
-    ``y_spline`` and ``x_spline`` float64[n, n] px ([row, col]; ``x_spline`` may be None).
+    ``y_spline`` and ``x_spline`` float64[n, n] px ([row, col]; ``x_spline`` may be None). Of an
+    image with a correction ``by_line``, all of this is of the smooth sensor's (col, row), as
+    ``packed`` for the kernels is; :meth:`forward` and :meth:`inverse` know the image's own.
     """
 
     affine: Floats
     domain: tuple[float, float, float, float]
     y_spline: Floats
     x_spline: Floats | None = None
+    by_line: LineCorrection | None = None
     packed: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -72,13 +82,21 @@ class ImageModel:
         )
         object.__setattr__(self, "packed", packed)
 
+    @property
+    def smooth(self) -> ImageModel:
+        """The model of the smooth sensor's (col, row)."""
+        return self if self.by_line is None else replace(self, by_line=None)
+
     def forward(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:
         """Epipolar (x, y) of image points, px; arrays broadcast."""
+        if self.by_line is not None:
+            col, row = self.by_line.take(col, row)
         return self._map(False, col, row)
 
     def inverse(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Image (col, row) of epipolar points, px; arrays broadcast; NaN if there is none."""
-        return self._map(True, x, y)
+        at = self._map(True, x, y)
+        return at if self.by_line is None else self.by_line.add(*at)
 
     def _map(self, inverse: bool, a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
         pair = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
@@ -100,7 +118,7 @@ class ImageModel:
         """The same model with its origin of (x, y) moved there."""
         affine = np.array(self.affine)
         affine[:, 2] -= (x, y)
-        return ImageModel(affine, self.domain, self.y_spline, self.x_spline)
+        return replace(self, affine=affine)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready, in the words of FORMULA."""
@@ -112,7 +130,7 @@ class ImageModel:
             "n": len(self.y_spline),
             "y_spline": self.y_spline.tolist(),
             "x_spline": None if self.x_spline is None else self.x_spline.tolist(),
-        }
+        } | of_record(self.by_line)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ImageModel:
@@ -124,6 +142,7 @@ class ImageModel:
             (domain["col_min"], domain["row_min"], domain["col_max"], domain["row_max"]),
             np.array(values["y_spline"], dtype=np.float64),
             None if x is None else np.array(x, dtype=np.float64),
+            read_correction(values),
         )
 
 
@@ -150,6 +169,11 @@ class EpipolarModel:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_sensors", np.stack([self.left.packed(), self.right.packed()]))
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether an image has a correction by line."""
+        return self.left_image.by_line is not None or self.right_image.by_line is not None
 
     def left_to_epipolar(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:
         """Epipolar (x, y) of points of the left image, px."""
@@ -194,7 +218,7 @@ class EpipolarModel:
         """JSON-ready, with the formula: enough to evaluate the model without this software."""
         return {
             "what": "epipolar geometry of a stereo pair: original image <-> rectified image",
-            "formula": FORMULA,
+            "formula": FORMULA + BY_LINE * self.has_lines,
             "units": "coordinates px, longitude and latitude degrees (WGS 84), heights m "
             "(ellipsoidal)",
             "shape": list(self.shape),

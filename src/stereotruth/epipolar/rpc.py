@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inlined, inner, kernel
+from .line_correction import LineCorrection, of_record, read_correction
 
 Floats = NDArray[np.float64]
 
@@ -317,11 +318,13 @@ def _terms(x: Floats, y: Floats, z: Floats) -> Floats:
 class SensorModel:
     """An RPC and the affine that brings its image coordinates to the true ones.
 
-    ``affine`` is float64[2, 3]: (col, row)_true = affine @ (col_rpc, row_rpc, 1), px.
+    ``affine`` is float64[2, 3]: (col, row) = affine @ (col_rpc, row_rpc, 1), px, which is the true
+    position but for a correction ``by_line``, if there is one.
     """
 
     rpc: RPC
     affine: Floats = field(default_factory=lambda: np.array(IDENTITY))
+    by_line: LineCorrection | None = None
 
     def __post_init__(self) -> None:
         affine = np.array(self.affine, dtype=np.float64)
@@ -335,26 +338,40 @@ class SensorModel:
         object.__setattr__(self, "_packed", packed)
 
     def packed(self) -> Floats:
-        """float64[96] for the kernels: ``RPC.packed()``, then the affine's rows (a copy)."""
+        """float64[96] for the kernels: ``RPC.packed()``, then the affine's rows (a copy).
+
+        The kernels know the smooth sensor alone.
+        """
         return self._packed.copy()
+
+    @property
+    def smooth(self) -> SensorModel:
+        """The sensor without its correction by line."""
+        return self if self.by_line is None else SensorModel(self.rpc, self.affine)
 
     def project(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """True image (col, row) in px of ground points (degrees, degrees, m); arrays broadcast."""
-        return _batch(project_points, self._packed, lon, lat, height)
+        return self.shown_at(*_batch(project_points, self._packed, lon, lat, height))
+
+    def shown_at(self, col: Floats, row: Floats) -> tuple[Floats, Floats]:
+        """Where the image has what the smooth sensor has at (col, row), px."""
+        return (col, row) if self.by_line is None else self.by_line.add(col, row)
 
     def localize(self, col: ArrayLike, row: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """Ground (lon, lat) in degrees of true image points at ellipsoidal heights in m.
 
         Arrays broadcast. NaN where the search does not converge.
         """
+        if self.by_line is not None:
+            col, row = self.by_line.take(col, row)
         return _batch(localize_points, self._packed, col, row, height)
 
     def corrected_rpc(self) -> tuple[RPC, float]:
         """One RPC with the affine folded in, for software that knows RPCs only.
 
         Denominators are kept and numerators refitted by linear least squares over the RPC's ground
-        box. Returns the RPC and its largest difference from this model in px, on points that did
-        not make the fit.
+        box. It cannot hold a correction by line, which is part of its difference. Returns the RPC
+        and its largest difference from this model in px, on points that did not make the fit.
         """
         rpc = self.rpc
         lon0, lat0, lon1, lat1, h0, h1 = rpc.ground_box
@@ -373,7 +390,7 @@ class SensorModel:
             (h - rpc.height_off) / rpc.height_scale,
         )
         samp_off, line_off = self.affine @ (rpc.samp_off, rpc.line_off, 1.0)
-        col, row = self.project(lon, lat, h)
+        col, row = self.smooth.project(lon, lat, h)
         fitted = {}
         for name, values, offset, scale, denominator in (
             ("samp", col, samp_off, rpc.samp_scale, rpc.samp_den_coeff),
@@ -396,9 +413,10 @@ class SensorModel:
             "rpc": self.rpc.to_dict(),
             "affine": self.affine.tolist(),
             "affine_meaning": "(col, row)_image = affine @ (col_rpc, row_rpc, 1), px",
-        }
+        } | of_record(self.by_line)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SensorModel:
         """The inverse of :meth:`to_dict`."""
-        return cls(RPC.from_dict(values["rpc"]), np.array(values["affine"], dtype=np.float64))
+        affine = np.array(values["affine"], dtype=np.float64)
+        return cls(RPC.from_dict(values["rpc"]), affine, read_correction(values))

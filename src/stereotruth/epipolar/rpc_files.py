@@ -115,7 +115,7 @@ def rpc_file(image: str | Path) -> Path:
 def _text_of(file: Path) -> str:
     if file.stat().st_size > MAX_BYTES:
         raise ValueError(f"{file.stat().st_size} bytes are more than any RPC has")
-    return file.read_text(encoding="utf-8", errors="replace")
+    return file.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def read_rpc(image: str | Path) -> RPC:

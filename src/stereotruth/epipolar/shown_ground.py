@@ -66,6 +66,16 @@ class GroundOfImages:
                 out |= _inside(col, row, col, row, size)
         return out
 
+    def box(self, heights: tuple[float, float]) -> tuple[float, float, float, float]:
+        """West, south, east, north (degrees) of what the images show between two heights, m."""
+        places = []
+        for sensor, (cols, rows) in zip(self.sensors, self.sizes):
+            col, row = np.meshgrid([0.0, cols / 2, cols - 1.0], [0.0, rows / 2, rows - 1.0])
+            places += [sensor.localize(col.ravel(), row.ravel(), height) for height in heights]
+        lon, lat = np.concatenate(places, axis=1)
+        ends = np.nanmin(lon), np.nanmin(lat), np.nanmax(lon), np.nanmax(lat)
+        return tuple(map(float, ends))
+
     def may_show(self, boxes: Floats) -> Bools:
         """Whether an image may show something of boxes [n, 6] (west, south, lowest, east, north,
         highest; degrees, m)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -13,13 +14,15 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from .lattice import CELL_BITS, cell_key
-from .point_store import CELL, CELLS, POINT_BYTES, POINTS, SQUARES, WORDS
+from .point_store import CELL, CELLS, POINTS, SQUARES, STRIPS, WORDS
 
 Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-SCRATCH_POINTS = (1 << 28) // POINT_BYTES  # kept in memory, 256 MiB
+RUN_WORDS = WORDS + 1  # of 32 bits, of a point in the scratch: with the codes of its strip
+RUN_BYTES = 4 * RUN_WORDS
+SCRATCH_POINTS = (1 << 28) // RUN_BYTES  # kept in memory, 256 MiB
 
 
 @kernel
@@ -33,12 +36,13 @@ def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Intege
 def _sort(
     lattice: Integers,
     attributes: Words,
+    strips: Words,
     cell: Integers,
     end: Integers,
     limits: NDArray[np.int32],
     run: Words,
 ) -> None:
-    """Fill ``run`` [n, 3] with the points as they are stored, by cell, in their order in a cell.
+    """Fill ``run`` [n, 4] with the points as they are stored, by cell, in their order in a cell.
 
     ``cell`` [n] is the number of each point's cell; ``end`` [m], zeros, gets the end of each cell
     in the run, ``limits`` [m, 2] its lowest and highest height. Neighbours in the file are so in a
@@ -70,6 +74,7 @@ def _sort(
             run[at + k, 0] = lattice[0, k] & inside | (told & 4095) << CELL_BITS
             run[at + k, 1] = lattice[1, k] & inside | told >> 16 << CELL_BITS
             run[at + k, 2] = height
+            run[at + k, 3] = strips[k]
             low, high = min(low, height), max(high, height)
         limits[c, 0], limits[c, 1] = low, high
 
@@ -101,7 +106,7 @@ class SortedRuns:
     """External sort by cell: each chunk becomes one sorted run, a part of the scratch.
 
     A segment is what one run holds of one cell; segments of a cell, in the order of the runs, are
-    its points in the order of the file. Runs are in ``memory`` [k, 3]; those that find no room
+    its points in the order of the file. Runs are in ``memory`` [k, 4]; those that find no room
     there any more are on ``disk``.
     """
 
@@ -112,16 +117,21 @@ class SortedRuns:
     segments: list[np.ndarray] = field(default_factory=list)  # int64 [k, 3]: key, start, count
     limits: list[np.ndarray] = field(default_factory=list)  # int32 [k, 2]: lowest, highest
 
-    def add(self, lattice: NDArray[np.int64], attributes: Words) -> None:
-        """Take in a chunk's points: lattice coordinates [3, n], attributes [n] as of _unpack."""
+    def add(self, lattice: NDArray[np.int64], attributes: Words, strips: Words) -> None:
+        """Take in a chunk's points: lattice coordinates [3, n], attributes and codes of strips [n]
+        as of _unpack."""
         size = attributes.size
         if not size:
             return
         key, cell = _cells(lattice)
         end, limits = np.zeros(key.size, np.int64), np.empty((key.size, 2), np.int32)
         room = self.held == self.written and self.held + size <= len(self.memory)
-        run = self.memory[self.held : self.held + size] if room else np.empty((size, WORDS), "<u4")
-        _sort(lattice, attributes, cell, end, limits, run)
+        run = (
+            self.memory[self.held : self.held + size]
+            if room
+            else np.empty((size, RUN_WORDS), "<u4")
+        )
+        _sort(lattice, attributes, strips, cell, end, limits, run)
         if room:
             self.held += size
         else:
@@ -139,14 +149,16 @@ class SortedRuns:
             if start < self.held:
                 yield self.memory[start : start + count]
                 continue
-            points = np.empty((count, WORDS), "<u4")
-            self.disk.seek((start - self.held) * POINT_BYTES)
+            points = np.empty((count, RUN_WORDS), "<u4")
+            self.disk.seek((start - self.held) * RUN_BYTES)
             if self.disk.readinto(points.data.cast("B")) != points.nbytes:
                 raise OSError("the scratch file of the points is cut short")
             yield points
 
-    def write(self, folder: Path) -> int:
-        """Write points and cell table in final order; return the CRC-32 of the latter's file."""
+    def write(self, folder: Path, strips_at: int | None) -> tuple[int, list[int]]:
+        """Write points and cell table in final order, and the points' strips unless ``strips_at``
+        is None: the bit where their code begins. Returns the CRC-32 of the table's file, and of the
+        strips of each cell."""
         segments = np.concatenate([np.empty((0, 3), np.int64), *self.segments])
         limits = np.concatenate([np.empty((0, 2), np.int32), *self.limits])
         order = np.argsort(segments[:, 0], kind="stable")
@@ -158,16 +170,34 @@ class SortedRuns:
         if key.size:
             table["lowest"] = np.minimum.reduceat(limits[:, 0], first)
             table["highest"] = np.maximum.reduceat(limits[:, 1], first)
-        described = {"descr": "<u4", "fortran_order": False, "shape": (self.written, WORDS)}
-        with (folder / POINTS).open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, described)
-            for cell, of in enumerate(np.split(segments, first[1:]) if key.size else ()):
+        of_cells = np.split(segments, first[1:]) if key.size else ()
+        with _array_file(folder / POINTS, "<u4", (self.written, WORDS)) as file:
+            for cell, of in enumerate(of_cells):
                 found, squares = 0, np.zeros((SQUARES, SQUARES), np.int64)
-                for points in self._take(of):
+                for run in self._take(of):
+                    points = np.ascontiguousarray(run[:, :WORDS])
                     found = zlib.crc32(points, found)
                     _count_squares(points, squares)
                     file.write(points)
                 table["crc32"][cell] = found
                 table["squares"][cell] = np.minimum(squares, 65535)
         np.save(folder / CELLS, table)
-        return zlib.crc32((folder / CELLS).read_bytes())
+        sums: list[int] = []
+        if strips_at is not None:
+            with _array_file(folder / STRIPS, "<u2", (self.written,)) as file:
+                for of in of_cells:
+                    sums.append(0)
+                    for run in self._take(of):
+                        codes = (run[:, WORDS] >> strips_at).astype("<u2")
+                        sums[-1] = zlib.crc32(codes, sums[-1])
+                        file.write(codes)
+        return zlib.crc32((folder / CELLS).read_bytes()), sums
+
+
+@contextmanager
+def _array_file(path: Path, kind: str, shape: tuple[int, ...]) -> Iterator[BinaryIO]:
+    """A file of NumPy's for an array that is written bit by bit."""
+    with path.open("wb") as file:
+        described = {"descr": kind, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, described)
+        yield file

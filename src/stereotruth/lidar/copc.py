@@ -35,6 +35,7 @@ FIELDS = (
     | DecompressionSelection.Z
     | DecompressionSelection.CLASSIFICATION
     | DecompressionSelection.FLAGS
+    | DecompressionSelection.POINT_SOURCE_ID
     | DecompressionSelection.GPS_TIME
 )
 

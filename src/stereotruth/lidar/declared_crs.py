@@ -1,10 +1,14 @@
-"""The coordinate system that a LiDAR file declares, or that the sheet gives it."""
+"""The coordinate system that a file declares, or that its user gives it: places, heights, units.
+
+The one reader of systems: of LiDAR, surface models, control points and geoid grids.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -21,7 +25,23 @@ LINEAR_UNITS = {  # EPSG code: (name, metres)
     9002: ("foot", 0.3048),
     9003: ("US survey foot", 1200 / 3937),
 }
+LENGTHS = {  # names of units in files: metres
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("dm", "decimetre", "decimeter", "decimetres", "decimeters"), 0.1),
+    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter", "millimetres", "millimeters"), 0.001),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(
+        ("us-ft", "us_ft", "ftus", "us survey foot", "us survey feet", "foot_us", "sft"),
+        1200 / 3937,
+    ),
+}
+SAME_UNIT = 1e-5  # of a unit: feet and US survey feet of a band's name are often not told apart
 _NO_DATUM = {"", "unknown", "unnamed", "not specified", "unspecified"}
+_WITH_EPOCH = re.compile(  # WKT2:2019, clause 16, which PROJ reads as no system
+    r"\s*COORDINATEMETADATA\s*\[(.*\])\s*,\s*EPOCH\s*\[\s*([0-9.]+)\s*\]\s*\]\s*",
+    re.DOTALL | re.IGNORECASE,
+)
 # Names of vertical datums that producers put into file names; delimited, so that no word hides one.
 DATUM_IN_NAME = re.compile(
     r"(?<![A-Za-z0-9])(IGN69|IGN78|NAVD88|NGVD29|EGM84|EGM96|EGM08|EGM2008|DHHN92|DHHN2016|NN2000"
@@ -37,6 +57,7 @@ class LidarCRS:
     ``horizontal`` is a 2-D geographic or projected system; ``vertical_datum`` names the orthometric
     datum (None: none declared); ``ellipsoidal`` says that heights are declared ellipsoidal;
     ``vertical_unit_m`` is the length of the height unit in metres (None: not declared).
+    ``epoch`` of the coordinates in a dynamic frame, decimal year (None: not declared).
     ``notes`` are remarks for the user.
     """
 
@@ -45,6 +66,7 @@ class LidarCRS:
     ellipsoidal: bool = False
     vertical_unit_m: float | None = None
     vertical_unit: str = ""
+    epoch: float | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -84,6 +106,15 @@ def _source(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+class Depths(ValueError):
+    """A system whose vertical axis points down."""
+
+
+def _refuse_depths(crs: CRS, axis: Any) -> None:
+    if axis.direction.lower() != "up":
+        raise Depths(f"the heights of '{crs.name}' point {axis.direction}: they are depths")
+
+
 def interpret(crs: CRS) -> LidarCRS:
     """Split a system into its horizontal and vertical meaning.
 
@@ -97,8 +128,7 @@ def interpret(crs: CRS) -> LidarCRS:
     if crs.is_compound:
         vertical = _source(parts[1])
         axis = vertical.axis_info[0]
-        if axis.direction.lower() != "up":
-            raise ValueError(f"the heights of '{crs.name}' point {axis.direction}")
+        _refuse_depths(crs, axis)
         datum = vertical.datum.name if vertical.datum is not None else vertical.name
         unnamed = {datum.lower(), vertical.name.lower()} <= _NO_DATUM
         return LidarCRS(
@@ -109,6 +139,7 @@ def interpret(crs: CRS) -> LidarCRS:
         )
     if len(first.axis_info) == 3:
         axis = first.axis_info[2]
+        _refuse_depths(crs, axis)
         return LidarCRS(
             crs.to_2d(),
             ellipsoidal=True,
@@ -118,21 +149,70 @@ def interpret(crs: CRS) -> LidarCRS:
     return LidarCRS(crs)
 
 
-def parse_crs(text: str) -> LidarCRS:
+def interpret_wkt(text: str) -> LidarCRS:
+    """A system of WKT, with the epoch of the coordinates if the text states it.
+
+    Raises CRSError and ValueError as :func:`interpret`.
+    """
+    if dated := _WITH_EPOCH.fullmatch(text):
+        return replace(interpret(CRS.from_wkt(dated[1])), epoch=float(dated[2]))
+    return interpret(CRS.from_wkt(text))
+
+
+def parse_crs(text: str, name: str = "lidar_crs", file: str | Path | None = None) -> LidarCRS:
     """Read ``lidar_crs``: "2154", "EPSG:2154", "EPSG:2154+5720" or WKT.
 
-    Raises InputError.
+    ``name``: what users call it, ``file``: where it stands. Raises InputError.
     """
     text = text.strip()
     user = f"EPSG:{text}" if re.fullmatch(r"\d+(\+\d+)?", text) else text
     try:
+        if _WITH_EPOCH.fullmatch(user):
+            return interpret_wkt(user)
         return interpret(CRS.from_user_input(user))
     except (CRSError, ValueError) as error:
         raise InputError(
-            f"lidar_crs '{text}' cannot be used: {error}",
+            f"{name} '{text}' cannot be used: {error}",
+            file=file,
             remedy="give an EPSG code such as EPSG:32650, a compound such as EPSG:2154+5720, "
             "or WKT of a geographic or projected system",
         ) from error
+
+
+def of_raster(wkt: str, band_unit: str, file: str | Path) -> LidarCRS:
+    """The system of a raster of heights, whose unit its band may tell.
+
+    Raises InputError: no place on the ground, no known unit, or two that differ.
+    """
+    try:
+        system = interpret(CRS.from_wkt(wkt))
+    except (CRSError, ValueError) as error:
+        raise InputError(
+            str(error),
+            file=file,
+            remedy="set its coordinate system by gdal_edit.py -a_srs, or bring the raster to "
+            "another by gdalwarp -t_srs",
+        ) from None
+    if not band_unit:
+        return system
+    metres = LENGTHS.get(band_unit.lower())
+    if metres is None:
+        raise InputError(
+            f"its heights are in {band_unit!r}, which is no known unit",
+            file=file,
+            remedy="write the unit again: gdal_edit.py -units metre, or foot, or 'US survey foot'",
+        )
+    stated = system.vertical_unit_m
+    if stated is None:
+        return replace(system, vertical_unit_m=metres, vertical_unit=band_unit)
+    if abs(stated / metres - 1) > SAME_UNIT:
+        raise InputError(
+            f"its band counts heights in {band_unit!r}, its coordinate system in "
+            f"{system.vertical_unit}",
+            file=file,
+            remedy="correct the wrong one: gdal_edit.py -units, or -a_srs",
+        )
+    return system
 
 
 def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS | None:
@@ -142,7 +222,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
     key is honoured here.
     """
-    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
+    from .geokeys import epoch_in, wkt_of_geokeys  # GDAL, which few files need
 
     keys = shorts[4:].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
@@ -162,7 +242,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
-    return meaning
+    return replace(meaning, epoch=epoch_in(shorts, doubles))
 
 
 def _wkt_text(data: bytes) -> str:
@@ -203,6 +283,8 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def attempt(what: str, read) -> None:
         try:
             meaning = read()
+        except Depths:
+            raise
         except (ProjError, ValueError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
@@ -212,7 +294,7 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def wkt() -> None:
         if text := _wkt_text(records.get(2112, b"")):
             x, y = float(header.mins[0]), float(header.mins[1])
-            attempt("WKT", lambda: _held_against_code(interpret(CRS.from_wkt(text)), x, y))
+            attempt("WKT", lambda: _held_against_code(interpret_wkt(text), x, y))
 
     def geokeys() -> None:
         data = records.get(34735, b"")
@@ -266,9 +348,14 @@ def resolve(
 ) -> tuple[LidarCRS, list[str]]:
     """The system that applies to a file, and remarks for the user.
 
-    Raises InputError if the file declares none and ``lidar_crs`` is empty.
+    Raises InputError if the file declares none and ``lidar_crs`` is empty, and for depths.
     """
-    own, problems = header_crs(header)
+    try:
+        own, problems = header_crs(header)
+    except Depths as error:
+        raise InputError(
+            str(error), file=file, remedy="write the file again with heights, which point up"
+        ) from None
     given = parse_crs(lidar_crs) if lidar_crs else None
     notes: list[str] = []
     if own is None:

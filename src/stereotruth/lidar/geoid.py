@@ -13,9 +13,18 @@ from rasterio.windows import Window
 from ..errors import InputError
 from ..kernels import kernel
 from ..numerics.bilinear import between_four
+from ..numerics.degrees import metres_per_degree
+from ..products.raster_values import MOST_CELLS, Fills, Quantity, Values
 from ..products.ungeoreferenced import open_raster
+from .declared_crs import of_raster
 
 FORMATS = ("GTX", "GTiff")
+REMEDY = "give a GTX or GeoTIFF grid of geoid undulations above WGS 84 or GRS 80"
+UNDULATION = Quantity("undulation of a geoid", "geoid grid", -120.0, 120.0, REMEDY)  # −107 to +86 m
+TYPE = "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL"  # of PROJ's grids that are geoids (key TYPE)
+STEEPEST = 1e-3  # m per m of the geoid: deflections of the vertical are below 2 minutes of arc
+ROUGH = 0.01  # share of neighbouring nodes that are steeper: heights of ground
+LEAST_SPREAD_M, WIDE_DEG = 3.0, 5.0  # undulations of any part of the Earth so wide differ by more
 
 
 @kernel
@@ -89,37 +98,52 @@ class GeoidGrid:
             raise InputError(
                 "no such geoid grid", file=self.path, remedy="give the path of a GTX or GeoTIFF"
             )
+        self.unit_m, self.above_wgs84 = 1.0, "egm" in self.path.name.lower()
         try:
             with open_raster(self.path, formats=FORMATS) as grid:
-                transform, crs, driver = grid.transform, grid.crs, grid.driver
-                self.height, self.width = grid.height, grid.width
+                transform, sample = grid.transform, self._looked_at(grid)
         except rasterio.errors.RasterioError as error:
             raise self._unusable(f"GDAL cannot read it ({error})") from error
-        self.above_wgs84 = "egm" in self.path.name.lower()
         if transform.b or transform.d or not (transform.a > 0 > transform.e):
             raise self._unusable("it is not a north-up grid of longitude and latitude")
-        if crs is not None:
-            if not crs.is_geographic:
-                raise self._unusable("its nodes are not on a grid of longitude and latitude")
-            system = CRS.from_wkt(crs.to_wkt())
-            ellipsoid = system.ellipsoid
-            # GDAL says WGS 84 of every GTX, so that only a GeoTIFF's word counts.
-            self.above_wgs84 |= driver == "GTiff" and "World Geodetic" in system.datum.name
-            if ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) > 1:
-                raise self._unusable(f"its undulations are above the ellipsoid {ellipsoid.name}")
         self.step_lon, self.step_lat = transform.a, -transform.e
         self.lon_first = transform.c + self.step_lon / 2
         self.lat_first = transform.f - self.step_lat / 2
+        self._refuse_level(sample)
         self.around = round(360 / self.step_lon)  # columns once around the Earth
         if self.width < self.around:
             self.around = 0
+
+    def _looked_at(self, grid: rasterio.DatasetReader) -> np.ndarray:
+        """Values (m) all over a grid, none of a large one, after all that its tags say."""
+        kind, name = grid.tags().get("TYPE", TYPE), self.path.name.lower()
+        if kind != TYPE:
+            raise self._unusable(f"it is a grid of {kind.lower().replace('_', ' ')}")
+        if "shift" in (grid.descriptions[0] or "") or "vertcon" in name:
+            raise self._unusable("it has shifts between two datums")
+        self.height, self.width = grid.height, grid.width
+        if grid.crs is not None:
+            if not grid.crs.is_geographic:
+                raise self._unusable("its nodes are not on a grid of longitude and latitude")
+            system = CRS.from_wkt(grid.crs.to_wkt()).to_2d()
+            unit = (grid.units[0] or "").strip()
+            self.unit_m = of_raster(system.to_wkt(), unit, self.path).height_unit_m
+            # GDAL says WGS 84 of every GTX, so that only a GeoTIFF's word counts.
+            is_stated = grid.driver == "GTiff" and "World Geodetic" in system.datum.name
+            self.above_wgs84 |= is_stated
+            if abs(system.ellipsoid.semi_major_metre - 6378137) > 1:
+                ellipsoid = system.ellipsoid.name
+                raise self._unusable(f"its undulations are above the ellipsoid {ellipsoid}")
+        values = Values(grid, self.path, UNDULATION, self.unit_m)
+        if grid.height * grid.width > MOST_CELLS and grid.driver != "GTX":
+            return np.empty(0)
+        return self.unit_m * values.read(out_shape=(min(grid.height, 64), min(grid.width, 64)))
 
     def _unusable(self, reason: str) -> InputError:
         return InputError(
             f"cannot be used as a geoid grid: {reason}",
             file=self.path,
-            remedy="give a GTX or GeoTIFF grid of geoid undulations in metres "
-            "above WGS 84 or GRS 80",
+            remedy=REMEDY,
         )
 
     def _window(self, first: int, last: int) -> np.ndarray:
@@ -131,11 +155,33 @@ class GeoidGrid:
                 last = max(last, self._first_row + len(rows) - 1)
             with open_raster(self.path, formats=FORMATS) as grid:
                 window = Window(0, first, self.width, last - first + 1)
-                masked = grid.read(1, window=window, masked=True, out_dtype="float64")
-                rows = masked.filled(np.nan) * grid.scales[0] + grid.offsets[0]
-            rows[~(np.abs(rows) < 1000)] = np.nan  # undeclared fill values; N is within ±110 m
+                fills = Fills(Values(grid, self.path, UNDULATION, self.unit_m))
+                rows = self.unit_m * fills.add(*fills.values.raw(window=window))
+            fills.refuse()
+            self._refuse_other(rows, first)
             self._first_row, self._rows = first, rows
         return rows
+
+    def _refuse_other(self, rows: np.ndarray, first: int) -> None:
+        """Raise InputError for rows from the ``first`` on that are rougher than any geoid."""
+        lat = self.lat_first - (first + len(rows) / 2) * self.step_lat
+        east, north = metres_per_degree(lat) * (self.step_lon, self.step_lat)
+        steps = [
+            np.diff(rows, axis=axis) / step for axis, step in ((0, north), (1, max(east, 1.0)))
+        ]
+        slopes = np.abs(np.concatenate([step[np.isfinite(step)] for step in steps]))
+        if slopes.size and (slopes > STEEPEST).mean() > ROUGH:
+            raise self._unusable("it is rougher than a geoid, as heights of ground are")
+
+    def _refuse_level(self, values: np.ndarray) -> None:
+        """Raise InputError if values of a whole grid are too alike, as shifts of datums are."""
+        sides = self.height * self.step_lat, self.width * self.step_lon
+        known = values[np.isfinite(values)]
+        if min(sides) > WIDE_DEG and known.size and np.abs(known).max() < LEAST_SPREAD_M:
+            raise self._unusable(
+                f"its values are {known.min():.2f} to {known.max():.2f} m all over "
+                f"{sides[0]:.0f} x {sides[1]:.0f} degrees: shifts between two datums"
+            )
 
     def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
         """N at lon, lat (degrees, [n]).

@@ -31,14 +31,15 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..kernels import kernel
 from ..products.files import atomic_folder, sealed
-from .cell_sort import SCRATCH_POINTS, SortedRuns
+from .cell_sort import RUN_WORDS, SCRATCH_POINTS, SortedRuns
 from .footprint import Footprint
+from .frames import Epochs
 from .gps_times import BY_CATALOGUE, CODES, not_told_apart
 from .las_files import PointTally
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 from .octree_nodes import Touches
 from .point_files import Part, PointFile, open_points
-from .point_store import ARRAYS, ATTRIBUTES, FORMAT, WORDS
+from .point_store import ARRAYS, ATTRIBUTES, FORMAT
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
 log = logging.getLogger("stereotruth")
@@ -137,6 +138,7 @@ def ingest(
     footprint: Footprint | None = None,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
+    epochs: Epochs | None = None,
     acquired: Sequence[str] = (),
     drop_classes: Sequence[int] | None = None,
     provenance: Mapping[str, Any] | None = None,
@@ -148,15 +150,15 @@ def ingest(
     (:mod:`.raster_points`).
 
     Memory is that of a reading chunk and :data:`SCRATCH_POINTS`, whatever the size of the file;
-    where it has more points, the others pass through a scratch file without a name, 12 bytes each,
+    where it has more points, the others pass through a scratch file without a name, 16 bytes each,
     on the disk of the store.
 
     Withheld points are dropped, and those of ``drop_classes``: by default (None) those of the
     settings, noise, 7 (low) and 18 (high). Synthetic points, overlap points and producers' own
-    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed. Coordinates: see
-    :mod:`stereotruth.lidar.to_wgs84`.
-    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv; None or "" where
-    not needed.
+    classes (65 and 67 mark artefacts in IGN's files) are kept unless listed.
+    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv (:mod:`.to_wgs84`);
+    None or "" where not needed; ``epochs`` of the images, and of the coordinates where files state
+    none (:mod:`.frames`); None: frames are what PROJ takes them for.
     ``footprint``: the ground whose points are kept; of COPC (``.copc.laz``) just the nodes that
     touch it are read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first
     and last day (ISO) by a catalogue, for files whose points do not tell them.
@@ -167,8 +169,8 @@ def ingest(
     degrees, h_min, h_max in m; of no point: where all points of the file are about), ``crs``,
     ``footprint`` (runs of cells, or None), ``acquired`` (first and last day of all points read, and
     what tells them; None where nothing does), ``days`` that points tell themselves (of more than
-    :data:`.gps_times.CODES` none) and ``notes`` (remarks for the user, which are logged
-    too).
+    :data:`.gps_times.CODES` none), ``strips`` (what tells them, points by code) and ``notes``
+    (remarks for the user, which are logged too).
 
     Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
@@ -183,7 +185,8 @@ def ingest(
     header = points.header
 
     def transform_of(extent: Floats | None) -> ToWGS84:
-        return to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, extent=extent)
+        how = {"lidar_crs": lidar_crs, "geoid": geoid, "epochs": epochs}
+        return to_wgs84(header, file, extent=extent, **how)
 
     transform = transform_of(None)
     _refuse_coarse(points, transform)
@@ -209,8 +212,8 @@ def ingest(
                 tally, runs = _read(points, part, transform, *reading)
         tally.refuse_quantised(file)
         bounds = _bounds(*tally.lattice_limits) if runs.written else _about(transform, points, own)
-        notes = _notes(points, part, transform, tally, bounds)
-        cells_crc32, days = runs.write(unfinished), tally.days.days
+        strips = _strips(tally)
+        cells_crc32, strips["crc32"] = runs.write(unfinished, strips.pop("at"))
         summary = {
             "points": _counts(tally, runs, header, dropped),
             "nodes": part.nodes,
@@ -220,8 +223,9 @@ def ingest(
             "crs": transform.describe(),
             "footprint": None if footprint is None else footprint.runs,
             "acquired": _days(tally, acquired),
-            "days": days if len(days) <= CODES else [],
-            "notes": notes,
+            "days": tally.days.days if len(tally.days.days) <= CODES else [],
+            "strips": strips,
+            "notes": _notes(points, part, transform, tally, bounds),
         }
         about = {"source": file.name, "cells_crc32": cells_crc32}
         _write_attributes(unfinished, about, summary, dict(provenance or {}))
@@ -240,6 +244,16 @@ def _counts(
         "kept": runs.written,
         "dropped": dropped,
     }
+
+
+def _strips(tally: PointTally) -> dict[str, Any]:
+    """What tells the strips of a file, the points of each, and where their code begins.
+
+    That is None where all points have the same code.
+    """
+    by, at = tally.strips.told
+    counts = tally.strips.counts
+    return {"by": by, "points": counts, "at": at if len(counts) > 1 else None}
 
 
 def _days(tally: PointTally, stated: Sequence[str]) -> dict[str, str] | None:
@@ -278,6 +292,8 @@ def _tell(file: Path, summary: Mapping[str, Any], transform: ToWGS84) -> None:
     else:
         log.info("%s: no point lies in the footprint", file.name)
     log.info("%s: brought to WGS 84 by '%s'", file.name, transform.operation)
+    if transform.frame is not None:
+        log.info("%s: places are in {frame} at {epoch:.3f}".format_map(transform.frame), file.name)
 
 
 def _is_whole(part: Part, header: laspy.LasHeader) -> bool:
@@ -374,10 +390,10 @@ def _read(
     disk.truncate()
     tally = PointTally()
     room = min(SCRATCH_POINTS, part.points)
-    runs = SortedRuns(np.empty((room, WORDS), "<u4"), disk)
+    runs = SortedRuns(np.empty((room, RUN_WORDS), "<u4"), disk)
     units_m = transform.system.horizontal_unit_m, transform.system.height_unit_m
     for chunk in _bytes_read(part.chunks(chunk_points), part, file.name):
-        xyz, attributes = tally.take(chunk, header, drop_classes)
+        xyz, attributes, strips = tally.take(chunk, header, drop_classes)
         tally.compare_bounds(header, units_m, file)
         if footprint is None:
             lattice = _to_lattice(transform, xyz, tally.lattice_limits, file)
@@ -386,9 +402,10 @@ def _read(
             lattice = _to_lattice(transform, xyz, tally.lattice_limits.copy(), file)
             tally.look(lattice)
             inside = footprint.contains(lattice)
-            lattice, attributes = lattice[:, inside], attributes[inside]
+            lattice, attributes, strips = lattice[:, inside], attributes[inside], strips[inside]
             tally.widen(lattice)
-        runs.add(lattice, attributes)
+        tally.strips.count(strips)
+        runs.add(lattice, attributes, strips)
     return tally, runs
 
 

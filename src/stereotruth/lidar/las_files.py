@@ -18,6 +18,7 @@ from ..products.remote_files import size_of
 from .gps_times import GpsDays
 from .las_layout import check_layout, wrong_count
 from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
+from .strip_codes import StripCodes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -112,7 +113,8 @@ def read_chunks(
             | fields.Z
             | fields.CLASSIFICATION
             | fields.FLAGS
-            | (fields.GPS_TIME if has_days(header) else fields(0)),
+            | fields.POINT_SOURCE_ID
+            | fields.GPS_TIME,
         ) as reader,
     ):
         while done < header.point_count:
@@ -165,19 +167,22 @@ class PointTally:
     sample: list[np.ndarray] = field(default_factory=list)
     sampled: int = 0
     days: GpsDays = field(default_factory=GpsDays)  # of all points, where they tell them
+    strips: StripCodes = field(default_factory=StripCodes)
 
     def take(
         self,
         points: laspy.ScaleAwarePointRecord,
         header: laspy.LasHeader,
         drop_classes: Sequence[int],
-    ) -> tuple[Floats, NDArray[np.uint32]]:
-        """Coordinates [3, n] and attributes [n], see _unpack, of the points to keep."""
+    ) -> tuple[Floats, NDArray[np.uint32], NDArray[np.uint32]]:
+        """Coordinates [3, n], attributes [n], see _unpack, and codes of strips [n] of the points to
+        keep."""
         unwanted = np.isin(np.arange(256), drop_classes)
         raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
-        xyz, attributes = np.empty((3, len(points))), np.zeros(len(points), np.uint32)
+        xyz, attributes = np.empty((3, len(points))), np.zeros((2, len(points)), np.uint32)
         if has_days(header):
-            self.days.take(points, attributes)
+            self.days.take(points, attributes[0])
+        attributes[1] = self.strips.take(points)
         kept = _unpack(
             raw,
             header.point_format.id >= 6,
@@ -190,7 +195,7 @@ class PointTally:
             self.by_return,
             self.file_limits,
         )
-        return xyz[:, :kept], attributes[:kept]
+        return xyz[:, :kept], attributes[0, :kept], attributes[1, :kept]
 
     @property
     def read(self) -> int:
@@ -303,14 +308,15 @@ def _unpack(
     by_return: Integers,
     limits: Integers,
 ) -> int:
-    """Fill ``xyz`` [3, n] and ``attributes`` [n] with the points to keep; returns their number.
+    """Fill ``xyz`` [3, n] and ``attributes`` [2, n] with the points to keep; returns their number.
 
     ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
     in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
     class. Attributes are class + 256 return number + 2**16 number of returns + 2**20 code of the
-    day; of all points, ``attributes`` have this code. ``counts`` [2, 257]: of kept and of dropped
-    points by class, the last of withheld ones; ``by_return`` [16]: of all points by return number.
-    ``limits`` [2, 3]: lowest and highest stored coordinates of all.
+    day, and codes of the strip; of all points, ``attributes`` have the code of the day and these.
+    ``counts`` [2, 257]: of kept and of dropped points by class, the last of withheld ones;
+    ``by_return`` [16]: of all points by return number. ``limits`` [2, 3]: lowest and highest stored
+    coordinates of all.
     """
     kept = 0
     low_x, low_y, low_z = limits[0]
@@ -332,7 +338,8 @@ def _unpack(
         xyz[0, kept] = x * scale[0] + offset[0]
         xyz[1, kept] = y * scale[1] + offset[1]
         xyz[2, kept] = z * scale[2] + offset[2]
-        attributes[kept] = kind | returns | np.int64(attributes[i]) << 20
+        attributes[0, kept] = kind | returns | np.int64(attributes[0, i]) << 20
+        attributes[1, kept] = attributes[1, i]
         kept += 1 - drop
     limits[0] = low_x, low_y, low_z
     limits[1] = high_x, high_y, high_z

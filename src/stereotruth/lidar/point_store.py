@@ -15,6 +15,8 @@ A folder with plain arrays, which NumPy opens (little-endian; n points, m cells 
 ``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
                               of the cell's first point; ``lowest``, ``highest``: heights of its
                               points, steps; ``crc32`` of its points as they lie in the file
+``strips.npy``  uint16[n]     code of the strip that each point was measured in, of files with more
+                              than one (:mod:`.strip_codes`)
 ``store.json``                attributes, with ``cells_crc32`` of ``cells.npy`` and a digest
 ==============  ============  =====================================================================
 
@@ -50,8 +52,8 @@ Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
 
-FORMAT = 4  # of the files
-POINTS, CELLS, ATTRIBUTES = "points.npy", "cells.npy", "store.json"
+FORMAT = 5  # of the files
+POINTS, CELLS, STRIPS, ATTRIBUTES = "points.npy", "cells.npy", "strips.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
 POINT_BYTES = 4 * WORDS
@@ -83,6 +85,7 @@ ARRAYS = {  # what the files' attributes would say if they had any
         "CRC-32 of its points; squares: points in each of its 16 x 16 squares, from south and west "
         "(65535 stands for more, too)",
     },
+    STRIPS: {"long_name": "code of the strip that each point was measured in"},
 }
 _PIECE = 1 << 16  # points that are read at once, so that they stay in the cache
 
@@ -189,7 +192,7 @@ class PointStore:
         self._start = np.append(cells["first"], self.count)
         self._key = cell_key(self.cell_row, self.cell_col)
         self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=-(1 << 40)))
-        self._offset = self._first_byte()
+        self._offset = self._first_byte(POINTS, (self.count, WORDS), "<u4")
 
     def _attributes(self) -> dict[str, Any]:
         file = self.path / ATTRIBUTES
@@ -222,19 +225,19 @@ class PointStore:
             raise self._damaged(CELLS)
         return np.load(BytesIO(data))
 
-    def _first_byte(self) -> int:
-        """Where the points begin in their file, which has the size that it should have."""
-        file = self.path / POINTS
+    def _first_byte(self, name: str, shape: tuple[int, ...], kind: str) -> int:
+        """Where an array begins in its file, which has the size that it should have."""
+        file, size = self.path / name, int(np.prod(shape)) * np.dtype(kind).itemsize
         try:
             with file.open("rb") as stream:
                 np.lib.format.read_magic(stream)
-                shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-                right = (shape, dtype) == ((self.count, WORDS), np.dtype("<u4"))
-                if right and file.stat().st_size - stream.tell() == self.count * POINT_BYTES:
+                found, _, dtype = np.lib.format.read_array_header_1_0(stream)
+                right = (found, dtype) == (shape, np.dtype(kind))
+                if right and file.stat().st_size - stream.tell() == size:
                     return stream.tell()
         except Exception as error:  # NumPy reads the header as Python, which fails in many ways
-            raise self._damaged(POINTS) from error
-        raise self._damaged(POINTS)
+            raise self._damaged(name) from error
+        raise self._damaged(name)
 
     def _damaged(self, name: str) -> InputError:
         return InputError(
@@ -306,6 +309,38 @@ class PointStore:
             out = (*lattice[:, kept:], attributes[:, kept:], day[kept:])
             kept += _select(stored, start, corner, limits, self.days, *out)
         return Points(*lattice[:, :kept], *attributes[:, :kept], day[:kept])
+
+    @property
+    def strips_by(self) -> str:
+        """What tells the strips of its points."""
+        return str(self.attrs["strips"]["by"])
+
+    @property
+    def strip_counts(self) -> dict[int, int]:
+        """Points by the code of their strip."""
+        return {int(code): count for code, count in self.attrs["strips"]["points"].items()}
+
+    def strips_of(self, cell: int) -> NDArray[np.uint16]:
+        """Codes of the strips of a cell's points, in stored order. InputError if damaged."""
+        told, count = self.attrs["strips"], int(self.cell_counts[cell])
+        if len(self.strip_counts) == 1:
+            return np.full(count, next(iter(self.strip_counts)), np.uint16)
+        place = self._strips_offset + 2 * int(self._start[cell])
+        with (self.path / STRIPS).open("rb") as file:
+            file.seek(place)
+            data = file.read(2 * count)
+        if zlib.crc32(data) != told["crc32"][cell]:
+            raise self._damaged(STRIPS)
+        return np.frombuffer(data, "<u2")
+
+    def words_of(self, cell: int) -> Words:
+        """The points of a cell as they are stored, [n, 3]. InputError if damaged."""
+        parts = [stored.copy() for stored, _, _ in self._stored([(cell, cell + 1)])]
+        return np.concatenate([np.empty((0, WORDS), np.uint32), *parts])
+
+    @cached_property
+    def _strips_offset(self) -> int:
+        return self._first_byte(STRIPS, (self.count,), "<u2")
 
     def _stored(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[Words, Integers, slice]]:
         """Points of ranges of cells as they are stored, [n, 3], a piece at a time.

@@ -15,38 +15,28 @@ import io
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
 import pyproj
 import rasterio
-from numpy.typing import NDArray
 from rasterio.errors import RasterioError
-from rasterio.windows import Window
 
-from ..errors import InputError, in_number
+from ..errors import InputError
+from ..products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
 from ..products.remote_files import url_of
 from ..products.ungeoreferenced import open_raster
-from .declared_crs import LINEAR_UNITS
+from .geokeys import epoch_of_tiff
+from .height_raster import refuse_grid, system_of
 from .range_copies import open_stream
-
-Floats = NDArray[np.float64]
 
 FORMATS = ("GTiff",)
 PARTS = 64  # of a cell, that the points' coordinates are stored in: exact, as a power of two
 HEIGHT_STEP = 1e-4  # of the unit of the heights
-LOWEST, HIGHEST = -4000.0, 30000.0  # heights on Earth, in metres or in feet
-MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
 MOST_BLOCK_CELLS = 1 << 26  # of a block, which GDAL reads as a whole
 STREAM_BYTES = 1 << 20  # that servers are asked for at once
 SAMPLES = 64  # cells along each side that say how high a surface lies
 UNCLASSIFIED = 1
-UNITS = {  # of GDAL's bands
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 9001),
-    **dict.fromkeys(("ft", "foot", "feet", "international feet"), 9002),
-    **dict.fromkeys(("us-ft", "ftus", "us survey foot", "us survey feet", "sft"), 9003),
-}
 
 
 @contextmanager
@@ -57,14 +47,13 @@ def _opened(file: Path) -> Iterator[rasterio.DatasetReader]:
     follows redirects to anywhere.
     """
     with ExitStack() as stack:
-        # vertical parts of systems are not told otherwise
-        stack.enter_context(rasterio.Env(GTIFF_REPORT_COMPD_CS=True))
         parts = None if url_of(file) is None else stack.enter_context(_Parts(file))
         try:
             if parts is None:
                 raster = open_raster(file, formats=FORMATS)
             else:
-                stack.enter_context(rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"))
+                alone = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GTIFF_REPORT_COMPD_CS": True}
+                stack.enter_context(rasterio.Env(**alone))
                 raster = rasterio.open(file.name, driver=FORMATS[0], opener=parts.opened)
             with raster:
                 _refuse_other(raster, file)
@@ -119,21 +108,8 @@ class _Parts(io.RawIOBase):
 
 
 def _refuse_other(raster: rasterio.DatasetReader, file: Path) -> None:
-    colours = [colour.name for colour in raster.colorinterp]
-    if raster.count - colours.count("alpha") != 1 or np.dtype(raster.dtypes[0]).kind not in "iuf":
-        raise InputError(
-            f"{in_number(raster.count, 'band')} of {raster.dtypes[0]} are no surface model",
-            file=file,
-            remedy="give a raster of one band of heights (gdal_translate -b N takes one out)",
-        )
-    at = raster.transform
-    if at.b or at.d or not (at.a > 0 > at.e) or at == rasterio.Affine.identity():
-        raise InputError(
-            "its cells are not on a grid with north up, or it has no place on the ground",
-            file=file,
-            remedy="gdalwarp it to its own coordinate system, or give its world file's content "
-            "with gdal_translate -a_ullr",
-        )
+    refuse_bands(raster, file, HEIGHT)
+    refuse_grid(raster, file)
     rows, cols = raster.block_shapes[0]
     if rows * cols > MOST_BLOCK_CELLS or max(raster.shape) * PARTS > np.iinfo(np.int32).max:
         raise InputError(
@@ -146,23 +122,20 @@ def _refuse_other(raster: rasterio.DatasetReader, file: Path) -> None:
 
 def _system(raster: rasterio.DatasetReader, file: Path) -> str:
     """WKT of the file's system, with the unit of its band's heights where only this tells it."""
-    if raster.crs is None:
+    if (system := system_of(raster, file)) is None:
         return ""
-    system = pyproj.CRS.from_wkt(raster.crs.to_wkt())
-    unit = (raster.units[0] or "").strip()
-    if not unit or system.is_compound or len(system.axis_info) == 3:
-        return system.to_wkt()
-    if unit.lower() not in UNITS:
-        raise InputError(
-            f"its heights are in {unit!r}, which is no known unit",
-            file=file,
-            remedy="write the unit again: gdal_edit.py -units metre, or foot, or 'US survey foot'",
-        )
-    name, metres = LINEAR_UNITS[UNITS[unit.lower()]]
+    wkt = pyproj.CRS.from_wkt(raster.crs.to_wkt()).to_wkt()
+    if system.has_vertical or system.vertical_unit_m is None:
+        return wkt
     return (
-        f'COMPOUNDCRS["unknown",{system.to_wkt()},VERTCRS["unknown",VDATUM["unknown"],'
-        f'CS[vertical,1],AXIS["up",up],LENGTHUNIT["{name}",{metres!r}]]]'
+        f'COMPOUNDCRS["unknown",{wkt},VERTCRS["unknown",VDATUM["unknown"],CS[vertical,1],'
+        f'AXIS["up",up],LENGTHUNIT["{system.vertical_unit}",{system.vertical_unit_m!r}]]]'
     )
+
+
+def _values(raster: rasterio.DatasetReader, file: Path) -> Values:
+    system = system_of(raster, file)
+    return Values(raster, file, HEIGHT, 1.0 if system is None else system.height_unit_m)
 
 
 def raster_header(file: Path) -> laspy.LasHeader:
@@ -184,6 +157,8 @@ def raster_header(file: Path) -> laspy.LasHeader:
         header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
         header.point_count = rows * cols
         if wkt := _system(raster, file):
+            if url_of(file) is None and (epoch := epoch_of_tiff(file)) is not None:
+                wkt = f"COORDINATEMETADATA[{wkt},EPOCH[{epoch!r}]]"
             record = laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0")
             header.vlrs.append(record)
             header.global_encoding.wkt = True
@@ -199,40 +174,19 @@ def remark_on(header: laspy.LasHeader) -> str:
 
 
 def sampled_heights(file: Path) -> tuple[float, float] | None:
-    """Lowest and highest of some cells all over the raster, in its unit; None where all lack."""
+    """Lowest and highest of some cells all over the raster, in its unit; None where all lack.
+
+    Of a raster of :data:`.raster_values.MOST_CELLS` at most, of all. Raises InputError for values
+    that are no heights.
+    """
     with _opened(file) as raster:
+        values = _values(raster, file)
         shape = min(raster.height, SAMPLES), min(raster.width, SAMPLES)
-        heights = _heights(raster, Window(0, 0, raster.width, raster.height), file, shape)
+        if raster.width * raster.height <= MOST_CELLS and url_of(file) is None:
+            values.refuse_fills()
+        heights = values.read(out_shape=shape)
     held = heights[np.isfinite(heights)]
     return (float(held.min()), float(held.max())) if held.size else None
-
-
-def _heights(raster: Any, window: Window, file: Path, shape: tuple[int, int]) -> Floats:
-    """Heights of a window's cells, resampled to ``shape`` by the nearest; NaN where none."""
-    raw = raster.read(1, window=window, out_shape=shape)
-    there = raster.read_masks(1, window=window, out_shape=shape) != 0
-    heights = np.where(there, raw * raster.scales[0] + raster.offsets[0], np.nan)
-    with np.errstate(invalid="ignore"):
-        wrong = (heights < LOWEST) | (heights > HIGHEST)
-    if wrong.any():
-        tagged = "no nodata value" if raster.nodata is None else f"nodata {raster.nodata:g}"
-        raise InputError(
-            f"{in_number(int(wrong.sum()), 'cell')} of {float(raw[wrong][0]):g}, which is no "
-            f"height on Earth; the file declares {tagged}",
-            file=file,
-            remedy="declare it as nodata (gdal_edit.py -a_nodata), or correct the band's scale",
-        )
-    return heights
-
-
-def _windows(raster: rasterio.DatasetReader) -> Iterator[Window]:
-    """The blocks of a raster, row by row; several of them where they are as wide as it is."""
-    (rows, cols), (height, width) = raster.block_shapes[0], raster.shape
-    if cols >= width:
-        rows *= max(1, MOST_CELLS // (rows * width))
-    for row in range(0, height, rows):
-        for col in range(0, width, cols):
-            yield Window(col, row, min(cols, width - col), min(rows, height - row))
 
 
 def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAwarePointRecord]:
@@ -241,9 +195,9 @@ def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAware
     Raises InputError for values that are no heights, and for a raster that became unreadable.
     """
     with _opened(file) as raster:
-        for window in _windows(raster):
-            shape = int(window.height), int(window.width)
-            heights = _heights(raster, window, file, shape)
+        fills = Fills(_values(raster, file))
+        for window in fills.values.windows():
+            heights = fills.add(*fills.values.raw(window=window))
             row, col = np.nonzero(np.isfinite(heights))
             points = laspy.ScaleAwarePointRecord.zeros(row.size, header=header)
             points.array["X"] = (2 * (col + int(window.col_off)) + 1) * (PARTS // 2)
@@ -254,3 +208,4 @@ def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAware
             points["classification"] = np.full(row.size, UNCLASSIFIED, np.uint8)
             if row.size:
                 yield points
+        fills.refuse()

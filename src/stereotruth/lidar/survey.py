@@ -10,6 +10,7 @@ import numpy as np
 from ..numerics.degrees import DEGREE_M
 from ..products.remote_files import url_of
 from .footprint import Footprint
+from .frames import Epochs
 from .ingest import _bounds, _refuse_coarse, _to_lattice, touching
 from .point_files import open_points
 from .to_wgs84 import check_area, to_wgs84
@@ -53,6 +54,7 @@ def survey(
     footprint: Footprint | None = None,
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
+    epochs: Epochs | None = None,
 ) -> SurveyedFile:
     """A LiDAR file as :func:`.ingest.ingest` will take it, from its header and layout alone.
 
@@ -66,7 +68,7 @@ def survey(
     file = Path(file)
     points = open_points(file, by_nodes=footprint is not None, layers=url_of(file) is None)
     header = points.header
-    transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid)
+    transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, epochs=epochs)
     _refuse_coarse(points, transform)
     part = points.part(touching(transform, footprint))
     notes = [*transform.notes, *([part.remark] if part.remark else [])]

@@ -15,6 +15,9 @@ Rules
 - Map projections are undone by polynomials that are checked against PROJ at run time, see
   :mod:`stereotruth.lidar.projection_polynomials`; a coordinate may come out one step of 1e-9
   degree beside PROJ's.
+- Frames that are known to centimetres go to ITRF2020 at the date of the images
+  (:mod:`stereotruth.lidar.frames`): WGS 84 as RPCs mean it. Geoid grids count from the frame of
+  the file, so that they come first.
 - Which datum transformation is best depends on the place: on the whole degrees of longitude and
   latitude that the points' own extent touches, whatever box the header states.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
@@ -28,7 +31,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
@@ -40,6 +43,7 @@ from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
+from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .projection_polynomials import PatchedTransform
 
 if TYPE_CHECKING:
@@ -56,7 +60,8 @@ class ToWGS84:
 
     ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
     ``heights`` what was done with the heights, ``notes`` are remarks for the user. ``area``: box of
-    longitude and latitude that the operation was chosen for.
+    longitude and latitude that the operation was chosen for. ``frame``: record of the frame and the
+    epoch of the result and of the file, None if no epoch is wanted.
     """
 
     system: LidarCRS
@@ -65,6 +70,7 @@ class ToWGS84:
     heights: str
     notes: tuple[str, ...]
     area: tuple[float, float, float, float] | None
+    frame: dict[str, object] | None
     _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
@@ -86,6 +92,28 @@ class ToWGS84:
             height[good] = base[good] + self._geoid(lon[good], lat[good])
         return lon, lat, height
 
+    @property
+    def _exact(self) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """PROJ's own, without polynomials."""
+        transform = self._transform
+        return transform.exact if isinstance(transform, PatchedTransform) else transform
+
+    def inverse(self, lon: np.ndarray, lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none.
+
+        Of transformations without epochs.
+        """
+        return self._exact(lon, lat, np.zeros(np.shape(lon)), direction="INVERSE")[:2]
+
+    @property
+    def is_orthometric(self) -> bool:
+        """Whether heights of the file count from a geoid."""
+        return self._geoid is not None
+
+    def undulation(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray | float:
+        """What an ellipsoidal height is above one of the file, m; 0 without a geoid."""
+        return 0.0 if self._geoid is None else self._geoid(lon, lat)
+
     def ground_boxes(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """West, south, east, north (degrees) [n, 4] around boxes of corners [n, 2 or more].
 
@@ -95,10 +123,7 @@ class ToWGS84:
         share = np.linspace(0.0, 1.0, BOX_SAMPLES)
         ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
         x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
-        exact = self._transform
-        if isinstance(exact, PatchedTransform):
-            exact = exact.exact
-        lon, lat, _ = exact(x, y, np.zeros(x.size))
+        lon, lat, _ = self._exact(x, y, np.zeros(x.size))
         places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
         places[~np.isfinite(places)] = np.nan
         first, last = places.min(axis=1), places.max(axis=1)
@@ -115,6 +140,7 @@ class ToWGS84:
             "heights": self.heights,
             "operation": self.operation,
             "accuracy_m": self.accuracy_m,
+            "frame": self.frame,
             "geoid": None if self._geoid is None else self._geoid.path.name,
         }
 
@@ -160,6 +186,36 @@ def _best_operation(
     return best, notes
 
 
+def _in_frame(horizontal: CRS, geographic: CRS) -> pyproj.Transformer:
+    """From a system to longitude, latitude and height on its own datum, exact and unambiguous."""
+    return pyproj.Transformer.from_crs(_source(horizontal).to_3d(), geographic, always_xy=True)
+
+
+def _change_of_frame(
+    horizontal: CRS, stated: np.ndarray, epochs: Epochs | None
+) -> FrameChange | None:
+    """How coordinates in an extent [2, 2 or more] get to ITRF2020 at the epoch of the images.
+
+    None: they are left to PROJ's way to WGS 84.
+
+    Raises InputError: as :func:`.frames.frame_change`.
+    """
+    geographic = _source(horizontal).geodetic_crs
+    if epochs is None or geographic is None or not np.isfinite(stated[:, :2]).all():
+        return None
+    area = area_of(horizontal, stated)
+    if area is not None:
+        place = (area[0] + area[2]) / 2, (area[1] + area[3]) / 2
+    else:
+        degrees = pyproj.Transformer.from_crs(
+            _source(horizontal), geographic.to_2d(), always_xy=True
+        )
+        place = degrees.transform(*stated[:, :2].mean(axis=0))
+        if not np.isfinite(place).all():
+            return None
+    return frame_change(geographic, place, *epochs)
+
+
 def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, float] | None:
     """Whole degrees around an extent [2, 2 or more] in a system; None where it makes no sense.
 
@@ -181,26 +237,34 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
     )
 
 
-def _refuse_degrees_as_metres(system: LidarCRS, header: laspy.LasHeader, file: str | Path) -> None:
-    corners = np.abs([header.mins[:2], header.maxs[:2]]).max(axis=0)
+def _after(first: Callable[..., Any], change: FrameChange) -> Callable[..., Any]:
+    def transform(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        return change(*first(x, y, z))
+
+    return transform
+
+
+def _refuse_degrees_as_metres(system: LidarCRS, extent: np.ndarray, file: str | Path) -> None:
+    corners = np.abs(extent[:, :2]).max(axis=0)
     if system.horizontal.is_projected and corners[0] <= 360 and corners[1] <= 90:
         raise InputError(
             f"coordinates up to ({corners[0]:g}, {corners[1]:g}) are no coordinates of "
             f"'{system.name}'; they look like degrees",
             file=file,
-            remedy="correct lidar_crs or the file's header (longitude/latitude is EPSG:4979)",
+            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
+            "(longitude/latitude is EPSG:4979)",
         )
 
 
-def _geoid_remedy(system: LidarCRS, header: laspy.LasHeader, datum: str) -> str:
+def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
     """What to do about heights of a datum: the grid of the place that PROJ has of it."""
     from .geoid_candidates import grid_of  # for refusals alone
 
-    text = "set geoid to a grid (GTX or GeoTIFF) of that datum for this scene"
+    text = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
     geographic = _source(system.horizontal).geodetic_crs
     if geographic is None:
         return text
-    middle = (np.asarray(header.mins[:2]) + np.asarray(header.maxs[:2])) / 2
+    middle = extent[:, :2].mean(axis=0)
     try:
         degrees = pyproj.Transformer.from_crs(
             _source(system.horizontal), geographic.to_2d(), always_xy=True
@@ -222,50 +286,104 @@ def to_wgs84(
     lidar_crs: str | None = None,
     geoid: str | Path | None = None,
     extent: np.ndarray | None = None,
+    epochs: Epochs | None = None,
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
-    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``geoid``: path of a grid for orthometric
-    heights; ``extent``: lowest and highest coordinates of the points [2, 3], those that the header
-    states if it is not given.
-    Raises InputError: no or unusable coordinate system, orthometric heights without a geoid.
+    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``extent``: lowest and highest coordinates
+    of the points [2, 3], those that the header states if it is not given. Others, errors: see
+    :func:`transformation`.
     """
     system, notes = resolve(header, lidar_crs or None, file)
-    _refuse_degrees_as_metres(system, header, file)
+    stated = np.array([header.mins, header.maxs], np.float64)
+    _refuse_degrees_as_metres(system, stated, file)
+    extent = stated if extent is None else extent
+    return transformation(system, file, extent, geoid=geoid, epochs=epochs, notes=notes)
+
+
+def _surface_of_heights(
+    system: LidarCRS, file: str | Path, extent: np.ndarray, geoid: str | Path | None, unit: str
+) -> tuple[str | Path | None, list[str]]:
+    """The geoid that heights of a file count from, None for the ellipsoid; and remarks."""
     hint = DATUM_IN_NAME.search(Path(file).stem)
     if system.vertical_datum and not geoid:
         raise InputError(
             f"heights are orthometric ('{system.vertical_datum}'), not ellipsoidal",
             file=file,
-            remedy=_geoid_remedy(system, header, system.vertical_datum),
+            remedy=_geoid_remedy(system, extent, system.vertical_datum),
         )
     if not system.has_vertical and hint and not geoid:
         raise InputError(
             f"declares no vertical datum, but its name says orthometric heights ({hint[1]})",
             file=file,
-            remedy=f"{_geoid_remedy(system, header, hint[1])}, or name the file otherwise if its "
+            remedy=f"{_geoid_remedy(system, extent, hint[1])}, or name the file otherwise if its "
             "heights are ellipsoidal",
         )
     if system.ellipsoidal and geoid:
-        notes.append("the file declares ellipsoidal heights: the geoid is not applied to it")
-        geoid = None
+        return None, ["the file declares ellipsoidal heights: the geoid is not applied to it"]
+    if system.has_vertical:
+        return geoid, []
+    taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
+    return geoid, [f"declares no vertical datum: heights are taken as {taken}, in {unit}"]
+
+
+def transformation(
+    system: LidarCRS,
+    file: str | Path,
+    extent: np.ndarray,
+    *,
+    geoid: str | Path | None = None,
+    epochs: Epochs | None = None,
+    keep_frame: bool = False,
+    notes: Sequence[str] = (),
+) -> ToWGS84:
+    """The transformation of coordinates of a system, as LiDAR, rasters and control points need it.
+
+    ``extent``: lowest and highest coordinates [2, 2 or more]; ``geoid``: path of a grid for
+    orthometric heights; ``epochs``: that of the images, at which coordinates are brought to
+    ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
+    takes them for, most of them WGS 84; ``keep_frame``: the result is in the system's own frame;
+    ``notes``: remarks that go before others.
+
+    Raises InputError: a system that PROJ cannot transform, orthometric heights without a geoid, a
+    dynamic frame without an epoch.
+    """
     unit = system.vertical_unit or (
         "metre" if system.horizontal.is_geographic else system.horizontal.axis_info[0].unit_name
     )
-    if not system.has_vertical:
-        taken = "orthometric, as a geoid is given" if geoid else "ellipsoidal, as no geoid is given"
-        notes.append(f"declares no vertical datum: heights are taken as {taken}, in {unit}")
-    stated = np.array([header.mins, header.maxs], np.float64)
+    geoid, more = _surface_of_heights(system, file, extent, geoid, unit)
+    notes = [*notes, *more]
+    if epochs is not None and system.epoch is not None:
+        epochs = epochs._replace(own=system.epoch)
     try:
-        area = area_of(system.horizontal, stated if extent is None else extent)
-        transformer, remarks = _best_operation(system.horizontal, area)
+        area = area_of(system.horizontal, extent)
+        change = _change_of_frame(system.horizontal, extent, epochs)
+        if keep_frame:
+            geographic = _source(system.horizontal).geodetic_crs.to_3d()
+            transformer, remarks = _in_frame(system.horizontal, geographic), []
+        elif change is None:
+            transformer, remarks = _best_operation(system.horizontal, area)
+        else:
+            transformer = _in_frame(system.horizontal, change.geographic)
+            remarks = list(change.notes)
+    except InputError as error:
+        raise InputError(error.problem, file=file, remedy=error.remedy) from error
     except ProjError as error:
         raise InputError(
             f"'{system.name}' cannot be transformed to WGS 84: {error}",
             file=file,
-            remedy="set lidar_crs to a system that PROJ can transform, or transform the file",
+            remedy="name a system that PROJ can transform (lidar_crs, --crs), or transform the "
+            "file",
         ) from error
-    transform = transformer.transform
+    transform, operation = transformer.transform, transformer.description
+    accuracy = frame = None
+    if transformer.accuracy >= 0:
+        accuracy = float(transformer.accuracy)
+    if epochs is not None and change is None:
+        frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
+    if change is not None:
+        transform = _after(transform, change)
+        operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
     if system.horizontal.is_projected:
         transform = PatchedTransform(transform, system.horizontal_unit_m)
     grid = None
@@ -281,16 +399,17 @@ def to_wgs84(
         heights = f"ellipsoidal ({'declared' if system.ellipsoidal else 'assumed'}), in {unit}"
     return ToWGS84(
         system=system,
-        operation=transformer.description,
-        accuracy_m=float(transformer.accuracy) if transformer.accuracy >= 0 else None,
+        operation=operation,
+        accuracy_m=accuracy,
         heights=heights,
         notes=tuple(notes + remarks),
         area=area,
+        frame=frame,
         _transform=transform,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.
-        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
+        _heights_follow_datum=modern and not keep_frame and not (grid and grid.above_wgs84),
     )
 
 
@@ -318,6 +437,9 @@ def check_area(
     )
     if beyond > 8:
         raise InputError(
-            where, file=file, remedy="correct lidar_crs or the file's coordinate system"
+            where,
+            file=file,
+            remedy="correct the coordinate system that is given (lidar_crs, --crs) or that the "
+            "file declares",
         )
     return where

@@ -175,7 +175,7 @@ class MirroredBatchMethod(MirroredMethod):
 
 def flipped(image: NDArray[Any]) -> NDArray[Any]:
     """An image [h, w] or [h, w, 3] with its columns from right to left."""
-    return np.ascontiguousarray(image[:, ::-1])
+    return image[:, ::-1].copy()  # no view: PyTorch takes no array that runs backwards
 
 
 def _negated(disparity_range: DisparityRange) -> DisparityRange:

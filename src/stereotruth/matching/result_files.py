@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +26,7 @@ def read_result(file: Path, nodata: float = np.nan) -> NDArray[np.float32]:
         values = (_npy if file.suffix == ".npy" else _pfm)(file).astype(np.float32)
     except InputError:
         raise
-    except (OSError, ValueError, TypeError, EOFError, cv2.error):
+    except (OSError, ValueError, TypeError, EOFError, IndexError):
         raise InputError("no image that can be read", file=file, remedy="write it anew") from None
     values[~np.isfinite(values) | (values == np.float32(nodata))] = np.nan
     return values
@@ -41,15 +40,14 @@ def _npy(file: Path) -> NDArray[Any]:
 
 
 def _pfm(file: Path) -> NDArray[Any]:
-    """A portable float map, which is as large as its header says."""
+    """A portable float map, whose rows run upwards; its scale tells the order of bytes alone."""
     with file.open("rb") as stream:
-        kind, size = (stream.readline(LONGEST_LINE).split() for _ in range(2))
-    cols, rows = map(int, size)
-    refuse_large((rows, cols), file)
-    bands = {b"Pf": 1, b"PF": 3}[kind[0]] if kind and kind[0] in (b"Pf", b"PF") else 0
-    if not bands or min(rows, cols) < 1 or file.stat().st_size < 4 * bands * rows * cols:
-        raise ValueError("not as large as its header says")
-    values = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise ValueError("no image")
-    return values
+        kind, size, scale = (stream.readline(LONGEST_LINE).split() for _ in range(3))
+        cols, rows = map(int, size)
+        refuse_large((rows, cols), file)
+        is_map = kind == [b"Pf"] and min(rows, cols) > 0 and float(scale[0])
+        if not is_map or file.stat().st_size < 4 * rows * cols:
+            raise ValueError("no map of one band, as large as its header says")
+        data = stream.read(4 * rows * cols)
+    values = np.frombuffer(data, "<f4" if float(scale[0]) < 0 else ">f4", rows * cols)
+    return values.reshape(rows, cols)[::-1]

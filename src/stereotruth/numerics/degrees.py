@@ -11,6 +11,24 @@ judged, not measured."""
 SEMI_MAJOR_M = 6_378_137.0  # WGS 84
 ECCENTRICITY_SQUARED = 6.69437999014e-3
 
+SEAM_DEG = -177.6
+"""Where longitudes jump by 360: the meridian near that of 180° with least land, so that places on
+both sides of the line of 180° have longitudes that are near to each other."""
+
+
+def turn(degrees: ArrayLike) -> NDArray[np.float64]:
+    """Differences of longitudes, the shorter way around: in [−180, 180)."""
+    return (np.asarray(degrees, np.float64) + 180.0) % 360.0 - 180.0
+
+
+def continuous(lon: ArrayLike) -> NDArray[np.float64]:
+    """Longitudes in [SEAM_DEG, SEAM_DEG + 360), to the bit those that lie there already."""
+    lon = np.asarray(lon, np.float64)
+    beyond = (lon < SEAM_DEG) | (lon >= SEAM_DEG + 360.0)
+    if not beyond.any():
+        return lon
+    return np.where(beyond, (lon - SEAM_DEG) % 360.0 + SEAM_DEG, lon)
+
 
 def metres_per_degree(lat: ArrayLike) -> NDArray[np.float64]:
     """Metres [2, ...] of a degree to the east and to the north at latitudes ``lat``; to 0.7 %."""

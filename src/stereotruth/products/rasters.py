@@ -16,11 +16,15 @@ from rasterio.errors import RasterioIOError
 
 from ..errors import InputError
 from .files import atomic_file
+from .raster_values import Quantity, Values, is_value
 from .ungeoreferenced import open_raster
 
 Floats = NDArray[np.float64]
 
 MOST_VALUES = 1 << 28  # of an image that is read as a whole: 16384 x 16384 of one band
+DISPARITY = Quantity(
+    "disparity", "disparity map", -np.inf, np.inf, "give one band of disparities in px"
+)
 KITTI_STEPS = 256  # in a px of disparity, of PNGs
 
 
@@ -105,17 +109,23 @@ def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float
 
     A PNG of 16 bits has KITTI's coding: KITTI_STEPS in a px, 0 where there is none.
 
-    Raises InputError if it cannot be read.
+    Raises InputError if it cannot be read, has other bands, or is a PNG of 8 bits.
     """
     with _opened(path) as source:
-        values = source.read(1).astype(np.float32)
-        missing = values == np.float32(nodata)
+        if source.driver == "PNG" and not _is_kitti(source):
+            raise InputError(
+                f"a PNG of {source.dtypes[0]} has no disparities",
+                file=path,
+                remedy=f"write 16 bits, {KITTI_STEPS} steps a px and 0 for none, or a TIFF",
+            )
+        values = Values(source, Path(path), DISPARITY)
+        raw, there = values.raw()
         if _is_kitti(source):
-            missing, values = values == 0, values / np.float32(KITTI_STEPS)
-        elif source.nodata is not None:
-            missing |= values == np.float32(source.nodata)
-    values[missing | ~np.isfinite(values)] = np.nan
-    return values
+            there, found = raw != 0, raw / np.float32(KITTI_STEPS)
+        else:
+            there &= ~is_value(raw, nodata)
+            found = raw.astype(np.float64) * values.scale + values.offset
+    return np.where(there, found, np.nan).astype(np.float32)
 
 
 @contextmanager

@@ -41,5 +41,6 @@ def open_raster(
         if mode != "r":
             return rasterio.open(path, mode, **options)
         name, reading = gdal_name(path)
-        with rasterio.Env(**reading):  # rasterio.open takes one format only
+        # vertical parts of systems are not told otherwise; rasterio.open takes one format only
+        with rasterio.Env(GTIFF_REPORT_COMPD_CS=True, **reading):
             return rasterio.DatasetReader(name, driver=list(formats), **options)

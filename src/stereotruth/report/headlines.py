@@ -6,6 +6,7 @@ a run print it: over all matches and all labelled pixels of a scene.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -91,7 +92,25 @@ def _lidar(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline
         if of["not_read_m2"]:
             note += f"; {of['not_read_m2'] / 1e6:.3f} km² around the images were not read"
     text = f"{read / 1e6:.1f} of {every / 1e6:.1f} MB"
-    return [Headline("LiDAR read", text, note, bool(holes)), *_dates(scenes, labelled)]
+    read_of = Headline("LiDAR read", text, note, bool(holes))
+    return [read_of, *_dates(scenes, labelled), *_strips(scenes)]
+
+
+def _strips(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
+    """How far strips are off those with most ground, of the scene where they are most in height."""
+    found = []
+    for strips in filter(None, (of.get("strips") for of in scenes)):
+        off = [row for row in strips["strips"] if row["beyond_noise"]]
+        if off:
+            up_m = max(abs(row["up_m"]) for row in off)
+            plan_m = max(math.hypot(row["east_m"], row["north_m"]) for row in off)
+            found.append((up_m, plan_m, len(off), len(strips["strips"]), strips["taken_out"]))
+    if not found:
+        return []
+    up_m, plan_m, off_count, count, taken_out = max(found)
+    note = f"{off_count} of {count} strips are off by up to so much in height, {plan_m:.2f} m in "
+    note += "plan; " + ("points are moved by that" if taken_out else "uncertainties have that")
+    return [Headline("strips of the LiDAR", f"{100 * up_m:.0f} cm", note, not taken_out)]
 
 
 def _dates(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
@@ -137,7 +156,8 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
-    doubted = list(quality.get("doubts", {}))
+    doubts = quality.get("doubts", {})
+    doubted = [scene for scene, of in doubts.items() if any(d.get("of") != "strips" for d in of)]
     if doubted:
         note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"

@@ -258,6 +258,13 @@ def quality_gates(record: Mapping[str, Any]) -> dict[str, Any] | None:
             for scene, found in record.get("doubts", {}).items()
             for doubt in found
         ],
+        "strips": table(
+            [
+                {"scene": scene, **{k: "" if v is None else str(v) for k, v in row.items()}}
+                for scene, figures in scenes.items()
+                for row in ((figures.get("lidar") or {}).get("strips") or {}).get("strips", ())
+            ]
+        ),
         "surfaces": table(
             [
                 {"scene": scene, "of": words(of), **{k: str(v) for k, v in figures.items()}}
@@ -285,6 +292,7 @@ def refinement(record: Mapping[str, Any]) -> dict[str, Any] | None:
     return {
         "applied": bool(found.get("applied")),
         "reason": found.get("reason", ""),
+        "remark": found.get("remark", ""),
         "table": table(rows),
         "used": found.get("used"),
         "sites": found.get("sites"),

@@ -1,6 +1,7 @@
 """Make synthetic cities without a workflow.
 
 python -m stereotruth.simulate Qichun data/synthetic/Qichun
+python -m stereotruth.simulate place.laz twin --crs EPSG:2154
 python -m stereotruth.simulate gcps config/gcps
 """
 
@@ -14,11 +15,13 @@ from pathlib import Path
 
 from ..errors import InputError
 from .cities import CITIES, CitySpec, SceneSpec, lidar_files
+from .city_files import read_city
 from .control_points import simulate_points, write_gcps
 from .lidar import simulate_lidar_tile
 from .render import simulate_image
 from .settings import Settings
 from .truth import simulate_truth
+from .twins import twin_city
 
 log = logging.getLogger("stereotruth")
 
@@ -49,15 +52,33 @@ def make_scene(
         log.info("%s %s: %.1f s", scene.name, name, time.perf_counter() - start)
 
 
+def _city(what: str, crs: str) -> CitySpec:
+    """What is asked for: a city by name or by its file, or the twin of a place."""
+    if what in CITIES:
+        return CITIES[what]
+    if what.lower().endswith(".json"):
+        return read_city(what)
+    if what.lower().endswith((".las", ".laz")):
+        return twin_city("Twin", what, crs=crs)
+    raise InputError(
+        f"{what!r} is no city", remedy=f"name one of {', '.join(CITIES)}, a city.json, LAS or LAZ"
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stereotruth.simulate", description=__doc__)
-    parser.add_argument("what", choices=[*CITIES, "gcps"], help="a city, or gcps for all GCP files")
+    parser.add_argument(
+        "what",
+        help=f"a city ({', '.join(CITIES)}), city.json of one, the LAS or LAZ file of a place to "
+        "make a twin of, or gcps for all GCP files",
+    )
     parser.add_argument("folder", type=Path, help="where to write <scene>/… (or <scene>.csv)")
     parser.add_argument(
         "--spacing-m", type=float, default=Settings.lidar_spacing_m, help="LiDAR pulse spacing"
     )
     parser.add_argument("--seed", type=int, default=SEED, help="draws all measurement noise")
+    parser.add_argument("--crs", default="", help="of a place's points, if they declare none")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
@@ -65,7 +86,7 @@ def main(arguments: list[str] | None = None) -> int:
             for path in write_gcps(given.folder, seed=given.seed):
                 log.info("wrote %s", path)
             return 0
-        city = CITIES[given.what]
+        city = _city(given.what, given.crs)
         for scene in city.scenes:
             make_scene(city, scene, given.folder / scene.name,
                        spacing_m=given.spacing_m, seed=given.seed)  # fmt: skip

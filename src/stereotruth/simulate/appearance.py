@@ -11,11 +11,15 @@ import math
 import numpy as np
 
 from ..kernels import inlined
-from .surfaces import CELL_M, GROUND, ROOF, TREE, WATER, in_shadow
+from .patches import PATCH_M, PATCHES_A_CELL
+from .surfaces import CELL_M, FIRST_PATCH, GROUND, ROOF, TREE, WATER, in_shadow
 
 SKY = 0.34  # diffuse share of the light
 GROUND_MEAN = 0.2  # reflectance that the ground keeps whatever its contrast
 VEHICLE = 4  # kind of roof cover, beside those of buildings
+PAINT = 65535.0
+SIDE_ALBEDO = 0.34  # of the sides of patches
+CLEAR_M = 0.4  # from a side, whose steps would shade each other
 
 
 @inlined
@@ -160,6 +164,44 @@ def _ground(s, x, y, slope2):
 
 
 @inlined
+def _painted(s, x, y):
+    """Reflectance by the paint at a plan position, with detail of less than a metre; negative where
+    there is no paint."""
+    u = (x - s.x0) / PATCH_M - PATCHES_A_CELL * s.patch_i - 0.5
+    v = (y - s.y0) / PATCH_M - PATCHES_A_CELL * s.patch_j - 0.5
+    i, j = int(np.floor(u)), int(np.floor(v))
+    if i < 0 or j < 0 or i >= s.paint.shape[1] - 1 or j >= s.paint.shape[0] - 1:
+        return -1.0
+    f, g = u - i, v - j
+    value = weight = 0.0
+    for n in range(2):
+        for m in range(2):
+            paint = s.paint[j + n, i + m]
+            if paint > 0:
+                w = (f if m else 1 - f) * (g if n else 1 - g)
+                value += w * paint
+                weight += w
+    if weight < 1e-3:
+        return -1.0
+    fine = _sample(s.fine, 4.0 * x, 4.0 * y)
+    mid = _sample(s.fine, 1.13 * x + 0.83 * y, 1.13 * y - 0.83 * x)
+    return value / (weight * PAINT) * (1 + 0.09 * fine + 0.08 * mid)
+
+
+@inlined
+def _facade(s, albedo, along, z, phase, number):
+    """Reflectance of a wall with windows; ``number`` and ``phase`` tell walls apart."""
+    fine = _sample(s.fine, 4.0 * along + phase[0], 4.0 * z + phase[1])
+    value = albedo * (1 + 0.10 * fine)
+    storey = z - 3.0 * math.floor(z / 3.0)
+    bay = along - 3.4 * math.floor(along / 3.4)
+    if storey > 0.9 and storey < 2.4 and bay > 0.7 and bay < 2.6:
+        glass = _hash(int(np.floor(along / 3.4)), int(np.floor(z / 3.0)), number)
+        value = 0.07 + 0.16 * glass * glass
+    return value
+
+
+@inlined
 def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
     """Light that comes back from a surface point, about 0 to 1.
 
@@ -167,9 +209,12 @@ def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
     that of the ground along x and y.
     """
     nx, ny, nz = 0.0, 0.0, 1.0
+    shaded_x, shaded_y = x, y
     if kind == GROUND:
         zx, zy = slope
-        value = _ground(s, x, y, zx * zx + zy * zy)
+        value = _painted(s, x, y) if s.paint.shape[0] > 0 else -1.0
+        if value < 0:
+            value = _ground(s, x, y, zx * zx + zy * zy)
         if s.ground_look[1] != 1.0:
             value = GROUND_MEAN + s.ground_look[1] * (value - GROUND_MEAN)
         value *= s.ground_look[0]
@@ -188,6 +233,19 @@ def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
             0.15 + 0.05 * (s.trees[index, 3] - math.floor(s.trees[index, 3]) - 0.5) + 0.062 * leaf
         )
         value *= s.tree_style[index, 0]
+    elif index <= FIRST_PATCH:
+        number = FIRST_PATCH - index
+        n, m = number // s.patches.shape[1], number % s.patches.shape[1]
+        if kind == ROOF:
+            zx, zy = s.patches[n, m, 1], s.patches[n, m, 2]
+            value = max(_painted(s, x, y), 0.0)
+            scale = 1 / math.sqrt(1 + zx * zx + zy * zy)
+            nx, ny, nz = -zx * scale, -zy * scale, scale
+        else:
+            looks = s.patch_side[n, m] * (math.pi / 128)
+            nx, ny, nz = math.cos(looks), math.sin(looks), 0.0
+            value = _facade(s, SIDE_ALBEDO, y * nx - x * ny, z, (0.0, 0.0), s.patch_side[n, m])
+            shaded_x, shaded_y = x + CLEAR_M * nx, y + CLEAR_M * ny
     else:
         u = (x - s.boxes[index, 0]) * s.boxes[index, 2] + (y - s.boxes[index, 1]) * s.boxes[
             index, 3
@@ -229,15 +287,10 @@ def reflectance(s, sun, view, x, y, z, kind, index, face, slope):
             else:
                 along, side = u, 1.0 if face == 4 else -1.0
                 nx, ny, nz = -side * s.boxes[index, 3], side * s.boxes[index, 2], 0.0
-            fine = _sample(s.fine, 4.0 * along + s.box_style[index, 3], 4.0 * z + face * 97.0)
-            value = s.box_style[index, 1] * (1 + 0.10 * fine)
-            storey = z - 3.0 * math.floor(z / 3.0)
-            bay = along - 3.4 * math.floor(along / 3.4)
-            if storey > 0.9 and storey < 2.4 and bay > 0.7 and bay < 2.6:
-                glass = _hash(int(np.floor(along / 3.4)), int(np.floor(z / 3.0)), index + face)
-                value = 0.07 + 0.16 * glass * glass
+            phase = s.box_style[index, 3], face * 97.0
+            value = _facade(s, s.box_style[index, 1], along, z, phase, index + face)
     light = nx * sun[0] + ny * sun[1] + nz * sun[2]
-    if light > 0 and in_shadow(s, sun, x, y, z, view):
+    if light > 0 and in_shadow(s, sun, shaded_x, shaded_y, z, view):
         light = 0.0
     sky = SKY * (0.55 + 0.45 * nz)
     return max(value, 0.02) * (sky + max(light, 0.0) * ((1 - SKY) / sun[2]))

@@ -2,11 +2,13 @@
 
 The satellite flies a circle that is fixed in inertial space while the Earth turns below. Every
 line is taken at its own time from its own position and attitude; all pixels of a line lie in one
-plane of the camera. Attitude is yaw steering plus roll, pitch and yaw polynomials of time. Image
+plane of the camera. Attitude is yaw steering plus roll, pitch and yaw polynomials of time, and
+jitter of roll and pitch, which RPCs cannot follow. Image
 coordinates are (col, row), (0, 0) the centre of the upper-left pixel.
 
 A camera is a flat float64 array for the kernels, made by :func:`aim`; its fields are the constants
-below. Positions and directions come out in the world frame of the city (see ``geodesy``).
+below. Where the radius of the orbit is 0, it is one of :mod:`.rpc_cameras`.
+Positions and directions come out in the world frame of the city (see ``geodesy``).
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..kernels import inlined, kernel
+from .cities import Jitter
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
+from .rpc_cameras import direction_by_rpc, pose_by_rpc, project_by_rpc
 
 ALTITUDE_M = 505e3
 INCLINATION_DEG = 97.4
@@ -34,12 +38,21 @@ ROLL, PITCH, YAW, TIME_REF = 13, 16, 19, 22  # polynomials of (time - TIME_REF),
 FRAME = 23  # origin and axes of the world frame
 SLOPE = 35  # d(look tangent)/d(row) of a ground point, start value of the solver
 ROWS_MID = 36
-SIZE = 37
+WAVES, WAVE = 37, 38  # number of the waves of jitter, and the first one's fields
+ROLL_WAVE, PITCH_WAVE, PER_ROW, PHASE = 0, 1, 2, 3  # amplitudes and frequency in rad, phase
+MOST_WAVES = 8
+SIZE = WAVE + 4 * MOST_WAVES
 
 
 @inlined
 def pose(cam, row, out):
-    """Write position and body axes (forward, left, up) of one line, world frame, to out[12]."""
+    """Write position and body axes (forward, left, up) of one line, world frame, to out[12].
+
+    Of a camera by given RPCs: its position, and what its directions follow from.
+    """
+    if cam[RADIUS] == 0.0:
+        pose_by_rpc(cam, row, out)
+        return
     t = cam[TIME0] + row * cam[PERIOD]
     # the circle in inertial space, turned back into ECEF
     c, s = math.cos(cam[MOTION] * t), math.sin(cam[MOTION] * t)
@@ -61,6 +74,11 @@ def pose(cam, row, out):
     roll = cam[ROLL] + d * (cam[ROLL + 1] + d * cam[ROLL + 2])
     pitch = cam[PITCH] + d * (cam[PITCH + 1] + d * cam[PITCH + 2])
     yaw = cam[YAW] + d * (cam[YAW + 1] + d * cam[YAW + 2])
+    for k in range(int(cam[WAVES])):
+        at = WAVE + 4 * k
+        swing = math.sin(cam[at + PHASE] + cam[at + PER_ROW] * row)
+        roll += cam[at + ROLL_WAVE] * swing
+        pitch += cam[at + PITCH_WAVE] * swing
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -82,6 +100,8 @@ def pose(cam, row, out):
 @inlined
 def direction(cam, line, col):
     """Direction (not normalised, z < 0) of the ray of a column, given its line's pose."""
+    if cam[RADIUS] == 0.0:
+        return direction_by_rpc(cam, line, col)
     across = (col - cam[COL0]) * cam[PITCH_PER_COL]
     look = cam[LOOK]
     return (
@@ -98,6 +118,8 @@ def project_point(cam, x, y, z, row, line):
     Solves for the line time by the secant method; the pose in ``line`` is that of the result to
     1e-4 rows, 0.1 mm of the satellite's way.
     """
+    if cam[RADIUS] == 0.0:
+        return project_by_rpc(cam, x, y, z, line)
     slope = cam[SLOPE]
     last = 0.0
     step = 0.0
@@ -197,6 +219,26 @@ class Pass:
 def drift_of_attitude(rng: np.random.Generator) -> np.ndarray:
     """Rate and bend of roll, pitch and yaw [3, 2], see :class:`Pass`."""
     return rng.normal(size=(3, 2)) * [[2e-5, 1.5e-5], [2e-5, 1.5e-5], [4e-5, 3e-5]]
+
+
+def jittering(cam: np.ndarray, jitter: Jitter, rng: np.random.Generator) -> np.ndarray:
+    """The camera with roll and pitch that swing along the lines, phases drawn apart.
+
+    Each of both moves the image by ``jitter.rms_px`` px rms, in equal parts by all its waves.
+    """
+    if 2 * len(jitter.periods) > MOST_WAVES:
+        raise ValueError(f"a camera jitters by {MOST_WAVES // 2} waves at most")
+    cam = cam.copy()
+    rows = 2.0 * cam[ROWS_MID] + 1.0
+    amplitude = jitter.rms_px * math.sqrt(2.0 / len(jitter.periods))
+    for axis, radians_per_px in ((ROLL_WAVE, cam[PITCH_PER_COL]), (PITCH_WAVE, abs(cam[SLOPE]))):
+        for periods in jitter.periods:
+            at = WAVE + 4 * int(cam[WAVES])
+            cam[at + axis] = amplitude * radians_per_px
+            cam[at + PER_ROW] = 2.0 * math.pi * periods / rows
+            cam[at + PHASE] = rng.uniform(0.0, 2.0 * math.pi)
+            cam[WAVES] += 1.0
+    return cam
 
 
 def aim(

@@ -33,7 +33,7 @@ def _reason(s, kind, index, z, scanned):
     if kind == TREE:
         return GROWN_OR_FELLED
     if kind in (ROOF, WALL):
-        if s.box_style[index, 2] == VEHICLE:
+        if index >= 0 and s.box_style[index, 2] == VEHICLE:
             return MOVED
         return DEMOLISHED if scanned > z - SAME_M else BUILT
     return WATER_LEVEL if kind == WATER else GROUND_LEVEL

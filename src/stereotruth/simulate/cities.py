@@ -34,15 +34,31 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class Jitter:
+    """Roll and pitch that swing while an image is taken; no RPC follows.
+
+    ``rms_px``: of the image's movement by either; ``periods`` of its waves, in an image.
+    """
+
+    rms_px: float
+    periods: tuple[float, ...] = (1.3, 2.1, 3.0)
+
+
+@dataclass(frozen=True)
 class ViewSpec:
     """What one image of a pair has of its own.
 
     ``sun_deg``: azimuth and elevation of the sun, degrees; None is the city's. ``bare``: the crowns
-    of the canopy have no leaves, so that most rays pass them.
+    of the canopy have no leaves, so that most rays pass them. ``jitter`` of the attitude.
+    ``psf_px``: standard deviation of the point spread, px. ``saturates``: the reflectance that has
+    the greatest of 8 bits; None: 11 bits, which nothing saturates.
     """
 
     sun_deg: tuple[float, float] | None = None
     bare: bool = False
+    jitter: Jitter | None = None
+    psf_px: float = 0.42
+    saturates: float | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +88,19 @@ class Dates:
         days = self.left, self.right, self.lidar
         first, last = min(days), max(days)
         return (getattr(self, world) - first) / (last - first) if last > first else 0.0
+
+
+@dataclass(frozen=True)
+class FlightStrip:
+    """One strip of an airborne LiDAR that flies north.
+
+    ``offset_m``: east, north, up that all of its points are off by; ``roll_deg``: the points turn
+    about the strip's middle line besides, the east down. ``spacing_m`` of its pulses.
+    """
+
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spacing_m: float = 0.4
+    roll_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,6 +157,28 @@ class Character:
 
 
 @dataclass(frozen=True)
+class Twin:
+    """The real place that a city is the twin of.
+
+    ``file``: LAS or LAZ; ``crs``: of its points, if it declares none. ``half_m``: half the ground
+    that the file covers, along its axes east and north; ``turned_rad``: counter-clockwise turn of
+    these axes in the city's frame. ``rpcs``: files of RPCs by which left and right image see the
+    place, over it or moved there; None: GaoFen-7's camera takes them.
+    """
+
+    file: str
+    crs: str
+    half_m: tuple[float, float]
+    turned_rad: float
+    rpcs: tuple[str, str] | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """The files of the place."""
+        return [self.file, *(self.rpcs or ())]
+
+
+@dataclass(frozen=True)
 class CitySpec:
     """A synthetic city: where it lies, what it looks like, and its scenes.
 
@@ -135,7 +186,10 @@ class CitySpec:
     height of its lowest ground; ``world_seed`` draws everything that is built.
     ``margin_m``: ground built around the scenes, more than any ray leans. ``left``, ``right``: what
     the images have of their own. ``dates``: of images and LiDAR, each of which has a world of its
-    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone.
+    own then; None: a few buildings of each scene stand in the images or in the LiDAR alone, but in
+    a twin. ``strips`` of the LiDAR, from west to east over each scene; none: two crossed sets of
+    flight lines that agree. ``twin``: the real place whose ground, roofs and crowns the city has;
+    None: it is drawn.
     """
 
     name: str
@@ -154,6 +208,8 @@ class CitySpec:
     left: ViewSpec = ViewSpec()
     right: ViewSpec = ViewSpec()
     dates: Dates | None = None
+    strips: tuple[FlightStrip, ...] = ()
+    twin: Twin | None = None
 
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""

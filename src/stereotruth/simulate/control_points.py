@@ -1,4 +1,4 @@
-"""Ground control points and check points: sharp roof corners, and marks on open ground."""
+"""Ground control points and check points: sharp roof corners, and places on open ground."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ..products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .layout import scene_coordinates
+from .patches import NOTHING, PATCH_M, PATCHES_A_CELL
 from .render import Camera, ImagedScene, prepare
 from .surfaces import (
     ANY_VIEW,
@@ -32,6 +33,7 @@ GCP_COUNT = 20
 CHECKPOINT_COUNT = 80
 GCP_NOISE_PX = 0.25
 FRAME_MARGIN_PX = 30.0
+MARKS_M = 4.0  # between the places of a twin that can be measured
 
 
 @kernel
@@ -67,8 +69,14 @@ def _visible(ready: ImagedScene, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.column_stack([left, right]), in_left & in_right
 
 
-def roof_corners(s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [n, 3] of flat roofs that stand free, unchanged, and the building of each."""
+def marks(s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
+    """Places [n, 3] that can be measured in images, and the building of each.
+
+    Corners of flat roofs that stand free, unchanged; of a twin, middles of patches of roofs and of
+    the ground, each of which counts as a building.
+    """
+    if s.patches.size:
+        return _middles(s)
     b = s.boxes
     area = b[:, 4] * b[:, 5]
     use = np.flatnonzero((b[:, 7] == 0) & (s.box_view == (IN_IMAGES | IN_LIDAR)) & (area > 20))
@@ -94,6 +102,20 @@ def roof_corners(s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
     v = np.abs(dy * b[box, 2] - dx * b[box, 3]) - b[box, 5]
     free[corner[(u < 1.0) & (v < 1.0) & (owner[corner] != box)]] = False
     return xyz[free], owner[free]
+
+
+def _middles(s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
+    """Every so many metres the middle of a patch, or the ground below it, and a number of each."""
+    step = round(MARKS_M / PATCH_M)
+    some = s.patches[step // 2 :: step, step // 2 :: step, 0].astype(np.float64)
+    j, i = (a.ravel() for a in np.indices(some.shape))
+    x, y = (
+        low + PATCH_M * (PATCHES_A_CELL * cell + step // 2 + step * k + 0.5)
+        for low, cell, k in ((s.x0, s.patch_i, i), (s.y0, s.patch_j, j))
+    )
+    xy = np.column_stack([x, y])
+    z = np.where(some > NOTHING, some, terrain_heights(s, xy)[:, 0].reshape(some.shape))
+    return np.column_stack([xy, z.ravel()]), np.arange(some.size)
 
 
 def spread_out(where: np.ndarray, count: int, start: np.ndarray) -> list[int]:
@@ -126,13 +148,13 @@ def make_points(
 ) -> tuple[list[dict], list[dict], list[dict]]:
     """Measured GCPs, the same without measurement noise, and independent exact check points.
 
-    GCPs are roof corners that both views show, spread as evenly as the city has them. Check points
+    GCPs are :func:`marks` that both views show, spread as evenly as the city has them. Check points
     are other buildings' corners and points on open ground. ``seed`` draws the noise of the GCPs'
     image coordinates (0.25 px each); their ground coordinates are exact.
     """
     ready = prepare(city, scene)
     s = ready.surfaces
-    xyz, owner = roof_corners(s)
+    xyz, owner = marks(s)
     image, seen = _visible(ready, xyz)
     xyz, owner, image = xyz[seen], owner[seen], image[seen]
     middle = np.array([[(ready.left.cols - 1) / 2, (ready.left.rows - 1) / 2]])
@@ -186,16 +208,15 @@ def _open_sky(s, xyz: np.ndarray) -> np.ndarray:
 def simulate_points(
     city: CitySpec,
     scene: SceneSpec,
-    gcps_csv: str | Path | None,
+    gcps_csv: str | Path,
     gcps_exact_csv: str | Path,
     checkpoints_csv: str | Path,
     *,
     seed: int,
 ) -> None:
-    """Write measured GCPs (unless None), exact GCPs and check points of a scene."""
+    """Write measured GCPs, exact GCPs and check points of a scene."""
     measured, exact, checks = make_points(city, scene, seed=seed)
-    if gcps_csv is not None:
-        write_table(gcps_csv, measured, FIELDS)
+    write_table(gcps_csv, measured, FIELDS)
     write_table(gcps_exact_csv, exact, FIELDS)
     write_table(checkpoints_csv, checks, FIELDS)
 

@@ -1,8 +1,8 @@
 """The worlds of both images and of the LiDAR, each at its date: objects, ground and water.
 
 Each thing that changes does so at a moment of its own, drawn between the first and the last date. A
-world holds what stands at its date. Objects carry the bits of their worlds; ground, water and the
-texture of streets are those of :func:`world_of`.
+world holds what stands at its date. Objects carry the bits of their worlds; ground, water, the
+texture of streets and the roofs of twins are those of :func:`world_of`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .cities import CitySpec
+from .patches import NOTHING
 from .surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT, Surfaces
 
 WORLDS = {"left": IN_LEFT, "right": IN_RIGHT, "lidar": IN_LIDAR}
@@ -70,20 +71,52 @@ def dated_buildings(
     return boxes, np.concatenate([style, style[raised]]), view
 
 
-def dated_trees(city: CitySpec, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Crowns [n, 6] and the bits of their worlds, with the young ones of those that have grown."""
+def dated_trees(
+    city: CitySpec,
+    trees: np.ndarray,
+    group: np.ndarray | None = None,
+    foot: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Crowns, the bits of their worlds, and which of ``trees`` [n, 6] each of them is.
+
+    Those that have grown are there with young ones in their place. ``group`` [n]: the tree that a
+    crown is part of, each is one without; ``foot`` [n]: z that a tree grows from, as far below its
+    middle as it is high without.
+    """
     view = np.full(len(trees), IN_IMAGES | IN_LIDAR, np.uint8)
     if city.dates is None:
-        return trees, view
+        return trees, view, np.arange(len(trees))
+    group = np.arange(len(trees)) if group is None else group
+    above = 2.0 * trees[:, 4] if foot is None else trees[:, 2] - foot
     rng = np.random.default_rng([city.world_seed, 8])
-    kind, moment = _drawn(rng, len(trees), city.dates.felled, city.dates.grown)
+    count = int(group.max(initial=-1)) + 1
+    kind, moment = _drawn(rng, count, city.dates.felled, city.dates.grown)
+    kind, moment = kind[group], moment[group]
     before, after = _moments(city, moment)
     view = np.select([kind == 0, kind == 1], [before, after], view)
     grown = np.flatnonzero(kind == 1)
     young = trees[grown].copy()
-    young[:, 2] -= (1.0 - YOUNG) * 2.0 * young[:, 4]
+    young[:, 2] -= (1.0 - YOUNG) * above[grown]
     young[:, 3:5] *= YOUNG
-    return np.concatenate([trees, young]), np.concatenate([view, before[grown]]).astype(np.uint8)
+    which = np.concatenate([np.arange(len(trees)), grown])
+    view = np.concatenate([view, before[grown]]).astype(np.uint8)
+    return np.concatenate([trees, young]), view, which
+
+
+def dated_patches(city: CitySpec, s: Surfaces, passed: float) -> np.ndarray:
+    """The patches of a twin where a share of the time has ``passed``, as Surfaces has them."""
+    dates, rng = city.dates, np.random.default_rng([city.world_seed, 7])
+    count = int(s.patch_building.max(initial=-1)) + 1
+    kind, moment = _drawn(rng, count, dates.built, dates.demolished, dates.raised)
+    rise = rng.uniform(*STOREYS_M, count)
+    is_past = passed >= moment
+    gone = np.append(np.where(kind == 0, ~is_past, (kind == 1) & is_past), False)
+    higher = np.append(np.where((kind == 2) & is_past, rise, 0.0), 0.0)
+    patches = s.patches.copy()
+    patches[..., 0] = np.where(
+        gone[s.patch_building], NOTHING, patches[..., 0] + higher[s.patch_building]
+    )
+    return patches
 
 
 def world_of(city: CitySpec, s: Surfaces, world: str) -> Surfaces:
@@ -94,6 +127,8 @@ def world_of(city: CitySpec, s: Surfaces, world: str) -> Surfaces:
     terrain = s.terrain
     if city.dates.crops:
         terrain = terrain + _crops(city, s, passed)
+    if s.patches.size:
+        s = s._replace(patches=dated_patches(city, s, passed))
     water = s.water + city.dates.water_m * passed
     return s._replace(terrain=terrain, water=water, resurfaced=city.dates.resurfaced * passed)
 

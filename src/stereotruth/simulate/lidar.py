@@ -1,4 +1,7 @@
-"""Airborne LiDAR of a city: two crossed sets of flight lines over the same exact surfaces."""
+"""Airborne LiDAR of a city: two crossed sets of flight lines over the same exact surfaces.
+
+A city may have strips instead, each with an error of its own (:mod:`.lidar_strips`).
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,13 @@ import datetime
 import logging
 import math
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pyproj
+from laspy.header import GpsTimeType
 
 from ..errors import InputError
 from ..kernels import inlined, kernel
@@ -21,6 +26,7 @@ from .dated_worlds import world_of
 from .geodesy import LocalFrame
 from .layout import frame_of
 from .lidar_coverage import coverage, covered
+from .lidar_strips import FlownStrip, flown_strips
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
 
 log = logging.getLogger("stereotruth")
@@ -213,6 +219,8 @@ def _header(city: CitySpec, offset: np.ndarray) -> laspy.LasHeader:
     header.system_identifier = "synthetic"
     header.generating_software = "stereotruth simulate"
     header.creation_date = datetime.date(2020, 6, 1)
+    if city.strips:
+        header.global_encoding.gps_time_type = GpsTimeType.STANDARD
     return header
 
 
@@ -237,6 +245,35 @@ def _record(
         fields["bit_fields"] = number | returns << 3
     fields["intensity"], fields["point_source_id"] = echo, line
     return record
+
+
+def _pulses(
+    s: Surfaces,
+    cover: np.ndarray,
+    box: tuple[float, ...],
+    spacing_m: float,
+    strip: FlownStrip | None,
+    rng: np.random.Generator,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """World points [n, 3] of a tile and what :func:`_fly` tells of them [n, 6], chunk by chunk.
+
+    Of a ``strip`` with its error, or of both crossed sets of flight lines.
+    """
+    directions = (0, 1) if strip is None else (0,)
+    lattice = spacing_m * math.sqrt(2) if strip is None else strip.spacing_m
+    per_line = int((box[2] - box[0]) / lattice) + 4
+    lines = max(1, PULSES_A_CHUNK // per_line)
+    xyz, info = np.empty((2 * per_line * lines, 3)), np.empty((2 * per_line * lines, 6), np.int32)
+    first, last = math.floor(box[1] / lattice) - 2, math.ceil(box[3] / lattice) + 2
+    for direction in directions:
+        for a in range(first, last, lines):
+            b = min(a + lines, last)
+            n = _fly(s, cover, np.array(box), lattice, direction, a, b, rng, xyz, info)
+            points, told = xyz[:n], info[:n]
+            if strip is not None:
+                points, told = strip.taken(points, told)
+            if len(points):
+                yield points, told
 
 
 def simulate_lidar_tile(
@@ -273,31 +310,23 @@ def simulate_lidar_tile(
     cover = coverage(city, scene)
     box = tile_box(city, scene, tile_index(scene, tile_name))
     top = max(float(s.terrain.max()), float((s.boxes[:, 6] + s.boxes[:, 7]).max(initial=0)))
+    top = max(top, float(s.patches[..., 0].max(initial=0)))
     low = np.array([box[0] - 120, box[1] - 120, s.terrain.min() - 60])
     high = np.array([box[2] + 120, box[3] + 120, top + 150])
     grid = to_grid(frame, city.epsg, low, high)
     rng = np.random.default_rng([seed, zlib.crc32(tile_name.encode())])
-    lattice = spacing_m * math.sqrt(2)
-    per_line = int((box[2] - box[0]) / lattice) + 4
-    lines = max(1, PULSES_A_CHUNK // per_line)
-    work = []
-    for strip in (0, 1):
-        first = math.floor(box[1] / lattice) - 2
-        last = math.ceil(box[3] / lattice) + 2
-        work += [(strip, a, min(a + lines, last)) for a in range(first, last, lines)]
-    xyz = np.empty((2 * per_line * lines, 3))
-    info = np.empty((len(xyz), 6), np.int32)
     header = _header(city, np.floor(grid(np.array([[box[0], box[1], 0.0]]))[0] / 100) * 100)
     counts = np.zeros(32, np.int64)
     with atomic_file(out_laz) as scratch, laspy.open(
         scratch, "w", header=header, laz_backend=laspy.LazBackend.Lazrs
     ) as writer:  # fmt: skip
-        for strip, first, last in work:
-            n = _fly(s, cover, np.array(box), lattice, strip, first, last, rng, xyz, info)
-            if not n:
-                continue
-            writer.write_points(_record(header, grid(xyz[:n]), info[:n]))
-            counts += np.bincount(info[:n, 0], minlength=32)
+        for strip in flown_strips(city, scene) or [None]:
+            for xyz, info in _pulses(s, cover, box, spacing_m, strip, rng):
+                record = _record(header, grid(xyz), info)
+                if strip is not None:
+                    strip.tell(record.array, header, xyz)
+                writer.write_points(record)
+                counts += np.bincount(info[:, 0], minlength=32)
     if not counts.sum():
         raise RuntimeError(
             f"{tile_name}: no point lies in this tile; change the scene's lidar_grid"

@@ -15,8 +15,13 @@ def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
     """Packed outline float64[21] of a scene's LiDAR coverage, see :func:`covered`.
 
     It reaches beyond the image at the first columns and last rows, and ends inside it, raggedly,
-    at the last columns and first rows, with a block missing in the corner between them.
+    at the last columns and first rows, with a block missing in the corner between them. That of a
+    twin is a rectangle.
     """
+    if city.twin is not None:  # what the file covers, and not the image's margin around it
+        cos, sin = math.cos(city.twin.turned_rad), math.sin(city.twin.turned_rad)
+        outline = [0.0, 0.0, cos, sin, -sin, cos, *city.twin.half_m]
+        return np.array([*outline, *np.zeros(13)])
     across, along = image_axes(city, scene)
     rng = np.random.default_rng([scene.pose_seed, 6])
     beyond = 35.0 + 0.12 * city.character.relief_m

@@ -18,10 +18,11 @@ from ..kernels import inlined, kernel
 from ..products.files import atomic_file
 from .appearance import reflectance
 from .built_city import surfaces_of
-from .camera import Pass, aim, direction, pose, rays
-from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec
+from .camera import Pass, aim, direction, jittering, pose, rays
+from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
 from .dated_worlds import world_of
 from .geodesy import LocalFrame
+from .given_rpcs import read_rpc, rpc_camera
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc
 from .surfaces import (
@@ -43,12 +44,13 @@ log = logging.getLogger("stereotruth")
 
 
 FULL_SCALE = 2047  # 11 bits
+FULL_SCALE_OF_8 = 255
 STRIP_ROWS = 128
 LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a time
 # Of each lane: its ray, the ground, the last step, where in a cell of the spline, coefficients
 AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
-PSF_SIGMA_PX = 0.42
 RPC_MARGIN_M = 130.0
+FRAME_PX = 30  # of a window of given RPCs around the place
 SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
 LEFT_COLLAR, RIGHT_COLLAR = 1, 2  # see in_collar
@@ -61,7 +63,8 @@ class Camera(NamedTuple):
 
     ``name``: of the image, or of the view of a scene. ``surfaces``: the city's by the sun of the
     image; ``shown``: bits of the objects in it. ``collar``: see :func:`in_collar`. ``radiometry``:
-    dark value and digital numbers per reflectance; ``noise_seed``: of the sensor noise.
+    dark value and digital numbers per reflectance; ``noise_seed``: of the sensor noise. ``look``:
+    point spread and grey levels.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Camera(NamedTuple):
     collar: int
     radiometry: tuple[float, float]
     noise_seed: int
+    look: ViewSpec = ViewSpec()
 
 
 class Relief(NamedTuple):
@@ -109,6 +113,35 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
     surfaces = surfaces_of(city, built)
     frame = frame_of(city)
     relief = relief_of(city, scene, surfaces)
+    views = _by_rpcs(city, frame, relief) if city.twin and city.twin.rpcs else None
+    cameras = []
+    for view, cam, cols, rows in views or _on_a_pass(scene, frame, relief):
+        rpc = biased_rpc(cam, frame, relief, (cols, rows), (scene.pose_seed, view))
+        look = getattr(city, view)
+        if look.jitter:  # the RPCs know nothing of it
+            drawn = np.random.default_rng([scene.pose_seed, 6 if view == "left" else 7])
+            cam = jittering(cam, look.jitter, drawn)
+        own = by_sun_of(world_of(city, surfaces, view), look.sun_deg)
+        cameras.append(
+            Camera(
+                view, cam, cols, rows, rpc, horizon_of(cam, cols, rows, surfaces), own,
+                SHOWN[view], COLLARS[view], RADIOMETRY[view], NOISE_SEEDS[view], look,
+            )
+        )  # fmt: skip
+    return ImagedScene(city, scene, frame, surfaces, *cameras)
+
+
+class View(NamedTuple):
+    """One of two images: its name, packed camera, columns and rows."""
+
+    name: str
+    cam: np.ndarray
+    cols: int
+    rows: int
+
+
+def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View]:
+    """Both images of a scene as GaoFen-7 takes them on one pass."""
     target = np.array([*scene.centre_m, relief.middle])
     # the forward view takes in all that the backward view shows, however high it stands
     rise = max(relief.top - relief.middle, relief.middle - relief.low)
@@ -117,22 +150,36 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
     right_rows = math.ceil(
         scene.rows * LEFT_GSD_M / RIGHT_GSD_M + 2 * lean / RIGHT_GSD_M + 0.02 * scene.cols
     )
-    cameras = []
+    views = []
     for view, gsd, cols, rows in (
         ("left", LEFT_GSD_M, scene.cols, scene.rows),
         ("right", RIGHT_GSD_M, right_cols, right_rows),
     ):
         flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
         cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
-        rpc = biased_rpc(cam, frame, relief, (cols, rows), (scene.pose_seed, view))
-        own = by_sun_of(world_of(city, surfaces, view), getattr(city, view).sun_deg)
-        cameras.append(
-            Camera(
-                view, cam, cols, rows, rpc, horizon_of(cam, cols, rows, surfaces), own,
-                SHOWN[view], COLLARS[view], RADIOMETRY[view], NOISE_SEEDS[view],
-            )
-        )  # fmt: skip
-    return ImagedScene(city, scene, frame, surfaces, *cameras)
+        views.append(View(view, cam, cols, rows))
+    return views
+
+
+def _by_rpcs(city: CitySpec, frame: LocalFrame, relief: Relief) -> list[View]:
+    """Both images of a twin as given RPCs see its place: the windows of them that show it."""
+    (half_x, half_y), turned = city.twin.half_m, city.twin.turned_rad
+    turn = np.array([[math.cos(turned), -math.sin(turned)], [math.sin(turned), math.cos(turned)]])
+    corners = np.array([
+        [*(turn @ [i * half_x, j * half_y]), z]
+        for i in (-1, 1) for j in (-1, 1) for z in (relief.low, relief.top)
+    ])  # fmt: skip
+    ground = frame.to_geodetic(corners)
+    heights = frame.height + relief.low - RPC_MARGIN_M, frame.height + relief.top + RPC_MARGIN_M
+    views = []
+    for view, file in zip(SHOWN, city.twin.rpcs):
+        rpc = read_rpc(file).over(city.lon, city.lat, frame.height + relief.middle)
+        image = rpc.project(ground)
+        first = np.floor(image.min(axis=0)).astype(int) - FRAME_PX
+        cols, rows = (np.ceil(image.max(axis=0)).astype(int) + FRAME_PX - first).tolist()
+        cam = rpc_camera(rpc.cropped(*first.tolist()), frame, (cols, rows), heights)
+        views.append(View(view, cam, cols, rows))
+    return views
 
 
 def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
@@ -151,6 +198,8 @@ def relief_of(city: CitySpec, scene: SceneSpec, surfaces: Surfaces) -> Relief:
         near = scene_coordinates(city, scene, surfaces.boxes[:, :2])
         inside = (np.abs(near) < half_size(scene) + 100).all(axis=1)
         objects = objects[np.append(True, inside)]
+    if surfaces.patches.size:
+        objects = np.append(objects, surfaces.cell_top.max())
     return Relief(low, (low + high) / 2, float(objects.max()))
 
 
@@ -305,10 +354,10 @@ def _shade_rows(s, above, shown, cam, first_row, out):
                     out[r0 + k, c0 + n] = value
 
 
-def _decimate(half: np.ndarray) -> np.ndarray:
+def _decimate(half: np.ndarray, psf_px: float) -> np.ndarray:
     """Pixels [r, c] from the half-pixel raster [2 (r + 4), 2 (c + 4)]: a Gaussian point spread."""
     offsets = np.arange(-2.75, 3.0, 0.5)[2:-2]  # ±0.25, 0.75, 1.25, 1.75
-    weights = np.exp(-0.5 * (offsets / PSF_SIGMA_PX) ** 2).astype(np.float32)
+    weights = np.exp(-0.5 * (offsets / psf_px) ** 2).astype(np.float32)
     weights /= weights.sum()
     n = len(weights)
     start = 4 - (n // 2 - 1)
@@ -342,9 +391,10 @@ def simulate_image(
 ) -> dict[str, float]:
     """Render the ``"left"`` (backward) or ``"right"`` (forward) image of a scene.
 
-    Writes uint16 [rows, cols] of 11 bits with nodata 0 and the RPCs as TIFF metadata. ``seed``
-    draws the sensor noise only; ``built`` is that of :func:`prepare`. Returns the image size and
-    how well the RPCs follow the camera (their bias apart). Raises InputError for another view.
+    Writes uint16 [rows, cols] of 11 bits (or 8, see :class:`.cities.ViewSpec`) with nodata 0 and
+    the RPCs as TIFF metadata. ``seed`` draws the sensor noise only; ``built`` is that of
+    :func:`prepare`. Returns the image size and how well the RPCs follow the camera (bias and jitter
+    apart). Raises InputError for another view.
     """
     if view not in ("left", "right"):
         raise InputError(f"no view {view!r}", remedy="ask for left or right")
@@ -359,6 +409,10 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
         name, camera.cols, camera.rows, camera.rpc.rms_px,
     )  # fmt: skip
     dark, gain = camera.radiometry
+    scale, full_scale = 1.0, FULL_SCALE
+    if camera.look.saturates is not None:
+        full_scale = FULL_SCALE_OF_8
+        scale = full_scale / (dark + gain * camera.look.saturates)
     cols, rows = camera.cols, camera.rows
     profile = dict(
         driver="GTiff", width=cols, height=rows, count=1, dtype="uint16", nodata=0, tiled=True,
@@ -375,18 +429,19 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
             _shade_rows(
                 camera.surfaces, camera.horizon, camera.shown, camera.cam, first - 2.0, half
             )
-            signal = dark + gain * _decimate(half)
+            signal = dark + gain * _decimate(half, camera.look.psf_px)
             rng = np.random.default_rng([seed, camera.noise_seed, first])
             noise = rng.standard_normal(signal.shape, dtype=np.float32)
             # read-out noise and shot noise: 3 DN at 100, 5 DN at 600
             signal += noise * np.sqrt(4.0 + 0.035 * signal)
-            values = np.clip(np.rint(signal), 1, FULL_SCALE).astype(np.uint16)
+            values = np.clip(np.rint(signal * scale), 1, full_scale).astype(np.uint16)
             row = np.arange(first, first + count, dtype=np.float64)[:, None]
             values[_collar(camera.collar, col_index, row, cols, rows)] = 0
             image[first : first + count] = values
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
-            target.set_band_description(1, "panchromatic, 11 bits")
+            bits = full_scale.bit_length()
+            target.set_band_description(1, f"panchromatic, {bits} bits")
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..products.files import write_table
 from .built_city import surfaces_of
-from .camera import Pass, aim, drift_of_attitude
-from .control_points import GCP_COUNT, GCP_NOISE_PX, roof_corners, spread_out, visible_in
+from .camera import Pass, aim, drift_of_attitude, jittering
+from .control_points import GCP_COUNT, GCP_NOISE_PX, marks, spread_out, visible_in
 from .dated_worlds import world_of
 from .layout import frame_of
 from .lidar_coverage import coverage
@@ -49,6 +49,8 @@ def camera_of(site: SiteSpec, image: ImageSpec) -> Camera:
     size = image.cols, image.rows
     drawn = image.pose_seed, "left"
     rpc = biased_rpc(cam, frame, relief, size, drawn, margin_m=RPC_MARGIN_M)
+    if image.jitter:  # the RPCs know nothing of it
+        cam = jittering(cam, image.jitter, np.random.default_rng([image.pose_seed, 6]))
     own = by_sun_of(world_of(city, surfaces, image.state), image.sun_deg)
     return Camera(
         image.name, cam, *size, rpc, horizon_of(cam, *size, surfaces), own,
@@ -88,10 +90,10 @@ def image_truth(
 def site_points(site: SiteSpec, *, seed: int) -> tuple[list[dict], list[dict]]:
     """Control points of a site in the long form, as measured, and without their noise.
 
-    Roof corners that at least two images show, as evenly spread as the city has them. ``seed``
-    draws the noise of the image coordinates (0.25 px each); ground coordinates are exact.
+    Marks, as roof corners, that at least two images show, as evenly spread as the city has them.
+    ``seed`` draws the noise of the image coordinates (0.25 px each); ground coordinates are exact.
     """
-    xyz, _ = roof_corners(surfaces_of(site.city))
+    xyz, _ = marks(surfaces_of(site.city))
     seen_in = [visible_in(camera_of(site, image), xyz) for image in site.images]
     often = np.sum([seen for _, seen in seen_in], axis=0)
     usable = np.flatnonzero(often >= 2)

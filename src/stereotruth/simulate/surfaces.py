@@ -4,7 +4,8 @@ Ground is a bicubic B-spline of z over (x, y), cut by a level water plane. Build
 rectangles with vertical walls and a flat or gabled roof, closed below; trees are ellipsoids. Rays
 are lines x = ax + bx z, y = ay + by z, given by (ax, ay, bx, by), and all of them come from above
 everything: the surface that is hit is the one of greatest z. The cell lists only say which objects
-a ray may meet; the intersections are those of the surfaces themselves.
+a ray may meet; the intersections are those of the surfaces themselves. Twins of real places have
+roofs of planar patches (:mod:`.patches`) in the place of buildings.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels import inlined, kernel
+from .patches import PATCH_M, patch_top
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
 LEFT_VIEW, RIGHT_VIEW = IN_IMAGES | IN_LEFT, IN_IMAGES | IN_RIGHT  # bits that an image shows
 ANY_VIEW = LEFT_VIEW | RIGHT_VIEW
+FIRST_PATCH = -2  # object number of patch 0; patch n has FIRST_PATCH - n
 CELL_M = 8.0
 REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+SAME_M = 0.01  # off a patch's plane: of the same roof
 CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
 LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
 
@@ -41,6 +45,12 @@ class Surfaces(NamedTuple):
     in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
     ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`. ``resurfaced``: share
     of the streets that have another texture.
+    ``patches`` float32[rows, cols, 3]: z in the middle and slopes along x and y of the patches of
+    :mod:`.patches`, from cell (``patch_i``, ``patch_j``) on; ``patch_side`` uint8[rows, cols]:
+    direction in which their sides look, counter-clockwise from east, in 256 parts of a turn.
+    ``patch_building`` int32[rows, cols]: the building that a patch is part of, −1 for none.
+    ``paint`` uint16[rows, cols]: reflectance of ground and roofs there, in parts of PAINT. A drawn
+    city has none of them.
     """
 
     x0: float
@@ -69,6 +79,12 @@ class Surfaces(NamedTuple):
     broad: np.ndarray
     sun: np.ndarray
     resurfaced: float
+    patches: np.ndarray
+    patch_side: np.ndarray
+    patch_building: np.ndarray
+    patch_i: int
+    patch_j: int
+    paint: np.ndarray
 
 
 def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
@@ -269,6 +285,12 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
                         high = tree_top(s.trees, k, ax, ay, bx, by)
                         if high > best:
                             best, kind, index, face = high, TREE, k, 0
+            if s.patches.shape[0] > 0:
+                leaves = min(next_x, next_y, s.cell_top[j, i])
+                high, k, is_side = patch_top(s, i, j, ax, ay, bx, by, z, leaves)
+                if high > best:
+                    best, index, face = high, FIRST_PATCH - k, 0
+                    kind = WALL if is_side else ROOF
         if next_x < next_y:
             z = next_x
             next_x += per_x
@@ -283,8 +305,16 @@ def above_ground(s, horizon, ax, ay, bx, by, view, trees, ground):
 
 
 @inlined
-def stands_in(s, kind, index, view):
-    """Whether the object of a surface point is in a view, where something may hide it."""
+def stands_in(s, kind, index, view, z):
+    """Whether the object of a surface point at height z is in a view of a world, where something
+    may hide it."""
+    if kind in (ROOF, WALL) and index <= FIRST_PATCH:
+        number = FIRST_PATCH - index
+        n, m = number // s.patches.shape[1], number % s.patches.shape[1]
+        slopes = abs(s.patches[n, m, 1]) + abs(s.patches[n, m, 2])
+        off = s.patches[n, m, 0] - z
+        reach = 0.5 * PATCH_M * slopes + SAME_M
+        return off > -reach and (kind == WALL or off < reach)
     if kind == TREE:
         return s.tree_view[index] & view != 0
     if kind in (ROOF, WALL):
@@ -329,6 +359,11 @@ def in_shadow(s, sun, x, y, z, view):
                     and s.trees[k, 2] + s.trees[k, 4] > clear
                     and tree_top(s.trees, k, ax, ay, bx, by) > clear + 0.1
                 ):
+                    return True
+            if s.patches.shape[0] > 0:
+                leaves = min(next_x, next_y, s.cell_top[j, i])
+                high, _, _ = patch_top(s, i, j, ax, ay, bx, by, max(z, clear), leaves)
+                if high > clear:
                     return True
         if next_x < next_y:
             z = next_x

@@ -135,7 +135,7 @@ def _truth_points(s, other_s, scanned_s, views, frame, cover, image_col, image_r
             and right_row <= size[3] - 1
             and not in_collar(collar_there, col, right_row, size[2], size[3])
         )
-        there = inside and stands_in(s, kind, index, shown_there)
+        there = inside and stands_in(other_s, kind, index, shown_there, z)
         there = there and not _lies_lower(other_s, kind, x, y, z)
         scanned, _, _, _, _, _, _ = cast(
             scanned_s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground

@@ -27,66 +27,82 @@ from ..kernels import inner, kernel
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
+Places = NDArray[np.int32]
 
 # Beyond this width (parts of a cell) the sums of the exact tests could leave 64 bits: 8000 px.
 MAX_PARTS = 1 << 19
 _SPLIT = 20  # bits; see _in_circle
+HILBERT_BITS = 6  # of a square's side in parts: two ground cells
+BESIDE = 3  # columns of a mesh from which on the neighbours stand
+NEAR = 1 << 14  # parts: of vertices nearer than this the test needs no split
 
 
 # ---------------------------------------------------------------------------------- exact tests
 
 
 @inner
-def _turn(x: Ints, y: Ints, a: int, b: int, c: int) -> int:
+def _turn(at: Places, a: int, b: int, c: int) -> int:
     """Twice the signed area of a triangle: positive if it runs counter-clockwise."""
-    return (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
+    x, y = np.int64(at[a, 0]), np.int64(at[a, 1])
+    return (at[b, 0] - x) * (at[c, 1] - y) - (at[b, 1] - y) * (at[c, 0] - x)
 
 
 @inner
-def _in_circle(x: Ints, y: Ints, a: int, b: int, c: int, d: int) -> bool:
-    """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie.
-
-    Of products of 40 and 40 bits the first factor is split, so that no sum leaves 64 bits.
-    """
-    ax, ay = x[a] - x[d], y[a] - y[d]
-    bx, by = x[b] - x[d], y[b] - y[d]
-    cx, cy = x[c] - x[d], y[c] - y[d]
+def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
+    """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie."""
+    x, y = np.int64(at[d, 0]), np.int64(at[d, 1])
+    ax, ay = at[a, 0] - x, at[a, 1] - y
+    bx, by = at[b, 0] - x, at[b, 1] - y
+    cx, cy = at[c, 0] - x, at[c, 1] - y
     p, q, r = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
     u, v, w = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
-    mask = (1 << _SPLIT) - 1
-    low = (p & mask) * u + (q & mask) * v + (r & mask) * w
-    high = (p >> _SPLIT) * u + (q >> _SPLIT) * v + (r >> _SPLIT) * w + (low >> _SPLIT)
-    if high != 0:
-        return high > 0
-    if low & mask:
-        return True
-    # Cocircular: the vertex of the highest rank is lifted most. Its cofactor decides, or, where
-    # the other three lie on a line, that of the next.
+    # All bits that any of them has, negative ones turned: all are less than 2**14 where these are
+    bits = (ax ^ (ax >> 63)) | (ay ^ (ay >> 63)) | (bx ^ (bx >> 63))
+    bits |= (by ^ (by >> 63)) | (cx ^ (cx >> 63)) | (cy ^ (cy >> 63))
+    if bits < NEAR:  # 29 bits times 29 bits, three of them
+        lifted = p * u + q * v + r * w
+        if lifted != 0:
+            return lifted > 0
+    else:  # of 40 and 40 bits: the first factor is split, so that no sum leaves 64 bits
+        mask = (1 << _SPLIT) - 1
+        low = (p & mask) * u + (q & mask) * v + (r & mask) * w
+        high = (p >> _SPLIT) * u + (q >> _SPLIT) * v + (r >> _SPLIT) * w + (low >> _SPLIT)
+        if high != 0:
+            return high > 0
+        if low & mask:
+            return True
+    return _tie_in_circle(at, a, b, c, d)
+
+
+@inner
+def _tie_in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
+    """:func:`_in_circle` of cocircular vertices: the one of the highest rank is lifted most. Its
+    cofactor decides, or, where the other three lie on a line, that of the next."""
     s0, s1, s2, s3 = a, b, c, d
     for _ in range(3):  # four entries, sorted by falling rank
-        if _before(x, y, s0, s1):
+        if _before(at, s0, s1):
             s0, s1 = s1, s0
-        if _before(x, y, s1, s2):
+        if _before(at, s1, s2):
             s1, s2 = s2, s1
-        if _before(x, y, s2, s3):
+        if _before(at, s2, s3):
             s2, s3 = s3, s2
     for s in (s0, s1, s2, s3):
         if s == d:
             return False  # -turn(a, b, c), which is not 0
         if s == a:
-            sign = _turn(x, y, d, b, c)
+            sign = _turn(at, d, b, c)
         elif s == b:
-            sign = _turn(x, y, a, d, c)
+            sign = _turn(at, a, d, c)
         else:
-            sign = _turn(x, y, a, b, d)
+            sign = _turn(at, a, b, d)
         if sign != 0:
             return sign > 0
     return False
 
 
 @inner
-def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
-    return y[s] < y[t] or (y[s] == y[t] and x[s] < x[t])
+def _before(at: Places, s: int, t: int) -> bool:
+    return at[s, 1] < at[t, 1] or (at[s, 1] == at[t, 1] and at[s, 0] < at[t, 0])
 
 
 # ------------------------------------------------------------------------------------ insertion
@@ -94,7 +110,8 @@ def _before(x: Ints, y: Ints, s: int, t: int) -> bool:
 
 @kernel
 def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
-    """Order of insertion: rounds of four times the vertices each, along a Hilbert curve."""
+    """Order of insertion: rounds of four times the vertices each, along a Hilbert curve of squares
+    of 1 << HILBERT_BITS parts, numbered by ``bits`` along each axis."""
     for k in range(x.size):
         mixed = (np.uint64(x[k]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
             np.uint64(y[k]) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -106,7 +123,7 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
         while level < 6 and mixed & np.uint64(3) == np.uint64(3):
             mixed >>= np.uint64(2)
             level += 1
-        px, py = x[k], y[k]
+        px, py = x[k] >> HILBERT_BITS, y[k] >> HILBERT_BITS
         key = np.int64(0)
         side = np.int64(1) << (bits - 1)
         while side > 0:
@@ -122,30 +139,31 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
 
 
 @inner
-def _replace(neighbour: Steps, t: int, old: int, new: int) -> None:
+def _replace(mesh: Steps, t: int, old: int, new: int) -> None:
     if t >= 0:
-        for i in range(3):
-            if neighbour[t, i] == old:
-                neighbour[t, i] = new
+        for i in range(BESIDE, BESIDE + 3):
+            if mesh[t, i] == old:
+                mesh[t, i] = new
 
 
 @inner
-def _set(corner: Steps, neighbour: Steps, t: int, v: tuple, n: tuple) -> None:
-    corner[t, 0], corner[t, 1], corner[t, 2] = v
-    neighbour[t, 0], neighbour[t, 1], neighbour[t, 2] = n
+def _set(mesh: Steps, t: int, v: tuple, n: tuple) -> None:
+    mesh[t, 0], mesh[t, 1], mesh[t, 2] = v
+    mesh[t, BESIDE], mesh[t, BESIDE + 1], mesh[t, BESIDE + 2] = n
 
 
 @kernel
-def _insert_all(x: Ints, y: Ints, corner: Steps, neighbour: Steps) -> int:
+def _insert_all(at: Places, mesh: Steps) -> int:
     """Delaunay triangles of vertices inside the square of the last four; returns their number.
 
     Vertices are inserted in their order: neighbours should follow each other, in memory too.
-    ``corner`` [m, 3] vertices counter-clockwise, ``neighbour`` [m, 3]: the triangle opposite each.
+    ``at`` [n, 2]: (x, y). ``mesh`` [m, 8]: three vertices counter-clockwise, the triangle opposite
+    each, -1 for none, and two spare numbers, so that a triangle is half a cache line.
     """
-    size = x.size
+    size = len(at)
     south_west, south_east, north_east, north_west = size - 4, size - 3, size - 2, size - 1
-    _set(corner, neighbour, 0, (south_west, south_east, north_east), (-1, 1, -1))
-    _set(corner, neighbour, 1, (south_west, north_east, north_west), (-1, -1, 0))
+    _set(mesh, 0, (south_west, south_east, north_east), (-1, 1, -1))
+    _set(mesh, 1, (south_west, north_east, north_west), (-1, -1, 0))
     n = 2
     t = 0
     stack = np.empty(1024, np.int32)
@@ -153,69 +171,72 @@ def _insert_all(x: Ints, y: Ints, corner: Steps, neighbour: Steps) -> int:
         while True:  # walk
             edge = -1
             moved = False
+            a, b, c = mesh[t, 0], mesh[t, 1], mesh[t, 2]
+            opposite = _turn(at, b, c, p), _turn(at, c, a, p), _turn(at, a, b, p)
             for i in range(3):
-                a, b = corner[t, (i + 1) % 3], corner[t, (i + 2) % 3]
-                turn = _turn(x, y, a, b, p)
-                if turn < 0:
-                    t = neighbour[t, i]
+                if opposite[i] < 0:
+                    t = mesh[t, BESIDE + i]
                     moved = True
                     break
-                if turn == 0:
+                if opposite[i] == 0:
                     edge = i
             if not moved:
                 break
         if edge < 0:
-            a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
-            na, nb, nc = neighbour[t, 0], neighbour[t, 1], neighbour[t, 2]
+            a, b, c = mesh[t, 0], mesh[t, 1], mesh[t, 2]
+            na, nb, nc = mesh[t, BESIDE], mesh[t, BESIDE + 1], mesh[t, BESIDE + 2]
             t1, t2 = n, n + 1
             n += 2
-            _set(corner, neighbour, t, (a, b, p), (t1, t2, nc))
-            _set(corner, neighbour, t1, (b, c, p), (t2, t, na))
-            _set(corner, neighbour, t2, (c, a, p), (t, t1, nb))
-            _replace(neighbour, na, t, t1)
-            _replace(neighbour, nb, t, t2)
+            _set(mesh, t, (a, b, p), (t1, t2, nc))
+            _set(mesh, t1, (b, c, p), (t2, t, na))
+            _set(mesh, t2, (c, a, p), (t, t1, nb))
+            _replace(mesh, na, t, t1)
+            _replace(mesh, nb, t, t2)
             stack[0], stack[1], stack[2] = t, t1, t2
             waiting = 3
         else:
-            c, a, b = corner[t, edge], corner[t, (edge + 1) % 3], corner[t, (edge + 2) % 3]
-            opposite_a, opposite_b = neighbour[t, (edge + 1) % 3], neighbour[t, (edge + 2) % 3]
-            u = neighbour[t, edge]
+            c, a, b = mesh[t, edge], mesh[t, (edge + 1) % 3], mesh[t, (edge + 2) % 3]
+            opposite_a, opposite_b = (
+                mesh[t, BESIDE + (edge + 1) % 3],
+                mesh[t, BESIDE + (edge + 2) % 3],
+            )
+            u = mesh[t, BESIDE + edge]
             k = 0
-            while neighbour[u, k] != t:
+            while mesh[u, BESIDE + k] != t:
                 k += 1
-            d = corner[u, k]
+            d = mesh[u, k]
             # u runs (d, b, a)
-            beyond_b, beyond_a = neighbour[u, (k + 1) % 3], neighbour[u, (k + 2) % 3]
+            beyond_b, beyond_a = mesh[u, BESIDE + (k + 1) % 3], mesh[u, BESIDE + (k + 2) % 3]
             t2, u2 = n, n + 1
             n += 2
-            _set(corner, neighbour, t, (c, a, p), (u2, t2, opposite_b))
-            _set(corner, neighbour, t2, (b, c, p), (t, u, opposite_a))
-            _set(corner, neighbour, u, (d, b, p), (t2, u2, beyond_a))
-            _set(corner, neighbour, u2, (a, d, p), (u, t, beyond_b))
-            _replace(neighbour, opposite_a, t, t2)
-            _replace(neighbour, beyond_b, u, u2)
+            _set(mesh, t, (c, a, p), (u2, t2, opposite_b))
+            _set(mesh, t2, (b, c, p), (t, u, opposite_a))
+            _set(mesh, u, (d, b, p), (t2, u2, beyond_a))
+            _set(mesh, u2, (a, d, p), (u, t, beyond_b))
+            _replace(mesh, opposite_a, t, t2)
+            _replace(mesh, beyond_b, u, u2)
             stack[0], stack[1], stack[2], stack[3] = t, t2, u, u2
             waiting = 4
         while waiting:
             waiting -= 1
             t = stack[waiting]
-            u = neighbour[t, 2]
+            u = mesh[t, BESIDE + 2]
             if u < 0:
                 continue
             k = 0
-            while neighbour[u, k] != t:
+            while mesh[u, BESIDE + k] != t:
                 k += 1
-            q = corner[u, k]
-            a, b = corner[t, 0], corner[t, 1]
-            if not _in_circle(x, y, a, b, p, q):
+            q = mesh[u, k]
+            a, b = mesh[t, 0], mesh[t, 1]
+            if not _in_circle(at, a, b, p, q):
                 continue
             # u runs (q, b, a)
-            beyond_b, beyond_a = neighbour[u, (k + 1) % 3], neighbour[u, (k + 2) % 3]
-            before_a, before_b = neighbour[t, 0], neighbour[t, 1]
-            _set(corner, neighbour, t, (a, q, p), (u, before_b, beyond_b))
-            _set(corner, neighbour, u, (q, b, p), (before_a, t, beyond_a))
-            _replace(neighbour, before_a, t, u)
-            _replace(neighbour, beyond_b, u, t)
+            beyond_b, beyond_a = mesh[u, BESIDE + (k + 1) % 3], mesh[u, BESIDE + (k + 2) % 3]
+            before_a, before_b = mesh[t, BESIDE], mesh[t, BESIDE + 1]
+            _set(mesh, t, (a, q, p), (u, before_b, beyond_b))
+            _set(mesh, u, (q, b, p), (before_a, t, beyond_a))
+            _replace(mesh, before_a, t, u)
+            _replace(mesh, beyond_b, u, t)
             if waiting + 2 > stack.size:
                 longer = np.empty(2 * stack.size, np.int32)
                 longer[: stack.size] = stack
@@ -242,39 +263,37 @@ class Triangles(NamedTuple):
 
 
 @inner
-def _circumradius(x: Ints, y: Ints, a: int, b: int, c: int) -> float:
-    u, v = float(x[b] - x[a]), float(y[b] - y[a])
-    s, t = float(x[c] - x[b]), float(y[c] - y[b])
-    p, q = float(x[a] - x[c]), float(y[a] - y[c])
+def _circumradius(at: Places, a: int, b: int, c: int) -> float:
+    u, v = float(at[b, 0] - at[a, 0]), float(at[b, 1] - at[a, 1])
+    s, t = float(at[c, 0] - at[b, 0]), float(at[c, 1] - at[b, 1])
+    p, q = float(at[a, 0] - at[c, 0]), float(at[a, 1] - at[c, 1])
     sides = (u * u + v * v) * (s * s + t * t) * (p * p + q * q)
-    return np.sqrt(sides) / (2.0 * float(_turn(x, y, a, b, c)))
+    return np.sqrt(sides) / (2.0 * float(_turn(at, a, b, c)))
 
 
 @kernel
-def _tidy(
-    x: Ints, y: Ints, order: Ints, corner: Steps, neighbour: Steps, limit: float
-) -> tuple[Steps, Steps, Floats]:
+def _tidy(at: Places, order: Ints, mesh: Steps, limit: float) -> tuple[Steps, Steps, Floats]:
     """Triangles of circumradius up to ``limit`` without the square's corners, in order.
 
     ``order``: the number that each vertex gets.
     """
-    size, vertices = len(corner), order.size
+    size, vertices = len(mesh), order.size
     radius = np.empty(size)
     start = np.zeros(vertices + 1, np.int32)
     for t in range(size):
-        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
+        a, b, c = mesh[t, 0], mesh[t, 1], mesh[t, 2]
         radius[t] = np.inf
         if max(a, b, c) >= vertices:
             continue
         a, b, c = order[a], order[b], order[c]
-        n0, n1, n2 = neighbour[t, 0], neighbour[t, 1], neighbour[t, 2]
-        p, q, r = corner[t, 0], corner[t, 1], corner[t, 2]
+        n0, n1, n2 = mesh[t, BESIDE], mesh[t, BESIDE + 1], mesh[t, BESIDE + 2]
+        p, q, r = mesh[t, 0], mesh[t, 1], mesh[t, 2]
         while b < a or c < a:
             a, b, c = b, c, a
             p, q, r = q, r, p
             n0, n1, n2 = n1, n2, n0
-        radius[t] = _circumradius(x, y, p, q, r)
-        _set(corner, neighbour, t, (a, b, c), (n0, n1, n2))
+        radius[t] = _circumradius(at, p, q, r)
+        _set(mesh, t, (a, b, c), (n0, n1, n2))
         if radius[t] <= limit:
             start[a + 1] += 1
     for v in range(vertices):
@@ -284,10 +303,10 @@ def _tidy(
     filled = start.copy()
     for t in range(size):
         if radius[t] <= limit:
-            v = corner[t, 0]
+            v = mesh[t, 0]
             k = filled[v]
             filled[v] += 1
-            while k > start[v] and corner[order[k - 1], 1] > corner[t, 1]:
+            while k > start[v] and mesh[order[k - 1], 1] > mesh[t, 1]:
                 order[k] = order[k - 1]
                 k -= 1
             order[k] = t
@@ -303,8 +322,8 @@ def _tidy(
         t = order[k]
         radii[k] = radius[t]
         for i in range(3):
-            corners[k, i] = corner[t, i]
-            other = neighbour[t, i]
+            corners[k, i] = mesh[t, i]
+            other = mesh[t, BESIDE + i]
             neighbours[k, i] = new[other] if other >= 0 else -1
     return corners, neighbours, radii
 
@@ -322,12 +341,11 @@ def triangulate(x: Ints, y: Ints, max_radius: float) -> Triangles:
     if end + spare >= MAX_PARTS:
         raise ValueError(f"positions {end} parts of a cell apart, at most {MAX_PARTS} are exact")
     keys = np.empty(n, np.int64)
-    _keys(x, y, max(end.bit_length(), 1), keys)
+    _keys(x, y, max((end >> HILBERT_BITS).bit_length(), 1), keys)
     order = np.argsort(keys, kind="stable")
-    every_x = np.concatenate([x[order], [-spare, end, end, -spare]]).astype(np.int64)
-    every_y = np.concatenate([y[order], [-spare, -spare, end, end]]).astype(np.int64)
-    corner, neighbour = (np.empty((2 * n + 2, 3), np.int32) for _ in range(2))
-    count = _insert_all(every_x, every_y, corner, neighbour)
-    return Triangles(
-        *_tidy(every_x, every_y, order, corner[:count], neighbour[:count], float(max_radius))
-    )
+    at = np.empty((n + 4, 2), np.int32)
+    at[:n, 0], at[:n, 1] = x[order], y[order]
+    at[n:] = [(-spare, -spare), (end, -spare), (end, end), (-spare, end)]
+    mesh = np.empty((2 * n + 2, 8), np.int32)
+    count = _insert_all(at, mesh)
+    return Triangles(*_tidy(at, order, mesh[:count], float(max_radius)))

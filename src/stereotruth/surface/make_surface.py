@@ -26,6 +26,7 @@ from ..job import progress
 from ..kernels import kernel
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
+from ..lidar.overlap_check import refuse_apart
 from ..lidar.point_store import PointStore
 from ..products.atomic_outputs import marks_of_inputs
 from ..products.files import atomic_file, atomic_folder, link, sealed
@@ -66,18 +67,27 @@ def group_blocks(scale: SurfaceScale, side: int) -> int:
 
 
 @kernel
-def _parts_of(x: Ints, y: Ints, boxes: Ints) -> Parts:
-    """In which of ``boxes`` [k, 2, 2] (first (x, y), that after the last), of which no two overlap,
-    each of n vertices lies; -1 for none. Most lie in that of the vertex before them."""
+def _parts_of(x: Ints, y: Ints, origin: Ints, numbers: Ints, boxes: Ints, side: int) -> Parts:
+    """In which of ``boxes`` [k, 2, 2] (first (x, y), that after the last) each of n vertices lies;
+    -1 for none.
+
+    Box k lies in block ``numbers`` [k, 2] (row, col), a square of ``side`` on the lattice, where
+    vertices and boxes count from ``origin`` (x, y).
+    """
+    first, last = np.empty(2, np.int64), np.empty(2, np.int64)
+    for axis in range(2):
+        first[axis], last[axis] = numbers[:, axis].min(), numbers[:, axis].max()
+    box = np.full((last[0] - first[0] + 1, last[1] - first[1] + 1), -1, np.int16)
+    for k in range(len(numbers)):
+        box[numbers[k, 0] - first[0], numbers[k, 1] - first[1]] = k
     out = np.full(x.size, -1, np.int16)
-    last = 0
     for n in range(x.size):
-        for step in range(len(boxes)):
-            k = (last + step) % len(boxes)
-            low, high = boxes[k, 0], boxes[k, 1]
+        row = (origin[1] + y[n]) // side - first[0]
+        col = (origin[0] + x[n]) // side - first[1]
+        if 0 <= row < box.shape[0] and 0 <= col < box.shape[1] and box[row, col] >= 0:
+            low, high = boxes[box[row, col], 0], boxes[box[row, col], 1]
             if low[0] <= x[n] < high[0] and low[1] <= y[n] < high[1]:
-                out[n] = last = k
-                break
+                out[n] = box[row, col]
     return out
 
 
@@ -147,7 +157,10 @@ class _Maker:
         boxes = (np.array(list(parts.values())) - first) * PART
         around = Core(tuple(boxes[:, 0].min(axis=0)), tuple(boxes[:, 1].max(axis=0)))
         every = ground_surface(builder.built(), self.scale, around)
-        part = _parts_of(every.vertices.x, every.vertices.y, boxes)
+        vertices, numbers = every.vertices, np.array(list(parts))
+        part = _parts_of(
+            vertices.x, vertices.y, first * PART, numbers, boxes, self.side * PART
+        )  # fmt: skip
         for number, surface in zip(parts, every.split(part, len(parts))):
             if len(surface.facet) + len(surface.undecided) + len(surface.tops.corner):
                 yield number, surface
@@ -210,6 +223,8 @@ def make_surface(
     :func:`group_blocks`; ``made_of``, ``code``:
     digests of other input and of the source, for the provenance. Blocks that an earlier call has
     left, made of the same, are taken over.
+
+    Raises InputError where the images show no point.
     """
     out = Path(out).absolute()
     density = points_per_m2(stores, ground and ground.shows) or points_per_m2(stores)
@@ -219,7 +234,13 @@ def make_surface(
     side = block_side(scale)
     imaged = ShownBlocks.of(stores, scale, side, ground)
     maker = _Maker(scale, side, imaged, tuple(stores), folder, code)
-    groups = _groups(imaged.numbers(), blocks_at_once or group_blocks(scale, side))
+    numbers = imaged.numbers()
+    if ground is not None and not numbers:
+        bounds = np.array([store.bounds for store in stores])
+        box = (*bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:4].max(axis=0).tolist())
+        heights = float(bounds[:, 4].min()), float(bounds[:, 5].max())
+        refuse_apart(box, ground.box(heights), heights, stores[0].path)
+    groups = _groups(numbers, blocks_at_once or group_blocks(scale, side))
     lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
     try:
         lock.take(out)

@@ -36,6 +36,9 @@ class ShownGround(Protocol):
         """Whether an image may show something of boxes [n, 6] (west, south, lowest, east, north,
         highest)."""
 
+    def box(self, heights: tuple[float, float]) -> tuple[float, float, float, float]:
+        """West, south, east, north of what the images show between two heights, m."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShownBlocks:
@@ -70,7 +73,7 @@ class ShownBlocks:
         """(row, col) of the blocks, in their order."""
         size = np.array(self.scale.cell) * self.side
         every = sorted(set().union(*map(_numbers, self.low // size, self.high // size)))
-        if self.ground is None:
+        if self.ground is None or not every:
             return every
         boxes = np.concatenate([self._boxes(number, 1) for number in every])
         return [number for number, visible in zip(every, self.ground.may_show(boxes)) if visible]

@@ -44,12 +44,14 @@ def test_uncertainty_of_the_estimate_is_honest(of_class):
         errors += rng.normal(0, of_class, (5, 2))[fifth]
         bad = rng.random(len(design)) < 0.2
         errors[bad] += rng.uniform(-3, 3, (bad.sum(), 2))
-        found = estimate(Equations(design, design @ truth + errors, own, sites, where), prior)
+        found = estimate(
+            Equations(design, design @ truth + errors, own, sites, where, where), prior
+        )
         at = design[:5].reshape(-1, 12)
         sigma = np.sqrt(np.einsum("na,ab,nb->n", at, found.covariance, at))
         ratios.append(at @ (found.parameters - truth) / sigma)
         shared.append(found.shared)
-        nothing = estimate(Equations(design, errors, own, sites, where), prior)
+        nothing = estimate(Equations(design, errors, own, sites, where, where), prior)
         chances.append(nothing.statistic / nothing.freedom)
     ratios = np.abs(ratios)
     assert 0.6 < (ratios < 1).mean() < 0.76
@@ -65,6 +67,8 @@ def test_observations_of_which_no_two_agree_are_blunders():
     design, _, where = system(rng, 24)
     observed = rng.uniform(-6, 6, (24, 2))
     alone = np.arange(24)
-    found = estimate(Equations(design, observed, np.full(24, 0.01), alone, where), np.eye(12))
+    found = estimate(
+        Equations(design, observed, np.full(24, 0.01), alone, where, where), np.eye(12)
+    )
     assert np.isfinite(found.covariance).all()
     assert (found.weights > 0.0).mean() < 0.5

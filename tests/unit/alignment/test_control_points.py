@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+import pyproj
 import pytest
 
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.control_points import COLUMNS, images_measured, read_gcps
 from stereotruth.errors import InputError
+from stereotruth.lidar.frames import Epoch
 
 # -------------------------------------------------------------------------------------- files
 
@@ -158,3 +161,56 @@ def test_a_pair_s_file_names_no_images(tmp_path):
     file.write_text(",".join(COLUMNS) + "\nA,115.1,30.2,50,1.5,2.5,3.5,4.5\n")
     assert images_measured(file) == {}
     assert read_gcps(file, "", ("one", "two")).ids == ("A",)
+
+
+# ------------------------------------------------------------------------------ frame and epoch
+
+PLACES = "A,-81.66,30.33,20,1,2,3,4\nB,-81.65,30.34,25,5,6,7,8\n"
+
+
+def declared(tmp_path, head: str, places: str = PLACES, year: float = 2020.0):
+    file = tmp_path / "gcps.csv"
+    file.write_text(f"{head}{','.join(COLUMNS)}\n{places}")
+    return read_gcps(file, epoch=Epoch(year, "the test"))
+
+
+def test_points_of_a_national_frame_are_brought_to_the_images(tmp_path):
+    plain = declared(tmp_path, "")
+    assert plain.lon.tolist() == [-81.66, -81.65] and plain.frame["epoch"] == 2020.0
+    found = declared(tmp_path, '"# surveyed in May",,\n# Frame: EPSG:6318,,,,\n')
+    east, north = 111320 * np.cos(np.radians(30.33)), 111200
+    shift = np.hypot((found.lon - plain.lon) * east, (found.lat - plain.lat) * north)
+    np.testing.assert_allclose(shift, 0.947, atol=0.002)  # as PROJ has it, see test_frames.py
+    np.testing.assert_allclose(found.height - plain.height, -1.481, atol=0.002)
+    assert found.line == (4, 5)
+    assert found.frame["source"]["frame"] == "NAD83(2011)"
+
+
+def test_an_epoch_moves_points_with_their_plate(tmp_path):
+    places = "A,151.2,-33.9,20,1,2,3,4\nB,151.21,-33.91,25,5,6,7,8\n"
+    found = declared(tmp_path, "# epoch: 2010-07-02\n", places)
+    pipeline = (
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart "
+        "+ellps=GRS80 +step +proj=helmert +dx=0.00037 +dy=0.00035 +dz=0.00074 +drx=0.001487 "
+        "+dry=0.001175 +drz=0.001223 +t_epoch=2010.5 +convention=position_vector "
+        "+step +inv +proj=cart +ellps=GRS80 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    judge = pyproj.Transformer.from_pipeline(pipeline).transform(151.2, -33.9, 20, 2020.0)
+    np.testing.assert_allclose([found.lon[0], found.lat[0]], judge[:2], rtol=0, atol=2e-8)
+    assert np.hypot(found.lon[0] - 151.2, found.lat[0] + 33.9) > 4e-6  # 0.5 m
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("# frame: EPSG:6339\n", "UTM zone 10N' is no geographic system"),
+        ("# frame: nonsense\n", "'nonsense' cannot be used"),
+        ("# frame: EPSG:4149\n", "'CH1903' gets to ITRF2020 is not known"),
+        ("# frame: EPSG:9000\n", "ITRF2014 move by 13 mm a year.*'# epoch:'"),
+        ("# epoch: today\n", "'today' is neither a decimal year nor a date"),
+    ],
+)
+def test_frames_that_cannot_be_used_are_refused(tmp_path, head, message):
+    with pytest.raises(InputError, match=message) as error:
+        declared(tmp_path, head)
+    assert "gcps.csv" in str(error.value)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import Affine
 
 from stereotruth.alignment.align import align
+from stereotruth.alignment.gcp_checks import open_view
 from stereotruth.epipolar.rpc import RPC
 from stereotruth.errors import InputError
 
@@ -93,3 +96,21 @@ def test_a_wrong_rpc_is_named_not_the_control_points(tmp_path, changes, fields, 
 def test_the_rpc_as_it_is_passes(tmp_path):
     pair = other_rpc(tmp_path, [])
     align(*pair, write_gcps(tmp_path / "gcps.csv", make_gcps()), provenance={})
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "moved_m"), [(0.0, 0.0), (0.0, 20.0), (3.0, 0.0), (0.0, 400.0)]
+)
+def test_an_image_on_a_map_grid_may_have_the_rpc_of_that_grid(tmp_path, turned_deg, moved_m):
+    """As images that were projected to a plane; not one that was brought to a map later."""
+    image = write_image(tmp_path / "left.tif", RPCS["left"], SIZES["left"])
+    lon, lat = RPCS["left"].localize([0, 1, 0], [0, 0, 1], 160.0)  # of another height than its own
+    at = Affine(lon[1] - lon[0], 0, lon[0] + moved_m / 96e3, 0, lat[2] - lat[0], lat[0])
+    with rasterio.open(image, "r+") as dataset:
+        dataset.crs = "EPSG:4326"
+        dataset.transform = at * Affine.rotation(turned_deg) * Affine.translation(-0.5, -0.5)
+    if turned_deg or moved_m > 100:
+        with pytest.raises(InputError, match=r"left\.tif.*on a map grid and has an RPC.*Remedy"):
+            open_view("left", image, "")
+    else:
+        open_view("left", image, "")

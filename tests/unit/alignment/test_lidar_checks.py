@@ -20,6 +20,7 @@ from stereotruth.alignment.lidar_checks import (
     doubt_by_rpcs,
     height_by_images,
     height_by_rpcs,
+    heights_of_model,
     lines_of_sight,
 )
 from stereotruth.alignment.refine import refine
@@ -125,6 +126,20 @@ def test_control_points_beside_the_lidar_say_nothing(tmp_path):
 # ----------------------------------------------------------------------------------- by the RPCs
 
 
+def test_an_epipolar_model_serves_the_heights_of_the_lidar(tmp_path):
+    pair = start(NONE, NONE, 1.0)  # the RPCs hold for 60 ± 400 m
+    sensors = pair.left, pair.right
+    cloud = points_on(False, spacing=2.0)
+    low, high = heights_of_model(store_of(tmp_path / "right", cloud), sensors)
+    assert low < cloud[:, 2].min() - 9.0 and cloud[:, 2].max() + 9.0 < high
+    assert high - low < 1.3 * np.ptp(cloud[:, 2]) + 25.0
+    cloud[:5, 2] += 3000.0  # birds do not stretch it beyond what the RPCs hold for
+    _, above = heights_of_model(store_of(tmp_path / "birds", cloud), sensors)
+    assert high < above < 1000.0
+    cloud[:, 2] += 5000.0
+    assert heights_of_model(store_of(tmp_path / "above", cloud), sensors) is None
+
+
 def test_heights_outside_those_of_the_rpcs_are_doubted(tmp_path):
     pair = start(NONE, NONE, 1.0)  # the RPCs hold for 60 ± 400 m
     sensors = pair.left, pair.right
@@ -157,7 +172,7 @@ def estimated(shifts: np.ndarray, sigma: float, rng: np.random.Generator, noise:
     observed = design @ truth + rng.normal(0, noise, (n, 2))
     prior = np.eye(12) * sigma**2
     where = np.column_stack([u, v])
-    equations = Equations(design, observed, np.full(n, noise), np.arange(n) // 9, where)
+    equations = Equations(design, observed, np.full(n, noise), np.arange(n) // 9, where, where)
     return estimate(equations, prior)
 
 

@@ -73,7 +73,7 @@ class Site:
         truth = np.concatenate([self.truth[left], self.truth[right]])
         observed = design @ truth + rng.normal(0, 0.03, (TIES, 2))
         equations = Equations(
-            design, observed, np.full(TIES, 0.03), (at // 150).astype(int) @ [10, 1], at
+            design, observed, np.full(TIES, 0.03), (at // 150).astype(int) @ [10, 1], at, at
         )
         places = 900 if few else 160
         ties = None if reason else PairEquations(equations, 0 * truth, truth, places, 0.0)

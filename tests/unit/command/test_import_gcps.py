@@ -164,3 +164,17 @@ def test_images_of_a_gcp_file_are_named(rows, tmp_path):
     file = asp(tmp_path / "a.gcp", rows)
     with pytest.raises(InputError, match=r"there are in/left\.tif, in/right\.tif"):
         import_gcps([file], tmp_path / "out.csv", left="other.tif")
+
+
+def test_points_keep_a_frame_that_is_known(tmp_path):
+    """NAD83(2011), of which PROJ says that it is WGS 84 to 2 m."""
+    (tmp_path / "a.csv").write_text(
+        "id,x,y,height,left_col,left_row,right_col,right_row\nA,550000,5272000,20,1,2,3,4\n"
+    )
+    import_gcps([tmp_path / "a.csv"], tmp_path / "out.csv", crs="EPSG:6339", epoch="2010.0")
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    assert lines[:2] == ["# frame: EPSG:6318", "# epoch: 2010.0"]
+    found = read_gcps(tmp_path / "out.csv")
+    assert found.height[0] - 20 == pytest.approx(-0.32, abs=0.01)
+    import_gcps([tmp_path / "a.csv"], tmp_path / "wgs.csv", crs="EPSG:32610")
+    assert not (tmp_path / "wgs.csv").read_text().startswith("#")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from stereotruth.command.main import app
 from stereotruth.command.new_project import KEYS, begin, configuration_text
 from stereotruth.configuration import Configuration
 from stereotruth.errors import InputError
@@ -39,3 +41,12 @@ def test_nothing_is_written_over(tmp_path):
     with pytest.raises(InputError, match="not empty"):
         begin(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_the_folder_where_one_is_may_be_the_project(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = CliRunner().invoke(app, ["init", "."])
+    assert run.exit_code == 0 and "Next: stereotruth scene add" in run.output
+    assert (tmp_path / "config.yaml").is_file()
+    with pytest.raises(InputError, match="no folder is named"):
+        begin("")

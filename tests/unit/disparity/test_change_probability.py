@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import CHANGED, probability_of_change
+from stereotruth.disparity.change_probability import (
+    CHANGED,
+    UNKNOWN,
+    as_learned,
+    beyond_learned,
+    learned,
+    probability_of_change,
+)
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
@@ -96,3 +103,16 @@ def test_what_is_left_to_doubt_goes_into_the_variance() -> None:
     expected = probability(window)
     assert np.array_equal(found.variance, expected)
     assert np.array_equal(found.changed, expected > CHANGED)
+
+
+@LIGHTS
+def test_what_was_never_learned_is_asked_less(diachronic: bool) -> None:
+    """Each figure beyond what trees were fitted to brings a probability nearer to the usual one."""
+    low, high = learned(diachronic).astype(np.float32)
+    figures = np.stack(
+        [(low + high) / 2, high + 1, np.where(np.arange(low.size) == 3, low - 1, low)]
+    )
+    assert beyond_learned(figures.T, diachronic).tolist() == [0, low.size, 1]
+    found = as_learned(np.full(3, 0.98), np.arange(3))
+    assert found[0] == pytest.approx(0.98) and (np.diff(found) < 0).all() and found[2] > UNKNOWN
+    assert as_learned(np.array([UNKNOWN]), np.array([5])) == pytest.approx(UNKNOWN)

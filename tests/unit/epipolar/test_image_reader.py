@@ -193,6 +193,27 @@ def test_own_mask_and_mask_file_add_up(tmp_path) -> None:
     np.testing.assert_array_equal(hidden, (own == 0) | (cloud > 0))
 
 
+@pytest.mark.parametrize("by", ["alpha", "mask"])
+def test_zeros_that_a_mask_shows_are_values(tmp_path, by) -> None:
+    """As shadows in images of 8 bits; of a file without a mask they are nodata."""
+    values = GREY.clip(0, 250).astype(np.uint8)
+    values[10:30, 20:60], shown = 0, np.full(GREY.shape, 255, np.uint8)
+    shown[70:, :] = 0
+    if by == "alpha":
+        path = write(tmp_path / "a.tif", values, shown, alpha="YES")
+    else:
+        path = write(tmp_path / "a.tif", values, mask=shown)
+    np.testing.assert_array_equal(holes(path), shown == 0)
+    assert holes(write(tmp_path / "b.tif", values))[10:30, 20:60].all()
+
+
+def test_a_mask_of_two_bands_is_refused(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", *np.zeros((2, *GREY.shape), np.uint8))
+    with pytest.raises(InputError, match=r"cloud\.tif: 2 bands of uint8 are no mask.*Remedy"):
+        Source(path, mask)
+
+
 def test_a_mask_of_another_size_is_refused(tmp_path) -> None:
     path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
     mask = write(tmp_path / "cloud.tif", np.zeros((10, 12), np.uint8))

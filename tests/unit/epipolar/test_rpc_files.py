@@ -45,8 +45,9 @@ def assert_same(a: RPC, b: RPC) -> None:
 def test_files_beside_the_image(tmp_path: Path, name: str, writer) -> None:
     rpc = make_rpc(10)
     image = write_image(tmp_path / "GF7_scene-BWD.tiff", None)
-    (tmp_path / name).write_text(writer(rpc))
-    assert_same(read_rpc(image), rpc)
+    for encoding in ("utf-8", "utf-8-sig"):
+        (tmp_path / name).write_text(writer(rpc), encoding=encoding)
+        assert_same(read_rpc(image), rpc)
 
 
 def test_tiff_tag(tmp_path: Path) -> None:

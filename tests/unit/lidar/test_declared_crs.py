@@ -85,11 +85,15 @@ def test_wkt_says_unit_and_surface_of_heights(wkt, datum, ellipsoidal, height_un
     assert len(system.horizontal.axis_info) == 2
 
 
-def test_depths_are_refused() -> None:
-    vertical = 'VERT_CS["d",VERT_DATUM["Mean Sea Level",2005],UNIT["metre",1],AXIS["Depth",DOWN]]'
-    system, problems = declared_crs.header_crs(header_of(f'COMPD_CS["c",{UTM_WKT1},{vertical}]'))
-    assert system is None
-    assert "point down" in problems[0]
+@pytest.mark.parametrize("lidar_crs", [None, "EPSG:32610"])
+@pytest.mark.parametrize("datum", ['VDATUM["EGM96_Geoid"]', 'DATUM["D_WGS_1984",{}]'])
+def test_depths_are_refused(lidar_crs, datum) -> None:
+    """As ESRI writes them, above a geoid and an ellipsoid, whatever the sheet says."""
+    datum = datum.format('SPHEROID["WGS_1984",6378137.0,298.257223563]')
+    vertical = f'VERTCS["d",{datum},PARAMETER["Vertical_Shift",0.0],PARAMETER["Direction",-1.0],'
+    header = header_of(f'{UTM_10.to_wkt("WKT1_ESRI")},{vertical}UNIT["Meter",1.0]]')
+    with pytest.raises(InputError, match=r"a\.laz.*point down.*Remedy"):
+        declared_crs.resolve(header, lidar_crs, "a.laz")
 
 
 METRE, FOOT, SURVEY_FOOT = 9001, 9002, 9003

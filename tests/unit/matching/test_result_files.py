@@ -11,7 +11,7 @@ import rasterio
 
 from stereotruth.errors import InputError
 from stereotruth.matching.result_files import read_result
-from stereotruth.products.rasters import image_shape, read_image
+from stereotruth.products.rasters import image_shape, read_disparity, read_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 MAP = np.arange(12, dtype=np.float32).reshape(3, 4)
@@ -31,6 +31,45 @@ def test_maps_are_read(tmp_path):
     for name in ("a.npy", "a.pfm"):
         assert np.array_equal(read_result(tmp_path / name), MAP)
     assert np.isnan(read_result(tmp_path / "a.npy", nodata=5.0)[1, 1])
+
+
+@pytest.mark.parametrize("scale", [-1.0, -1 / 255, 1.0, 1 / 255, 256.0])
+def test_the_scale_of_a_pfm_is_the_order_of_its_bytes(tmp_path, scale):
+    """-1/255 is the default of Middlebury's SDK; the format knows no unit."""
+    data = (MAP + 10.5)[::-1].astype("<f4" if scale < 0 else ">f4").tobytes()
+    (tmp_path / "a.pfm").write_bytes(b"Pf\n4 3\n%f\n" % scale + data)
+    assert np.array_equal(read_result(tmp_path / "a.pfm"), MAP + 10.5)
+
+
+def tiff(path, *bands, scale=1.0, offset=0.0, nodata=None):
+    shape = {"width": 4, "height": 3, "count": len(bands), "dtype": bands[0].dtype}
+    with rasterio.open(path, "w", driver="GTiff", nodata=nodata, **shape) as target:
+        target.scales, target.offsets = (scale,) * len(bands), (offset,) * len(bands)
+        target.write(np.array(bands))
+    return path
+
+
+def test_scale_offset_and_fill_of_a_tiff_count(tmp_path):
+    stored = (16 * MAP).astype(np.int16)
+    stored[1, 2] = -32768
+    found = read_result(tiff(tmp_path / "a.tif", stored, scale=1 / 16, offset=-8, nodata=-32768))
+    assert np.isnan(found[1, 2])
+    np.testing.assert_array_equal(np.delete(found.ravel(), 6), np.delete(MAP.ravel() - 8, 6))
+
+
+@pytest.mark.parametrize("bands", [[MAP, MAP], [MAP] * 3, [MAP.astype(np.complex64)]])
+def test_other_bands_are_no_disparities(tmp_path, bands):
+    with pytest.raises(InputError, match=r"a\.tif: .* are no disparity map.*Remedy"):
+        read_result(tiff(tmp_path / "a.tif", *bands))
+
+
+def test_a_png_of_8_bits_has_no_disparities(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), (256 * MAP).astype(np.uint16))
+    cv2.imwrite(str(tmp_path / "b.png"), MAP.astype(np.uint8))
+    found = read_disparity(tmp_path / "a.png")
+    assert np.isnan(found[0, 0]) and np.array_equal(found.ravel()[1:], MAP.ravel()[1:])
+    with pytest.raises(InputError, match=r"b\.png: a PNG of uint8 has no disparities.*16 bits"):
+        read_disparity(tmp_path / "b.png")
 
 
 @pytest.mark.parametrize("read", [read_result, read_image, image_shape])

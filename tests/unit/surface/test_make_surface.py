@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
+from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.lattice import LATTICE_DEG
 from stereotruth.lidar.point_store import PointStore, open_stores
 from stereotruth.products.files import read_sealed
@@ -16,6 +18,7 @@ from stereotruth.surface.scale import PART, SurfaceScale
 from stereotruth.surface.surface_store import ARRAYS, TRIANGLES, SurfaceStore
 
 from ...synthetic.box_scene import points_on, write_points
+from ...synthetic.las import write_las
 from ...synthetic.stores import tree_digest
 
 CELL = (3400, 2900)
@@ -49,6 +52,9 @@ class East:
 
     def may_show(self, boxes):
         return boxes[:, 3] > self.lon
+
+    def box(self, heights):
+        return self.lon, 30.0, self.lon + 0.01, 30.01
 
 
 def triangles(store: SurfaceStore) -> dict[str, set]:
@@ -187,3 +193,17 @@ def test_groups_are_wide_against_their_halo(density, monkeypatch):
     assert side & (side - 1) == group & (group - 1) == 0
     assert group >= 12 * scale.halo_cells or group == 4096
     assert group + 2 * scale.halo_cells < MAX_PARTS // PART
+
+
+def test_points_that_no_image_shows_are_refused(stores, tmp_path):
+    """As of a file of another place, of which ingest has kept none: where it lies is known."""
+    write_las(tmp_path / "a.las")
+    elsewhere = Footprint.around([np.array([[10.0, 10.01, 10.0], [50.0, 50.0, 50.01]])], 50.0)
+    ingest(tmp_path / "a.las", tmp_path / "a", footprint=elsewhere)
+    empty = PointStore(tmp_path / "a")
+    assert not empty.attrs["points"]["kept"]
+    for found in (stores, (empty,)):
+        words = r"the LiDAR covers longitude .* the images longitude .*Remedy"
+        with pytest.raises(InputError, match=words):
+            make_surface(found, tmp_path / "s", cell=CELL, ground=East(170.0))
+    assert not (tmp_path / "s").exists()

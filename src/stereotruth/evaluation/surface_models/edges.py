@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from ...lidar.height_raster import Floats
 from ...numerics.error_sums import quantile_bin
-from .height_raster import Floats
 from .reference import BUILDING, NONE, OTHER, TREE, WATER, Lattice
 
 LEAST_STEP_M = 3.0  # of a roof's edge over the ground beside it

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from ...lidar.height_raster import Floats
 from ...numerics.error_sums import ErrorSum, Scale
 from .edges import near_steps
-from .height_raster import Floats
 from .reference import BUILDING, GROUND, OTHER, TREE, WATER, Lattice
 
 METRES = Scale((1.0, 3.0), 0.005, 40_001)  # to ±100 m

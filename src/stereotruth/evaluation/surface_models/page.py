@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from matplotlib.figure import Figure
 
+from ...lidar.height_raster import HeightRaster
 from ...products.files import atomic_folder, write_json, write_table
 from ...products.html_page import way, write_page
 from ...products.html_tables import Headline, minus, table
@@ -24,7 +24,6 @@ from ...products.pictures import (
 )
 from .edges import HIGH, LOW, SHARP, S
 from .height_errors import OPEN
-from .height_raster import HeightRaster
 from .score import Verdict
 
 MAP_BYTES, FIGURE_BYTES = 250_000, 60_000
@@ -81,11 +80,8 @@ def _draw_profile(path: Path, profile: list[float | None]) -> None:
 
 def _shaded(model: HeightRaster) -> Picture:
     """Hillshade of the model, read at ``MAP_PX`` along its longer side."""
-    with rasterio.open(model.path) as dataset:
-        times = max(max(dataset.shape) / MAP_PX, 1.0)
-        shape = tuple(max(2, round(side / times)) for side in dataset.shape)
-        read = dataset.read(1, out_shape=shape, masked=True)
-    return hillshade(read.astype(float).filled(np.nan) / (times * np.mean(model.cell_m)), 1.0)
+    heights, times = model.decimated(MAP_PX)
+    return hillshade(heights / (times * np.mean(model.cell_m)), 1.0)
 
 
 def _limit(verdict: Verdict) -> float:

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from ...errors import InputError
+from ...lidar.height_raster import CLASSES, Floats, HeightRaster
 from ...lidar.point_store import PointStore, open_stores, query_points
-from .height_raster import Floats, HeightRaster
 
 NONE, GROUND, BUILDING, TREE, WATER, OTHER = range(6)
 KIND_OF_CLASS = np.full(256, OTHER, np.uint8)  # of LAS classes
@@ -109,8 +108,12 @@ class LidarReference:
         kind = KIND_OF_CLASS[found.classification]
         chosen = (found.return_number <= 1) & (kind != NONE)
         lon, lat, height = (v[chosen] for v in (found.lon, found.lat, found.height))
-        height = height - model.undulation(lon, lat) if height.size else height
-        return (*model.places(lon, lat), height, kind[chosen])
+        x, y = model.places(lon, lat)
+        dx, dy = model.cell_m
+        inside = (x >= (cols.start - 0.5) * dx) & (x < (cols.stop - 0.5) * dx)
+        inside &= (-y >= (rows.start - 0.5) * dy) & (-y < (rows.stop - 0.5) * dy)
+        height = height[inside] - model.undulation(lon[inside], lat[inside])
+        return x[inside], y[inside], height, kind[chosen][inside]
 
 
 class RasterReference:
@@ -123,7 +126,7 @@ class RasterReference:
         self, path: str | Path, geoid: str | Path | None = None, classes: str | Path | None = None
     ) -> None:
         self.raster = HeightRaster.open(path, geoid)
-        self.classes = None if classes is None else HeightRaster.open(classes)
+        self.classes = None if classes is None else HeightRaster.open(classes, quantity=CLASSES)
         self.name = Path(path).name
         self.classified = classes is not None
         if self.classes is not None and (
@@ -166,14 +169,13 @@ class RasterReference:
         row, col = (at + part.start for at, part in zip(np.nonzero(known), window))
         east, north = self.raster.coordinates(col * dx, -row * dy)
         z = heights[known].astype(np.float64)
-        ours, theirs = self.raster.system.horizontal, model.system.horizontal
-        if not ours.equals(theirs) or self.raster.geoid or model.geoid:
-            to_wgs84 = pyproj.Transformer.from_crs(ours, 4326, always_xy=True)
-            lon, lat = to_wgs84.transform(east, north)
-            if z.size:
-                z = z + self.raster.undulation(lon, lat) - model.undulation(lon, lat)
-            return (*model.places(lon, lat), z, kind)
-        return (*model.places_of(east, north), z, kind)
+        own, other = self.raster.to_wgs84, model.to_wgs84
+        is_same = own.system.horizontal.equals(other.system.horizontal)
+        if is_same and not (own.is_orthometric or other.is_orthometric):
+            return (*model.places_of(east, north), z, kind)
+        lon, lat, _ = own._exact(east, north, np.zeros(east.size))
+        z = z + own.undulation(lon, lat) - other.undulation(lon, lat)
+        return (*model.places(lon, lat), z, kind)
 
 
 def lattice_step(reference: Reference, model: HeightRaster) -> float:

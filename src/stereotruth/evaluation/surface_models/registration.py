@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ...kernels import kernel
+from ...lidar.height_raster import Floats, Window
 from ...numerics.robust import huber_weights, median_and_nmad, reweighted_fit
 from .edges import Edges, measure
-from .height_raster import Floats, Window
 
 SEARCH_M = 24.0  # shifts looked for, to each side
 COARSE = (4.0, 2.0, 1.0, 0.5)  # m, steps of the search
@@ -40,6 +40,7 @@ class Registration:
     """The model's displacement against the reference, m, and its standard uncertainties.
 
     What lies at (x, y, z) in the reference lies at (x + east, y + north, z + up) in the model.
+    East and north are those of the ellipsoid in the model's middle, whatever its grid.
     ``tilt_*``: what is left of the difference of heights along east and north, m per km. The
     uncertainties are None where the ground is too small for them. ``edges``: that told east and
     north, 0 if the heights did.
@@ -237,10 +238,17 @@ def _up(parts: Sequence[Part], shift: Floats) -> float:
     return float(shift[2] + _huber(np.ones((d.size, 1)), d)[0]) if d.size else float(shift[2])
 
 
-def register(parts: Sequence[Part], groups: Sequence[int], seed: int = 0) -> Registration | None:
+def _to_enu(shift: Floats, to_enu: Floats) -> Floats:
+    return np.array([*(to_enu @ shift[:2]), shift[2]])
+
+
+def register(
+    parts: Sequence[Part], groups: Sequence[int], to_enu: Floats, seed: int = 0
+) -> Registration | None:
     """The registration over all parts; ``groups``: the jackknife's group of each, 0 to GROUPS − 1.
 
-    None if fewer than 100 places have a height.
+    ``to_enu`` [2, 2] takes vectors of the parts' places to metres east and north. None if fewer
+    than 100 places have a height.
     """
     few = _thinned(parts, FEW, seed)
     shift = np.array(_search(few))
@@ -259,6 +267,7 @@ def register(parts: Sequence[Part], groups: Sequence[int], seed: int = 0) -> Reg
         edges = _Displaced.of(parts, groups, shift)
     if not by_edges:
         shift = _fit(many, shift, scale, 0.1)
+    of_slopes = np.linalg.inv(to_enu)
     again = []
     for group in sorted(set(groups)):
         rest = [part for part, of in zip(many, groups) if of != group]
@@ -267,9 +276,9 @@ def register(parts: Sequence[Part], groups: Sequence[int], seed: int = 0) -> Reg
         else:
             moved = _fit(rest, shift, scale, 0.05)
         moved[2] = _up(rest, moved)
-        again.append([*moved, *_tilt(rest, moved)])
+        again.append([*_to_enu(moved, to_enu), *_tilt(rest, moved) @ of_slopes])
     shift[2] = _up(many, shift)
-    tilt = _tilt(many, shift)
+    tilt = _tilt(many, shift) @ of_slopes
     spread = np.array(again) - np.mean(again, axis=0)
     n = len(again)
     sigma: list[float | None] = [None] * 5
@@ -277,7 +286,7 @@ def register(parts: Sequence[Part], groups: Sequence[int], seed: int = 0) -> Reg
         variance = (n - 1) / n * (spread**2).sum(axis=0)
         sigma = list(map(float, np.sqrt(variance) * [1, 1, 1, 1000, 1000]))
     return Registration(
-        *map(float, shift),
+        *map(float, _to_enu(shift, to_enu)),
         *sigma[:3],
         *map(float, 1000 * tilt),
         *sigma[3:],

@@ -21,9 +21,9 @@ import numpy as np
 
 from ...errors import InputError
 from ...job import progress
+from ...lidar.height_raster import Floats, HeightRaster, Window
 from .edges import REACH_M, EdgeErrors, find_edges, measure
 from .height_errors import SOLID, HeightErrors, strata
-from .height_raster import Floats, HeightRaster, Window
 from .reference import TREE, WATER, Reference, lattice_of, lattice_step
 from .registration import GROUPS, SEARCH_M, Part, Registration, register
 
@@ -110,7 +110,9 @@ def score_surface_model(
     model = HeightRaster.open(path, geoid)
     step_m = lattice_step(reference, model)
     parts = list(_parts(model, reference, step_m))
-    found = register([part for part, _ in parts], [group for _, group in parts]) if parts else None
+    found = None
+    if parts:
+        found = register(*map(list, zip(*parts)), model.to_enu)
     if found is None:
         raise InputError(
             f"no place has both a height and a reference ({reference.name})",
@@ -126,6 +128,7 @@ def score_surface_model(
     coarse = max(1, -(-max(model.shape) // MAP_SIDE))
     sums = np.zeros((2, -(-model.shape[0] // coarse), -(-model.shape[1] // coarse)))
     margin = REACH_M + abs(found.east_m) + abs(found.north_m)
+    along, across = np.linalg.solve(model.to_enu, [found.east_m, found.north_m])
 
     windows = _windows(model.shape, BLOCK)
     for window in progress(windows, len(windows), "surface model judged"):
@@ -133,7 +136,7 @@ def score_surface_model(
         heights = _read(model, *window, margin + 4.0)
 
         def height_at(x: Floats, y: Floats, heights: Window = heights) -> Floats:
-            return heights.at(x + found.east_m, y + found.north_m) - found.up_m
+            return heights.at(x + along, y + across) - found.up_m
 
         error = height_at(lattice.x, lattice.y) - lattice.z
         chosen = strata(lattice, reference.classified)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...products.raster_values import OFTEN
+
 TURNED = 0.5  # EPE of −d to that of d, below which the sign is in doubt
 OUTSIDE_SHARE = 0.01  # of the values
 ONE_VALUE_SHARE = 0.5  # of the values outside the range, that are one and the same
@@ -25,6 +27,8 @@ class Doubts:
     values: int = 0
     outside: int = 0
     repeated: Counter[float] = field(default_factory=Counter)
+    zeros: int = 0
+    near_zero: int = 0  # within a px, and not zero
 
     def add(self, disparity: NDArray[np.float32], truth: NDArray[Any]) -> None:
         """Add a pair: disparity and truth [h, w] px, NaN where there is none."""
@@ -37,6 +41,8 @@ class Doubts:
         low, high = self.disparity_range
         outside = values[(values < low) | (values >= high)]
         self.values += values.size
+        self.zeros += int((values == 0).sum())
+        self.near_zero += int(((values != 0) & (np.abs(values) <= 1.0)).sum())
         self.outside += outside.size
         if outside.size:
             each, count = np.unique(outside, return_counts=True)
@@ -60,4 +66,9 @@ class Doubts:
             else:
                 share = 100 * self.outside / self.values
                 found.append(f"{share:.2g} % of the values lie {where}")
+        if self.zeros > max(OUTSIDE_SHARE * self.values, OFTEN * self.near_zero):
+            found.append(
+                f"{100 * self.zeros / self.values:.2g} % of the values are exactly 0, and hardly "
+                "any is near it: is that nodata? Write NaN for it"
+            )
         return found

@@ -72,7 +72,8 @@ def scaled(
         if model.channels == 1:
             bands = bands @ np.array(GREY, np.float32)[:, None]
         bands = bands[..., ::-1] if model.scaling == "us3d" else bands / 2
-        return np.ascontiguousarray(bands.transpose(2, 0, 1), dtype=np.float32)
+        # copies: of one band, NumPy takes a reversed axis for contiguous, and PyTorch refuses it
+        return bands.transpose(2, 0, 1).astype(np.float32, order="C").copy()
     if not grey and model.channels == 1:
         image = image @ np.array(GREY, np.float32)
     out = (image.astype(np.float32) - np.float32(first)) / np.float32(second)

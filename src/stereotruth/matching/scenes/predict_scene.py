@@ -141,7 +141,7 @@ def _fixed(offset: Any, tiling: Tiling) -> Offsets:
 
 
 def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
-    """The disparities of the heights for which the scene's RPCs are made, with some reserve."""
+    """The disparities of the heights that the epipolar model is made for, with some reserve."""
     try:
         low, high = attrs["epipolar"]["report"]["disparity_range_px"]
     except (KeyError, TypeError):

@@ -1,0 +1,227 @@
+"""What no correction of the images fits: errors that near tie points share.
+
+Strips of the LiDAR that disagree, RPCs that an affine does not follow, attitude beyond what the
+lines tell: the residuals of sites near each other agree. They are no noise, which the number of tie
+points averages away. Their covariance is that of the greatest restricted likelihood (Patterson &
+Thompson 1971), exponential in the distance, beside errors that each site has for itself. It counts
+if the likelihood rises by more than chance allows; then it is part of what labels state, and of how
+sure the corrections are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import chdtrc
+
+from .adjustment import MATCHING, Estimate
+from .equations import Equations
+from .hill_climb import amount, climb
+
+Floats = NDArray[np.float64]
+
+
+CHANCE = 0.05  # probability of such a rise of the likelihood where sites share nothing
+SURE = 0.001  # the same, from which on their form is told
+UNKNOWNS = 2  # a standard deviation and a length
+LENGTHS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)  # of the covariance, in spacings of the sites
+FEWEST = 12  # sites that tell a covariance
+LEAST = 0.5  # of the variance that labels have at least, whatever the corrections take of it
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Errors [2] along and across the rows that sites near each other share.
+
+    ``sigma_px``: standard deviations, 0 where they are no more than chance; ``length_px`` of the
+    left image, over which they fall to 1/e; ``chance``; ``label_px``: the standard deviation of a
+    label's disparity by them, beside the corrections' own. ``smooth``: a curved surface
+    of second degree over the scene takes them away.
+    """
+
+    sigma_px: tuple[float, float]
+    length_px: tuple[float, float]
+    chance: tuple[float, float]
+    label_px: float = 0.0
+    smooth: bool = False
+
+    def figures(self) -> dict[str, Any]:
+        """JSON-ready."""
+        found: dict[str, Any] = {
+            "sigma_of_labels_px": round(self.label_px, 4),
+            "smooth": self.smooth,
+        }
+        for k, name in enumerate(("disparity", "y_parallax")):
+            found[name] = {
+                "sigma_px": round(self.sigma_px[k], 4),
+                "length_px": round(self.length_px[k], 1),
+                "probability_by_chance": float(f"{self.chance[k]:.3g}"),
+            }
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Sites:
+    """Means of m sites: ``value`` and ``variance`` [m]; ``distance`` [m, m] px and ``trend``
+    [m, t], which has no part in the likelihood."""
+
+    value: Floats
+    variance: Floats
+    distance: Floats
+    trend: Floats
+
+    @classmethod
+    def of(cls, at: Floats, value: Floats, variance: Floats, *, curved: bool = False) -> _Sites:
+        """At places [m, 2] px; ``curved``: the trend is of second degree, else the affines'."""
+        distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+        u, v = ((at - at.mean(axis=0)) / max(float(np.ptp(at)), 1.0)).T
+        squares = [u * u, u * v, v * v] if curved else []
+        trend = np.column_stack([np.ones(len(at)), u, v, *squares])
+        return cls(value, variance, distance, trend)
+
+    def twice_log(self, own: float, shared: float, length: float) -> float:
+        """Twice the log of the restricted likelihood; standard deviations and a length, px."""
+        covariance = np.diag(self.variance + own**2)
+        if shared:
+            covariance += shared**2 * np.exp(-self.distance / length)
+        factor = np.linalg.cholesky(covariance)
+        both = solve_triangular(factor, np.column_stack([self.trend, self.value]), lower=True)
+        trend, value = both[:, :-1], both[:, -1]
+        basis, corner = np.linalg.qr(trend)
+        left = value - basis @ (basis.T @ value)
+        determinant = np.log(np.diag(factor)).sum() + np.log(np.abs(np.diag(corner))).sum()
+        return -float(left @ left) - 2.0 * float(determinant)
+
+
+def _shared_of(sites: _Sites) -> tuple[float, float, float]:
+    """Standard deviation and length (px) of what sites share, and its probability by chance."""
+    unit = float(np.sqrt(np.median(sites.variance)))
+    near = sites.distance + np.diag(np.full(len(sites.value), np.inf))
+    spacing = float(np.median(near.min(axis=1)))
+    (own,), without = climb(lambda k: sites.twice_log(amount(k[0]) * unit, 0.0, 1.0), (0,))
+    best = (without, 0.0, spacing, (own, 0))
+    for length in (spacing * times for times in LENGTHS):
+        steps, top = climb(
+            lambda k, length=length: sites.twice_log(
+                amount(k[0]) * unit, amount(k[1]) * unit, length
+            ),
+            best[3],
+        )
+        if top > best[0] + 1e-9:
+            best = top, amount(steps[1]) * unit, length, steps
+    top, sigma, length, _ = best
+    return sigma, length, float(chdtrc(UNKNOWNS, max(top - without, 0.0)))
+
+
+def with_shared_errors(
+    found: Estimate, equations: Equations, *, by_line: bool = False
+) -> tuple[Estimate, SharedErrors]:
+    """The estimate of a pair's affines with what near sites share counted, and these errors.
+
+    Then the parameters are those of generalised least squares; without such errors nothing changes.
+    ``equations``: of ``found``, corrections by line taken off. ``by_line``: there are some. They
+    take a part of what near sites share, so that the rest counts whatever its probability.
+    """
+    index = np.unique(equations.site, return_inverse=True)[1]
+    residuals = equations.observed - equations.design @ found.parameters
+    known = np.bincount(index, found.weights) > 0.0
+    information = (
+        found.weights[:, None] / (np.hypot(equations.own, MATCHING)[:, None] * found.ratio) ** 2
+    )
+    total = np.stack([np.bincount(index, i) for i in information.T], axis=1)
+    at = np.stack([np.bincount(index, found.weights * c) for c in equations.at.T], axis=1)
+    at = at[known] / np.bincount(index, found.weights)[known, None]
+    if known.sum() < FEWEST:
+        return found, SharedErrors((0.0, 0.0), (0.0, 0.0), (1.0, 1.0))
+    means = [
+        (np.bincount(index, i * r)[known] / t[known], 1.0 / t[known])
+        for i, r, t in zip(information.T, residuals.T, total.T)
+    ]
+    told = [_shared_of(_Sites.of(at, *mean)) for mean in means]
+    sigma = tuple(s if by_line or chance < CHANCE else 0.0 for s, _, chance in told)
+    smooth = told[0][2] < SURE and _shared_of(_Sites.of(at, *means[0], curved=True))[2] > CHANCE
+    shared = SharedErrors(
+        sigma,
+        tuple(length for _, length, _ in told),
+        tuple(chance for _, _, chance in told),
+        smooth=smooth,
+    )
+    if not any(sigma):
+        return found, shared
+    return _counted(found, equations, shared, index, known, at)
+
+
+def shared_spread(found: Estimate, equations: Equations, shared: SharedErrors) -> Floats:
+    """Covariance [12, 12] that shared errors add to the right side of a pair's normal equations."""
+    index = np.unique(equations.site, return_inverse=True)[1]
+    count = np.bincount(index)
+    at = np.stack([np.bincount(index, c) / count for c in equations.at.T], axis=1)
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    spread = np.zeros((12, 12))
+    for k in (0, 1):
+        covariance = shared.sigma_px[k] ** 2 * np.exp(-distance / max(shared.length_px[k], 1.0))
+        weighted = found.information[:, k, None] * equations.design[:, k]
+        pull = np.stack([np.bincount(index, w) for w in weighted.T], axis=1)
+        spread += pull.T @ covariance @ pull
+    return spread
+
+
+def _counted(
+    found: Estimate,
+    equations: Equations,
+    shared: SharedErrors,
+    index: NDArray[np.int64],
+    known: NDArray[np.bool_],
+    at: Floats,
+) -> tuple[Estimate, SharedErrors]:
+    """The estimate by generalised least squares, with the errors that are shared."""
+    inner = equations.design @ found.root
+    rank = inner.shape[-1]
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    normal, right = np.zeros((rank, rank)), np.zeros(rank)
+    of_disparity: Floats = np.zeros((0, rank))
+    for k in (0, 1):
+        weight = found.information[:, k]
+
+        def of_sites(values: Floats, weight: Floats = weight) -> Floats:
+            total = np.bincount(index, weight)
+            return (np.bincount(index, weight * values) / np.where(total > 0.0, total, 1.0))[known]
+
+        design = np.stack([of_sites(column) for column in inner[:, k].T], axis=1)
+        value = of_sites(equations.observed[:, k])
+        total = np.bincount(index, weight)[known]
+        covariance = shared.sigma_px[k] ** 2 * np.exp(-distance / shared.length_px[k])
+        covariance += found.shared[k] ** 2
+        inverse = np.linalg.inv(covariance + np.diag(1.0 / total))
+        by_itself = weight[:, None] * inner[:, k]
+        normal += by_itself.T @ inner[:, k] - (design.T * total) @ design
+        right += by_itself.T @ equations.observed[:, k] - (design.T * total) @ value
+        normal += design.T @ inverse @ design
+        right += design.T @ inverse @ value
+        if k == 0:
+            of_disparity, taken_by = design, inverse @ covariance
+    posterior = np.linalg.inv(np.eye(rank) + normal)
+    values, vectors = np.linalg.eigh(normal)
+    seen = values > 1e-9 * values.max()
+    values, squares = values[seen], (vectors[:, seen].T @ right) ** 2
+    alone = vectors[:, seen] @ ((vectors[:, seen].T @ right) / values)
+    # Of a label's error by what is shared, the corrections take a part.
+    variance = shared.sigma_px[0] ** 2
+    taken = np.mean(np.sum((of_disparity @ posterior @ of_disparity.T) * taken_by.T, axis=1))
+    label = float(np.sqrt(max(variance - 2.0 * float(taken), LEAST * variance)))
+    counted = replace(
+        found,
+        parameters=np.round(found.root @ (posterior @ right), 8),
+        covariance=np.round(found.root @ posterior @ found.root.T, 14),
+        normal=normal,
+        alone=found.root @ alone,
+        statistic=float(np.sum(squares / values)),
+        freedom=int(seen.sum()),
+        contradiction=float(np.sum(squares / (values + values**2))),
+        contradiction_freedom=int(seen.sum()),
+    )
+    return counted, replace(shared, label_px=label)

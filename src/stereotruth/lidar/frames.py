@@ -1,0 +1,399 @@
+"""From the terrestrial frame of coordinates to ITRF2020 at the date of the images.
+
+RPCs and control points by GNSS are in the ITRF of their day, which WGS 84 (G…) follows to a
+centimetre. National frames move with their plate, or stand still since an epoch of their own: they
+are 0.3 to 2 m away from it. To WGS 84 PROJ moves most of them by nothing, with an accuracy of 1 to
+4 m. So frames go to ITRF2020 here, in two legs that are both explicit, since PROJ does nothing when
+the epoch alone changes:
+
+1. the frame to ITRF2020 at the epoch of the coordinates, by PROJ's time-dependent transformation
+   (Helmert, 14 parameters, EPSG's) or that of the ITRF that the frame is a realisation of;
+2. from that epoch to that of the target by the motion of the plate (:mod:`.plate_motion`).
+
+What the epoch of the coordinates is follows from the kind of frame:
+
+- a frame that moves with its plate (NAD83, ETRS89, GDA2020): coordinates hold at any time, and the
+  first leg is taken at the target's epoch;
+- a frame that stands for ITRF at one epoch (NZGD2000: ITRF96 at 2000.0): that epoch;
+- a dynamic frame (ITRF2014, WGS 84 (G1762)): the epoch that the file or ``lidar_epoch`` states;
+- WGS 84 without a realisation names no frame: ITRF2020, at the stated epoch, or else at the
+  target's.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.aoi import AreaOfInterest
+from pyproj.crs import Datum, GeographicCRS
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
+
+from ..errors import InputError
+from .plate_motion import moved, plate_at, speed
+
+Floats = NDArray[np.float64]
+Place = tuple[Floats, Floats, Floats]
+
+NAME = "ITRF2020"
+ITRF2020 = 9989  # EPSG: longitude, latitude, ellipsoidal height
+ETRS89 = 4937
+ETRS89_ENSEMBLE = 6258  # EPSG code of the datum
+WGS84_ENSEMBLE = 6326  # EPSG code of the datum
+WGS84_NAME = f"{NAME} (WGS 84 names no realisation)"
+SURE_M = 0.1  # accuracy of a transformation to ETRS89 that makes a frame one of its realisations
+NEAR_DEG = 0.5  # around a place for which the transformation is chosen
+UNKNOWN_M = 0.03  # a tenth of the finest pixel: places that may be farther off are refused
+MOST_M_A = 0.08  # by which any place on Earth moves in a year
+SETTLED_M = 1e-4  # motion that is left out: the step of heights in point stores
+
+
+class Epoch(NamedTuple):
+    """Decimal year that places are brought to, and what tells it; empty: nothing does."""
+
+    year: float
+    by: str = ""
+
+
+DEFAULT_EPOCH = Epoch(2020.0)
+
+
+class Epochs(NamedTuple):
+    """``images``: that coordinates are brought to; ``own``: theirs (decimal year), where stated."""
+
+    images: Epoch
+    own: float | None = None
+
+
+class Realisation(NamedTuple):
+    """What a datum's coordinates are: those of an EPSG system, at an epoch (None: at any).
+
+    ``spread_m``: among the realisations that the datum may stand for.
+    """
+
+    system: int
+    epoch: float | None = None
+    spread_m: float = 0.0
+    remark: str = ""
+
+
+_ETRS89 = Realisation(10570, spread_m=0.1)  # ETRF2020, which PROJ takes ETRS89 for, too
+_ETRF2000 = Realisation(7931)
+_NAD83 = Realisation(
+    6319,
+    spread_m=1.0,
+    remark="names no realisation of NAD83, or an old one: taken as NAD83(2011); NAD83(HARN) and "
+    "later ones lie within some 0.1 m of it, NAD83(1986) within 1 m",
+)
+_NZGD2000 = Realisation(
+    7907,  # ITRF96
+    2000.0,
+    spread_m=0.5,
+    remark="New Zealand deforms, by up to 4 cm a year between its coasts: NZGD2000 is brought to "
+    "the date of the images as on a rigid plate, since LINZ's grid nz_linz_nzgd2000-20180701.json "
+    "is not installed (projsync --file gets it)",
+)
+# By the EPSG code of the datum, with the definitions of EPSG's register (v11) where nothing else
+# stands. No entry is made where PROJ knows the way itself.
+REALISATIONS = {
+    6167: _NZGD2000,
+    1043: Realisation(7908, 2000.0, spread_m=0.2),  # China 2000 (CGCS2000): ITRF97
+    6674: Realisation(7909, 2000.4),  # SIRGAS 2000: ITRF2000
+    6170: Realisation(7906, 1995.4),  # SIRGAS 1995: ITRF94
+    1062: Realisation(7910, 2006.632),  # POSGAR 2007: ITRF2005
+    1068: Realisation(7906, 1995.4),  # SIRGAS-ROU98
+    1120: Realisation(7911, 2010.0),  # Mexico ITRF2008
+    6737: Realisation(7909, 2002.0),  # KGD2002 (Korea 2000): ITRF2000
+    1209: Realisation(7907, 1998.121),  # Hong Kong Geodetic: ITRF96
+    6148: Realisation(7903, 1994.0),  # Hartebeesthoek94: ITRF91
+    1159: Realisation(7911, 2011.0),  # GSK-2011: ITRF2008
+    ETRS89_ENSEMBLE: _ETRS89,
+    6171: _ETRS89,  # RGF93 v1
+    6140: Realisation(10413),  # NAD83(CSRS), of which versions 6 to 8 are the same
+    6269: _NAD83,  # NAD83
+    6152: _NAD83,  # NAD83(HARN)
+    6759: _NAD83,  # NAD83(NSRS2007)
+    1211: _NAD83,  # NAD83(FBN)
+    1312: _ETRF2000,  # RGF93 v2, at 2009.0
+    1313: _ETRF2000,  # RGF93 v2b, at 2019.0
+    1132: _ETRF2000,  # RDN2008
+    1305: _ETRF2000,  # ETRF2000-PL
+    1214: _ETRF2000,  # SRB_ETRS89
+    6619: Realisation(7929),  # SWEREF99: ETRF97
+    # The frames of the IGS are those of the ITRF, to some mm of its stations.
+    1333: Realisation(9989),  # IGS20
+    1191: Realisation(7912),  # IGS14
+    1272: Realisation(7912),  # IGb14
+    1141: Realisation(7911),  # IGS08
+    1248: Realisation(7911),  # IGb08
+}
+
+
+@dataclass(frozen=True)
+class FrameChange:
+    """From longitude, latitude, height of a frame to those in ITRF2020 at epoch ``target``.
+
+    ``frame``: its name; ``epoch`` of the coordinates (decimal year), None where they hold at any
+    (the frame moves with its plate); ``target``: epoch of the result; ``legs``: what is done, in
+    words; ``accuracy_m``: of PROJ's transformation, None where it is not known; ``notes``: remarks
+    for the user. ``geographic``: the system that it begins from, in degrees, three-dimensional.
+    """
+
+    frame: str
+    epoch: float | None
+    target: Epoch
+    legs: tuple[str, ...]
+    accuracy_m: float | None
+    notes: tuple[str, ...]
+    geographic: CRS
+    _steps: tuple[Callable[[Floats, Floats, Floats], Place], ...] = field(repr=False)
+
+    def __call__(self, lon: Floats, lat: Floats, height: Floats) -> Place:
+        """Longitude, latitude (degrees), ellipsoidal height (m), each float64[n]."""
+        for step in self._steps:
+            lon, lat, height = step(lon, lat, height)
+        return lon, lat, height
+
+    def describe(self) -> dict[str, Any]:
+        """Record for the attributes of a product."""
+        return record(self.target, self.frame, self.epoch, self.legs)
+
+
+def record(
+    target: Epoch, frame: str, epoch: float | None, legs: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Record of coordinates in ITRF2020 at ``target``, and of the frame and epoch that they come
+    from (``epoch``: None where they hold at any)."""
+    source = {"frame": frame, "epoch": epoch, "legs": list(legs)}
+    return {"frame": NAME, "epoch": round(target.year, 4), "by": target.by, "source": source}
+
+
+def taken_as_it_is(geodetic: CRS | None, target: Epoch) -> dict[str, Any]:
+    """Record of coordinates that :func:`frame_change` leaves to PROJ's way to WGS 84."""
+    if geodetic is not None and datum_code(geodetic) == WGS84_ENSEMBLE:
+        return record(target, WGS84_NAME, round(target.year, 4))
+    name = "unknown" if geodetic is None else geodetic.name
+    return record(target, f"{name}, to WGS 84 by PROJ and that taken as {NAME}", None)
+
+
+def datum_code(geodetic: CRS) -> int | None:
+    """EPSG code of a system's datum, by its code or its name; None where neither says it."""
+    datum = geodetic.datum
+    if datum is None or (datum.prime_meridian is not None and datum.prime_meridian.longitude):
+        return None
+    identity = datum.to_json_dict().get("id", {})
+    if identity.get("authority") == "EPSG":
+        return int(identity["code"])
+    for name in (datum.name, f"{datum.name} ensemble"):
+        try:
+            identity = Datum.from_name(name, auth_name="EPSG").to_json_dict().get("id", {})
+        except CRSError:
+            continue
+        if identity.get("authority") == "EPSG":
+            return int(identity["code"])
+    return None
+
+
+@cache
+def _geographic(datum: int) -> CRS:
+    """Longitude, latitude and ellipsoidal height on a datum of EPSG."""
+    found = Datum.from_epsg(datum)
+    return GeographicCRS(name=found.name, datum=found).to_3d()
+
+
+def _is_dynamic(datum: int) -> bool:
+    return Datum.from_epsg(datum).type_name.startswith("Dynamic")
+
+
+def _operation(
+    source: CRS, target: int, place: tuple[float, float] | None
+) -> pyproj.Transformer | None:
+    """PROJ's best transformation between two frames at a place (None: at any), or None.
+
+    What it calls a ballpark is none, nor is one that needs a grid which is not installed.
+    """
+    pyproj.network.set_network_enabled(False)
+    around = None
+    if place is not None:
+        lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
+        west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
+        south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
+        around = AreaOfInterest(west, south, east, north)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of grids that are not installed
+            group = TransformerGroup(
+                source,
+                f"EPSG:{target}",
+                always_xy=True,
+                area_of_interest=around,
+                allow_ballpark=False,
+            )
+    except (ProjError, IndexError):  # pyproj 3.7: of a group without any operation
+        return None
+    good = (one for one in group.transformers if "ballpark" not in one.description.lower())
+    return next(good, None)
+
+
+def _at(operation: pyproj.Transformer, epoch: float) -> Callable[[Floats, Floats, Floats], Place]:
+    def transform(lon: Floats, lat: Floats, height: Floats) -> Place:
+        return operation.transform(lon, lat, height, np.full(np.shape(lon), epoch))[:3]
+
+    return transform
+
+
+@dataclass(frozen=True)
+class _Way:
+    """From a frame to ITRF2020 by PROJ: operations, one after the other, and what they mean."""
+
+    operations: tuple[pyproj.Transformer, ...]
+    epoch: float | None
+    dynamic: bool
+    spread_m: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def accuracy_m(self) -> float | None:
+        known = [one.accuracy for one in self.operations]
+        return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
+
+
+def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
+    """How a datum gets to ITRF2020; None where nothing better than WGS 84 is known."""
+    own, dynamic, known = _geographic(datum), _is_dynamic(datum), REALISATIONS.get(datum)
+    direct = None
+    if known is None or known.epoch is not None:  # PROJ may have a grid of deformations
+        direct = _operation(own, ITRF2020, place)
+    if direct is not None:
+        return _Way((direct,), None, dynamic)
+    before: tuple[pyproj.Transformer, ...] = ()
+    if known is None:
+        to_etrs89 = _operation(own, ETRS89, place)
+        if to_etrs89 is None or not 0 <= to_etrs89.accuracy <= SURE_M:
+            return None
+        before, known = (to_etrs89,), REALISATIONS[ETRS89_ENSEMBLE]
+    best = _operation(CRS.from_epsg(known.system), ITRF2020, place)
+    if best is None:
+        return None
+    notes = (known.remark,) if known.remark else ()
+    return _Way((*before, best), known.epoch, dynamic, known.spread_m, notes)
+
+
+def is_known(system: CRS) -> bool:
+    """Whether coordinates of a system get to ITRF2020 otherwise than by WGS 84."""
+    geodetic = system.geodetic_crs
+    datum = None if geodetic is None else datum_code(geodetic)
+    if datum is None or datum == WGS84_ENSEMBLE:
+        return False
+    if datum in REALISATIONS:
+        return True
+    area = system.area_of_use or geodetic.area_of_use
+    east = area.east + 360 * (area.east < area.west) if area else 0.0
+    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else None
+    return _way(datum, middle) is not None
+
+
+def _words(operation: pyproj.Transformer) -> str:
+    """What an operation does, without what is no more than another form of coordinates."""
+    parts = operation.description.split(" + ")
+    forms = ("axis order change", "Conversion from", "Null geographic offset")
+    return " + ".join(part for part in parts if not part.startswith(forms)) or "nothing"
+
+
+def _motion(plate: str, years: float) -> Callable[[Floats, Floats, Floats], Place]:
+    def move(lon: Floats, lat: Floats, height: Floats) -> Place:
+        return moved(lon, lat, height, plate, years)
+
+    return move
+
+
+def _refuse_without_epoch(
+    name: str, datum: int, place: tuple[float, float], plate: str | None, goal: float
+) -> None:
+    """Raise InputError if coordinates that may be of any epoch since their frame's may be off."""
+    since = Datum.from_epsg(datum).to_json_dict().get("frame_reference_epoch", goal)
+    m_a = MOST_M_A if plate is None else speed(*place, plate)
+    if m_a * abs(goal - since) > UNKNOWN_M:
+        raise InputError(
+            f"coordinates in {name} move by {1000 * m_a:.0f} mm a year here, and nothing states "
+            "their epoch",
+            remedy="set lidar_epoch of the scene to the epoch of the coordinates, as 2016.4 or "
+            "2016-05-27",
+        )
+
+
+def frame_change(
+    geodetic: CRS,
+    place: tuple[float, float],
+    target: Epoch,
+    epoch: float | None = None,
+) -> FrameChange | None:
+    """How coordinates on a datum get to ITRF2020 at an epoch.
+
+    ``geodetic``: geographic system of the datum; ``place``: longitude and latitude in degrees of
+    the coordinates, for the plate and PROJ's choice; ``epoch``: of the coordinates as stated, which
+    dynamic frames need and WGS 84 may have. None: the frame is WGS 84 without a stated epoch, or
+    nothing better is known of it than PROJ's way to WGS 84.
+
+    Raises InputError: a dynamic frame without an epoch, or an epoch that differs from the target's
+    where no plate's motion is known.
+    """
+    datum = datum_code(geodetic)
+    if datum is None or (datum == WGS84_ENSEMBLE and epoch is None):
+        return None
+    goal = target.year
+    if datum == WGS84_ENSEMBLE:
+        way = _Way((), epoch, True)
+        name = WGS84_NAME
+    else:
+        found = _way(datum, place)
+        if found is None:
+            return None
+        way, name = found, geodetic.name
+    plate = plate_at(*place)
+    own = way.epoch if way.epoch is not None else epoch if way.dynamic else None
+    if way.dynamic and own is None:
+        _refuse_without_epoch(name, datum, place, plate, goal)
+        own = goal
+    if own is not None and plate is None and abs(own - goal) * MOST_M_A > UNKNOWN_M:
+        if way.epoch is not None:
+            return None
+        raise InputError(
+            f"coordinates in {name} at {own:g}, where no plate's motion is known that would bring "
+            f"them to {goal:.2f}, the date of the images",
+            remedy="transform the points to ITRF2020 at that date by the country's own service, "
+            "and set lidar_epoch to it",
+        )
+    steps: list[Callable[[Floats, Floats, Floats], Place]] = []
+    legs = []
+    for operation in way.operations:
+        steps.append(_at(operation, goal if own is None else own))
+        legs.append(f"{_words(operation)}, at {goal if own is None else own:.3f}")
+    years = 0.0 if own is None else goal - own
+    if plate is not None and abs(years) * speed(*place, plate) > SETTLED_M:
+        steps.append(_motion(plate, years))
+        legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
+    notes = list(way.notes)
+    if not target.by and plate is not None:
+        notes.append(
+            f"the date of the images is not known, it is taken as {goal:g}: places in ITRF2020 "
+            f"move by {1000 * speed(*place, plate):.0f} mm a year here"
+        )
+    return FrameChange(
+        frame=name,
+        epoch=own,
+        target=target,
+        legs=tuple(legs),
+        accuracy_m=way.accuracy_m,
+        notes=tuple(notes),
+        geographic=_geographic(datum),
+        _steps=tuple(steps),
+    )

@@ -1,0 +1,248 @@
+"""Rasters of heights on the ground: where their cells lie, and what their heights count from.
+
+The one reader of surface models and elevation models, for LiDAR, scores and control points: values
+by :mod:`..products.raster_values`, systems by :mod:`.declared_crs`, datums by :mod:`.to_wgs84`.
+Pixels that are points (AREA_OR_POINT) are the middles of their cells: GDAL brings the grid to that.
+
+Places are metres on the ground along the raster's columns and against its rows, from the centre of
+the upper-left cell: (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures on the
+ellipsoid in the raster's middle. So any north-up grid serves, in degrees, feet or a projection
+whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to east and north.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+from rasterio.windows import Window as RasterWindow
+
+from ..errors import InputError
+from ..numerics.bilinear import bilinear
+from ..numerics.degrees import exact_metres_per_degree, turn
+from ..products.raster_values import HEIGHT, Fills, Quantity, Values
+from ..products.ungeoreferenced import open_raster
+from .declared_crs import LidarCRS, of_raster
+from .to_wgs84 import ToWGS84, transformation
+
+log = logging.getLogger("stereotruth")
+Floats = NDArray[np.float64]
+Heights = NDArray[np.float32]
+WIDEST_M = 1e5  # metres along the cells are those of the raster's middle
+BASE = 16.0  # cells over which a cell is measured
+CLASSES = Quantity(
+    "class of LAS", "raster of classes", 0.0, 255.0, "give a raster of one band of LAS classes"
+)
+AROUND = 32  # cells around a point that are held against the rules on fill values
+
+
+def refuse_grid(raster: Any, file: Path) -> None:
+    """Raise InputError unless rows run from north to south and columns from west to east."""
+    at = raster.transform
+    if at.b or at.d or not (at.a > 0 > at.e) or at == rasterio.Affine.identity():
+        raise InputError(
+            "its cells are not on a grid with north up, or it has no place on the ground",
+            file=file,
+            remedy="gdalwarp it to its own coordinate system, or give its world file's content "
+            "with gdal_translate -a_ullr",
+        )
+
+
+def system_of(raster: Any, file: Path) -> LidarCRS | None:
+    """What the system and the band's unit of an open raster say; None if it has no system."""
+    unit = (raster.units[0] or "").strip()
+    return None if raster.crs is None else of_raster(raster.crs.to_wkt(), unit, file)
+
+
+@dataclass(frozen=True)
+class HeightRaster:
+    """A raster of heights on disk. ``shape`` rows, columns; ``to_wgs84``: of its coordinates.
+
+    Made by :meth:`open`. ``quantity``: what it is a raster of.
+    """
+
+    path: Path
+    to_wgs84: ToWGS84
+    transform: rasterio.Affine
+    shape: tuple[int, int]
+    quantity: Quantity
+
+    @classmethod
+    def open(
+        cls,
+        path: str | Path,
+        geoid: str | Path | None = None,
+        *,
+        quantity: Quantity = HEIGHT,
+        whole: bool = True,
+    ) -> HeightRaster:
+        """The raster of a file.
+
+        ``geoid``: a grid of undulations, where the heights count from the geoid and not from the
+        WGS 84 ellipsoid. ``whole``: read once, for fill values that are not declared.
+
+        Raises InputError: no raster of one band, no place on a north-up grid, no coordinate system;
+        values that are no heights; declared orthometric heights without a geoid.
+        """
+        path = Path(path)
+        try:
+            with open_raster(path) as source:
+                transform, shape = source.transform, source.shape
+                system = system_of(source, path)
+                if system is None:
+                    raise InputError(
+                        "no coordinate system", file=path, remedy="set it by gdal_edit.py -a_srs"
+                    )
+                refuse_grid(source, path)
+                if quantity is not HEIGHT:
+                    system = LidarCRS(system.horizontal, ellipsoidal=True)
+                values = Values(source, path, quantity, system.height_unit_m)
+                if whole and quantity is HEIGHT:
+                    values.refuse_fills()
+        except RasterioError as error:
+            raise InputError(
+                f"no raster that can be read ({error})", file=path, remedy="give a GeoTIFF"
+            ) from None
+        ends = np.array([transform * (0, shape[0]), transform * (shape[1], 0)])
+        to_wgs84 = transformation(system, path, ends, geoid=geoid)
+        for note in to_wgs84.notes:
+            log.warning("%s: %s", path.name, note)
+        return cls(path, to_wgs84, transform, shape, quantity)
+
+    @cached_property
+    def _cell(self) -> Floats:
+        """Metres [2, 2] east and north (rows) of one column and one row (columns) in the middle."""
+        row, col = (n / 2 for n in self.shape)
+        half = BASE / 2 * np.array([[-1, 1, 0, 0], [0, 0, -1, 1]])
+        x, y = self.transform * (col + half[0], row + half[1])
+        lon, lat, _ = self.to_wgs84._exact(np.asarray(x), np.asarray(y), np.zeros(4))
+        if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
+            raise InputError(
+                f"its middle has no place on Earth in '{self.to_wgs84.system.name}'",
+                file=self.path,
+                remedy="correct its coordinate system (gdal_edit.py -a_srs)",
+            )
+        steps = np.array([turn(np.diff(lon)[::2]), np.diff(lat)[::2]]) / BASE
+        return steps * exact_metres_per_degree(float(lat.mean()), 0.0)[:, None]
+
+    @cached_property
+    def cell_m(self) -> tuple[float, float]:
+        """Size of a cell in metres on the ground (along columns, rows), in the raster's middle."""
+        dx, dy = map(float, np.hypot(*self._cell))
+        if (widest := max(self.shape[1] * dx, self.shape[0] * dy)) > WIDEST_M:
+            raise InputError(
+                f"{widest / 1000:.0f} km wide",
+                file=self.path,
+                remedy=f"cut it into parts of at most {WIDEST_M / 1000:.0f} km",
+            )
+        return dx, dy
+
+    @cached_property
+    def to_enu(self) -> Floats:
+        """[2, 2] that takes vectors of places (x, y) to metres east and north on the ground."""
+        return self._cell / self.cell_m * [1.0, -1.0]
+
+    def places(self, lon: Floats, lat: Floats) -> tuple[Floats, Floats]:
+        """(x, y) in metres of WGS 84 longitudes and latitudes, degrees [n]."""
+        return self.places_of(*self.to_wgs84.inverse(lon, lat))
+
+    def places_of(self, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+        """(x, y) in metres of coordinates in the raster's own system [n]."""
+        t, (dx, dy) = self.transform, self.cell_m
+        col = (np.asarray(east) - t.c) / t.a - 0.5
+        row = (np.asarray(north) - t.f) / t.e - 0.5
+        return col * dx, -row * dy
+
+    def coordinates(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """The inverse of :meth:`places_of`."""
+        t, (dx, dy) = self.transform, self.cell_m
+        return t.c + (np.asarray(x) / dx + 0.5) * t.a, t.f + (0.5 - np.asarray(y) / dy) * t.e
+
+    def bounds_wgs84(self, rows: slice, cols: slice) -> tuple[float, float, float, float]:
+        """West, south, east, north in degrees around a window; it may reach over the edges."""
+        west, north = self.transform * (cols.start, rows.start)
+        east, south = self.transform * (cols.stop, rows.stop)
+        box = self.to_wgs84.ground_boxes(np.array([[west, south]]), np.array([[east, north]]))
+        return tuple(map(float, box[0]))
+
+    def undulation(self, lon: Floats, lat: Floats) -> Floats | float:
+        """What an ellipsoidal height is above one of this raster, m."""
+        return self.to_wgs84.undulation(lon, lat)
+
+    def window(self, rows: slice, cols: slice) -> Heights:
+        """Heights in m of a window that may reach over the edges; NaN where there are none."""
+        out = np.full((rows.stop - rows.start, cols.stop - cols.start), np.nan, np.float32)
+        top, left = max(rows.start, 0), max(cols.start, 0)
+        bottom, right = min(rows.stop, self.shape[0]), min(cols.stop, self.shape[1])
+        if top >= bottom or left >= right:
+            return out
+        unit = self.to_wgs84.system.height_unit_m
+        with open_raster(self.path) as source:
+            window = RasterWindow(left, top, right - left, bottom - top)
+            values = Values(source, self.path, self.quantity, unit).read(window=window)
+        inside = slice(top - rows.start, bottom - rows.start)
+        out[inside, left - cols.start : right - cols.start] = unit * values
+        return out
+
+    def decimated(self, most: int) -> tuple[Floats, float]:
+        """Heights in m at ``most`` cells along the longer side, and how many cells are one."""
+        times = max(max(self.shape) / most, 1.0)
+        shape = tuple(max(2, round(side / times)) for side in self.shape)
+        unit = self.to_wgs84.system.height_unit_m
+        with open_raster(self.path) as source:
+            values = Values(source, self.path, self.quantity, unit).read(out_shape=shape)
+        return unit * values, times
+
+    def heights_at(self, lon: Floats, lat: Floats) -> Floats:
+        """Heights over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
+
+        Raises InputError for fill values around the places.
+        """
+        x, y = self.to_wgs84.inverse(lon, lat)
+        col, row = ~self.transform * (np.asarray(x), np.asarray(y))
+        found = np.full(len(col), np.nan)
+        unit = self.to_wgs84.system.height_unit_m
+        with open_raster(self.path) as source:
+            fills = Fills(Values(source, self.path, self.quantity, unit))
+            for k, (i, j) in enumerate(zip(row, col)):
+                if not (0 <= i <= self.shape[0] and 0 <= j <= self.shape[1]):
+                    continue
+                top, left = max(int(i) - AROUND, 0), max(int(j) - AROUND, 0)
+                size = (
+                    min(int(n) + AROUND + 1, side) - first
+                    for n, side, first in zip((j, i), self.shape[::-1], (left, top))
+                )
+                values = fills.add(*fills.values.raw(window=RasterWindow(left, top, *size)))
+                found[k] = unit * bilinear(values, j - 0.5 - left, i - 0.5 - top)
+            fills.refuse()
+        known = np.isfinite(found)
+        found[known] += self.undulation(np.asarray(lon)[known], np.asarray(lat)[known])
+        return found
+
+
+@dataclass(frozen=True)
+class Window:
+    """Heights of a part of a raster, and how they are taken at any place.
+
+    ``heights`` [h, w] begin with the cell ``first`` (row, column).
+    """
+
+    heights: Heights
+    first: tuple[int, int]
+    cell_m: tuple[float, float]
+
+    def cells(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """(column, row) in ``heights`` of places in m; whole numbers are centres of cells."""
+        col = np.asarray(x) / self.cell_m[0] - self.first[1]
+        return col, -np.asarray(y) / self.cell_m[1] - self.first[0]
+
+    def at(self, x: Floats, y: Floats) -> Floats:
+        """Heights at places, of any shape, bilinear; NaN where one of the four cells lacks."""
+        return bilinear(self.heights, *self.cells(x, y))

@@ -1,0 +1,325 @@
+"""Roofs of a twin: points that lie in planes, and the raster of planar patches made of them.
+
+Planes are grown from point to point by the points' neighbours (Rabbani et al. 2006, Segmentation
+of point clouds using smoothness constraint): whatever they come to is what the twin has.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from ..kernels import inlined, kernel
+from .patches import NOTHING, PATCH_M
+
+NEIGHBOURS = 10  # by which the plane of a point is told
+THIN_M = 0.4  # one point at most in a square of this side
+ROUGH_M = 0.12  # rms of the neighbours off their plane: less for a point that a plane begins with
+OFF_M = 0.18  # of a plane: a point so near belongs to it
+JOIN_M = 0.45  # what no plane took up joins the one beside it, so near
+TURN = math.cos(math.radians(28))  # of the normals within a plane
+STEEPEST = 2.0  # rise over run; what is steeper is a wall
+FEWEST = 10  # points of a plane
+VOTES = 14  # points that say what stands at a patch
+VOTE_M = 0.55  # how near they count
+REACH_M = 1.3
+PAINTED_M = 8.0  # from the nearest point: what is farther has no paint
+STRAIGHT_M = 0.6  # over which outlines are smoothed
+SMALLEST_M2 = 10.0  # of a building
+BUILDING_M2 = 400.0  # of one among others that it touches
+SEAM_M = 0.35  # planes that come so near each other meet in a ridge or a valley
+SEAM = 3  # patches to each side, among which such a plane is sought
+SIDE_M = 1.0  # over which the directions of sides are smoothed
+
+
+class Planes(NamedTuple):
+    """Of points: ``number`` int32[n], −1 for none. ``plane`` float64[m, 5]: middle x, y, z there,
+    slopes along x and y."""
+
+    number: np.ndarray
+    plane: np.ndarray
+
+
+class Raster(NamedTuple):
+    """What stands in each patch, [rows, cols], as in :class:`.surfaces.Surfaces`, and ``roof``
+    int32: the number of the plane, −1 for none."""
+
+    patches: np.ndarray
+    side: np.ndarray
+    paint: np.ndarray
+    roof: np.ndarray
+
+
+def thinned(xyz: np.ndarray, side_m: float = THIN_M) -> np.ndarray:
+    """Indices of the highest point in each square of a side, in order."""
+    if not len(xyz):
+        return np.zeros(0, np.int64)
+    i, j = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / side_m).astype(np.int64).T
+    cell = j * (i.max() + 1) + i
+    order = np.lexsort((-xyz[:, 2], cell))
+    return np.sort(order[np.diff(cell[order], prepend=-1) != 0])
+
+
+def local_planes(xyz: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Upward normal [n, 3] and rms (m) off the plane of the neighbours ``near`` [n, k]."""
+    normal, rough = np.empty((len(xyz), 3)), np.empty(len(xyz))
+    for first in range(0, len(xyz), 100_000):
+        part = slice(first, first + 100_000)
+        around = xyz[near[part]]
+        around = around - around.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+        up = vectors[:, :, 0]
+        normal[part] = up * np.where(up[:, 2:] < 0, -1.0, 1.0)
+        rough[part] = np.sqrt(np.maximum(values[:, 0], 0.0) / near.shape[1])
+    return normal, rough
+
+
+@inlined
+def _fit(sums, plane):
+    """Plane z = plane[2] + gx (x − plane[0]) + gy (y − plane[1]) of sums about an origin."""
+    n = sums[0]
+    mx, my, mz = sums[1] / n, sums[2] / n, sums[3] / n
+    xx, xy, yy = sums[4] / n - mx * mx, sums[5] / n - mx * my, sums[6] / n - my * my
+    xz, yz = sums[7] / n - mx * mz, sums[8] / n - my * mz
+    det = xx * yy - xy * xy
+    plane[0], plane[1], plane[2] = mx, my, mz
+    if det > 1e-3 * xx * yy and det > 1e-9:
+        plane[3], plane[4] = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
+
+
+@kernel
+def _grow(xyz, near, normal, rough, order, number, planes):
+    """Grow planes from the points in ``order``; returns how many there are."""
+    count = 0
+    queue = np.empty(len(xyz), np.int64)
+    sums, plane = np.zeros(9), np.zeros(5)
+    for seed in order:
+        if number[seed] >= 0 or rough[seed] > ROUGH_M or normal[seed, 2] < 0.4:
+            continue
+        ox, oy, oz = xyz[seed, 0], xyz[seed, 1], xyz[seed, 2]
+        plane[:3] = 0.0
+        plane[3] = -normal[seed, 0] / normal[seed, 2]
+        plane[4] = -normal[seed, 1] / normal[seed, 2]
+        sums[:] = 0.0
+        queue[0], size, at, refit = seed, 1, 0, 2 * FEWEST
+        number[seed] = count
+        while at < size:
+            p = queue[at]
+            at += 1
+            x, y, z = xyz[p, 0] - ox, xyz[p, 1] - oy, xyz[p, 2] - oz
+            sums[0] += 1
+            sums[1] += x
+            sums[2] += y
+            sums[3] += z
+            sums[4] += x * x
+            sums[5] += x * y
+            sums[6] += y * y
+            sums[7] += x * z
+            sums[8] += y * z
+            if at >= refit:
+                _fit(sums, plane)
+                refit = at + at // 2
+            scale = 1 / math.sqrt(1 + plane[3] ** 2 + plane[4] ** 2)
+            for k in range(near.shape[1]):
+                q = near[p, k]
+                if number[q] >= 0:
+                    continue
+                dx, dy = xyz[q, 0] - ox - plane[0], xyz[q, 1] - oy - plane[1]
+                off = xyz[q, 2] - oz - plane[2] - plane[3] * dx - plane[4] * dy
+                turn = normal[q, 2] - plane[3] * normal[q, 0] - plane[4] * normal[q, 1]
+                if abs(off) * scale < OFF_M and (turn * scale > TURN or rough[q] > ROUGH_M):
+                    number[q] = count
+                    queue[size] = q
+                    size += 1
+        _fit(sums, plane)
+        if size < FEWEST or plane[3] ** 2 + plane[4] ** 2 > STEEPEST**2:
+            for k in range(size):
+                number[queue[k]] = -1
+            continue
+        planes[count, 0], planes[count, 1], planes[count, 2] = (
+            plane[0] + ox,
+            plane[1] + oy,
+            plane[2] + oz,
+        )
+        planes[count, 3:] = plane[3:]
+        count += 1
+    return count
+
+
+@kernel
+def _join(xyz, near, number, planes, out):
+    """Give points without a plane the nearest one of their neighbours'; returns how many."""
+    joined = 0
+    for p in range(len(xyz)):
+        out[p] = number[p]
+        best = JOIN_M
+        if number[p] >= 0:
+            continue
+        for k in range(near.shape[1]):
+            m = number[near[p, k]]
+            if m < 0:
+                continue
+            off = abs(_height(planes[m], xyz[p, 0], xyz[p, 1]) - xyz[p, 2])
+            if off < best:
+                best = off
+                out[p] = m
+        joined += out[p] >= 0
+    return joined
+
+
+@inlined
+def _height(plane, x, y):
+    return plane[2] + plane[3] * (x - plane[0]) + plane[4] * (y - plane[1])
+
+
+def planes_of(xyz: np.ndarray) -> Planes:
+    """The planes that points [n, 3] of roofs lie in."""
+    if len(xyz) <= NEIGHBOURS:
+        return Planes(np.full(len(xyz), -1, np.int32), np.zeros((0, 5)))
+    near = cKDTree(xyz).query(xyz, NEIGHBOURS)[1]
+    normal, rough = local_planes(xyz, near)
+    number = np.full(len(xyz), -1, np.int32)
+    planes = np.zeros((len(xyz), 5))
+    order = np.argsort(rough, kind="stable")
+    count = _grow(xyz, near, normal, rough, order, number, planes)
+    while True:
+        joined = np.empty_like(number)
+        if not _join(xyz, near, number, planes, joined):
+            return Planes(number, planes[:count].copy())
+        number = joined
+
+
+@kernel
+def _vote(number, tint, near, away, roof, paint):
+    """The plane that stands in each patch, −1 for none, and its paint.
+
+    By the votes, falling with distance, of the ``near`` [rows, cols, k] points, ``away`` m from it,
+    that are of a plane or of the ground. The paint is that of the points that have won.
+    """
+    for j in range(roof.shape[0]):
+        for i in range(roof.shape[1]):
+            best, most = -1, 0.0
+            for k in range(near.shape[2]):
+                if away[j, i, k] > REACH_M:
+                    break
+                m, votes = number[near[j, i, k]], 0.0
+                for n in range(near.shape[2]):
+                    if number[near[j, i, n]] == m and away[j, i, n] <= REACH_M:
+                        votes += math.exp(-((away[j, i, n] / VOTE_M) ** 2))
+                if votes > most + 1e-12:
+                    best, most = m, votes
+            light = weight = 0.0
+            for k in range(near.shape[2]):
+                if number[near[j, i, k]] == best or away[j, i, 0] > REACH_M:
+                    w = 1 / (0.04 + away[j, i, k] ** 2)
+                    light += w * tint[near[j, i, k]]
+                    weight += w
+            paint[j, i] = light / weight if away[j, i, 0] < PAINTED_M else 0.0
+            roof[j, i] = best
+
+
+@kernel
+def _raise(roof, planes, x0, y0, patches):
+    """The planes of patches: of two that meet, the lower at a ridge, the higher in a valley."""
+    rows, cols = roof.shape
+    for j in range(rows):
+        for i in range(cols):
+            own = roof[j, i]
+            if own < 0:
+                continue
+            x, y = x0 + PATCH_M * (i + 0.5), y0 + PATCH_M * (j + 0.5)
+            chosen, z = own, _height(planes[own], x, y)
+            for n in range(max(j - SEAM, 0), min(j + SEAM + 1, rows)):
+                for k in range(max(i - SEAM, 0), min(i + SEAM + 1, cols)):
+                    m = roof[n, k]
+                    if m < 0 or m in (own, chosen):
+                        continue
+                    other = _height(planes[m], x, y)
+                    if other == z or abs(other - z) > SEAM_M:
+                        continue
+                    is_ridge = _height(planes[m], planes[own, 0], planes[own, 1]) > planes[own, 2]
+                    if (other < z) == is_ridge:
+                        chosen, z = m, other
+            patches[j, i, 0] = z
+            patches[j, i, 1], patches[j, i, 2] = planes[chosen, 3], planes[chosen, 4]
+
+
+def _straightened(roof: np.ndarray) -> np.ndarray:
+    """The planes of patches where outlines are smooth and nothing small stands alone."""
+    solid = ndimage.gaussian_filter((roof >= 0).astype(np.float32), STRAIGHT_M / PATCH_M) > 0.5
+    part, _ = ndimage.label(solid)
+    solid &= np.bincount(part.ravel())[part] * PATCH_M**2 >= SMALLEST_M2
+    if not solid.any():
+        return np.full_like(roof, -1)
+    at = ndimage.distance_transform_edt(roof < 0, return_distances=False, return_indices=True)
+    return np.where(solid, roof[tuple(at)], -1).astype(np.int32)
+
+
+def rasterised(
+    found: Planes,
+    roofs: np.ndarray,
+    ground: np.ndarray,
+    tint: tuple[np.ndarray, np.ndarray],
+    origin: tuple[float, float],
+    shape: tuple[int, int],
+) -> Raster:
+    """The raster of roofs and paint from an ``origin`` (x, y) on.
+
+    ``roofs``, ``ground`` [n, 3]: points; ``tint``: reflectance of both. ``found``: the planes of
+    the roofs' points.
+    """
+    use = found.number >= 0
+    xyz = np.concatenate([roofs[use], ground])
+    number = np.concatenate([found.number[use], np.full(len(ground), -1, np.int32)])
+    light = np.concatenate([tint[0][use], tint[1]]).astype(np.float32)
+    tree = cKDTree(xyz[:, :2])
+    patches = np.zeros((*shape, 3), np.float32)
+    patches[..., 0] = NOTHING
+    roof, paint = np.full(shape, -1, np.int32), np.zeros(shape, np.float32)
+    x = origin[0] + PATCH_M * (np.arange(shape[1]) + 0.5)
+    k = min(VOTES, len(xyz))
+    for first in range(0, shape[0], 64):
+        rows = slice(first, min(first + 64, shape[0]))
+        y = origin[1] + PATCH_M * (np.arange(rows.start, rows.stop) + 0.5)
+        at = np.stack(np.meshgrid(x, y), axis=-1)
+        away, near = (v.reshape(*at.shape[:2], k) for v in tree.query(at, k))
+        _vote(number, light, near, away, roof[rows], paint[rows])
+    roof = _straightened(roof)
+    _raise(roof, found.plane, *origin, patches)
+    return Raster(patches, _sides(patches[..., 0]), paint, roof)
+
+
+def buildings_of(roof: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The building that each patch of a raster of planes is part of, −1 for none.
+
+    Roofs that touch each other are one, or several of about BUILDING_M2, parted halfway between
+    places that are drawn.
+    """
+    part, count = ndimage.label(roof >= 0)
+    j, i = np.nonzero(part)
+    of = part[j, i]
+    size = np.bincount(of, minlength=count + 1)
+    several = np.maximum(np.rint(size * PATCH_M**2 / BUILDING_M2), 1).astype(int)
+    order = np.argsort(of, kind="stable")
+    ends = np.cumsum(size)
+    building, first = np.full(roof.shape, -1, np.int32), 0
+    for k in range(1, count + 1):
+        inside = order[ends[k - 1] : ends[k]]
+        at = np.column_stack([i[inside], j[inside]])
+        seeds = at[rng.integers(len(at), size=several[k])]
+        building[j[inside], i[inside]] = first + cKDTree(seeds).query(at)[1]
+        first += several[k]
+    return building
+
+
+def _sides(z: np.ndarray) -> np.ndarray:
+    """Direction in which the side of each patch looks, uint8 in 256 parts of a turn: downhill."""
+    standing = z > NOTHING
+    level = np.where(standing, z, z[standing].min() - 3.0 if standing.any() else 0.0)
+    smooth = ndimage.gaussian_filter(level.astype(np.float64), SIDE_M / PATCH_M, mode="nearest")
+    down_y, down_x = (-d for d in np.gradient(smooth))
+    return np.rint(np.arctan2(down_y, down_x) * (128 / math.pi)).astype(np.int64).astype(np.uint8)

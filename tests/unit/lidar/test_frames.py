@@ -1,0 +1,303 @@
+"""Frames and epochs against PROJ's pipelines, written out from the parameters of EPSG's register.
+
+The judge shares no table with the package: rates and epochs stand here as the operations have them.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from pyproj import CRS
+from rasterio.transform import from_origin
+
+from stereotruth.errors import InputError
+from stereotruth.lidar.frames import DEFAULT_EPOCH, Epoch, Epochs, frame_change, is_known
+from stereotruth.lidar.geokeys import epoch_of_tiff
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.plate_motion import moved, plate_at, speed
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.raster_points import raster_header
+from stereotruth.lidar.to_wgs84 import to_wgs84
+
+from ...synthetic.las import everything, header_of, write_gtx, write_las
+
+# x, y, z (m), rx, ry, rz ("), s (ppm), their rates a year, and the epoch of the parameters.
+NAD83 = (  # EPSG:10334, ITRF2020 to NAD83(2011); EPSG:10415, to NAD83(CSRS)v8, is the same
+    "+inv +proj=helmert +x=1.0039 +y=-1.90961 +z=-0.54117 +rx=0.02678138 +ry=-0.00042027 "
+    "+rz=0.01093206 +s=-5.109e-05 +dx=0.00079 +dy=-0.0007 +dz=-0.00124 +drx=6.667e-05 "
+    "+dry=-0.00075744 +drz=-5.133e-05 +ds=-7.201e-05 +t_epoch=2010 +convention=coordinate_frame"
+)
+GDA2020 = (  # EPSG:8049, ITRF2014 to GDA2020; EPSG:9991, ITRF2014 to ITRF2020
+    "+inv +proj=helmert +drx=0.00150379 +dry=0.00118346 +drz=0.00120716 +t_epoch=2020 "
+    "+convention=coordinate_frame +step +proj=helmert +x=0.0014 +y=0.0009 +z=-0.0014 +s=0.00042 "
+    "+dy=0.0001 +dz=-0.0002 +t_epoch=2015 +convention=position_vector"
+)
+ETRF2020 = (  # EPSG:10573
+    "+inv +proj=helmert +rx=0.002236 +ry=0.013494 +rz=-0.019578 +drx=8.6e-05 +dry=0.000519 "
+    "+drz=-0.000753 +t_epoch=2015 +convention=position_vector"
+)
+ETRF2000 = (  # EPSG:10586
+    "+inv +proj=helmert +x=0.0538 +y=0.0518 +z=-0.0822 +rx=0.002106 +ry=0.01274 +rz=-0.020592 "
+    "+s=0.00225 +dx=0.0001 +dz=-0.0017 +drx=8.1e-05 +dry=0.00049 +drz=-0.000792 +ds=0.00011 "
+    "+t_epoch=2015 +convention=position_vector"
+)
+# EPSG:9996, ITRF96 to ITRF2020, its parameters brought to 2000.0: x - 15 dx and so on.
+ITRF96_AT_2000 = (
+    "+proj=helmert +x=-0.005 +y=-0.0051 +z=0.0314 +rz=-0.00006 +s=-0.00218 "
+    "+convention=position_vector"
+)
+PLATES = {  # file ITRF2020 of PROJ: plate motion model of Altamimi et al. (2023)
+    "AUST": "+drx=0.001487 +dry=0.001175 +drz=0.001223",
+    "PCFC": "+drx=-0.000404 +dry=0.001021 +drz=-0.002154",
+    "NOAM": "+drx=0.000045 +dry=-0.000666 +drz=-0.000098",
+    "EURA": "+drx=-0.000085 +dry=-0.000519 +drz=0.000753",
+}
+BIAS = "+dx=0.00037 +dy=0.00035 +dz=0.00074"
+
+
+def plate(name: str, since: float, bias: str = BIAS) -> str:
+    return f"+proj=helmert {bias} {PLATES[name]} +t_epoch={since} +convention=position_vector"
+
+
+def by_proj(steps: str, lon: float, lat: float, height: float, epoch: float) -> np.ndarray:
+    """Longitude, latitude, height by geocentric steps of PROJ at an epoch."""
+    pipeline = (
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart "
+        f"+ellps=GRS80 +step {steps} +step +inv +proj=cart +ellps=GRS80 "
+        "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    return np.array(pyproj.Transformer.from_pipeline(pipeline).transform(lon, lat, height, epoch))[
+        :3
+    ]
+
+
+def metres(found: np.ndarray, judge: np.ndarray) -> np.ndarray:
+    """East, north and up of ``found`` less ``judge``."""
+    east, north, up = np.subtract(found, judge)
+    return np.array([east * 111320 * np.cos(np.radians(judge[1])), north * 111200, up])
+
+
+def placed(code: int, lon: float, lat: float, height: float, epochs: Epochs, **how) -> np.ndarray:
+    """A place of the horizontal system ``code``, on its own datum, as a LAS file has it."""
+    return through(CRS.from_epsg(code).to_wkt(), code, lon, lat, height, epochs, **how)
+
+
+def through(
+    wkt: str, code: int, lon: float, lat: float, height: float, epochs: Epochs | None, **how
+) -> np.ndarray:
+    system = CRS.from_epsg(code)
+    x, y = pyproj.Transformer.from_crs(
+        system.geodetic_crs.to_2d(), system.to_2d(), always_xy=True
+    ).transform(lon, lat)
+    header = header_of(wkt, low=(x - 50, y - 50, height - 50))
+    transform = to_wgs84(header, "a.las", epochs=epochs, **how)
+    return np.array([v[0] for v in transform(*(np.array([v]) for v in (x, y, height)))])
+
+
+def at(year: float) -> Epochs:
+    return Epochs(Epoch(year, "the test"))
+
+
+# ------------------------------------------------------------------ national frames
+
+NEW_ZEALAND = [f"{ITRF96_AT_2000} +step {plate(name, 2000)}" for name in ("AUST", "PCFC")]
+COUNTRIES = [  # system, place, epoch of the images, PROJ's steps, metres in plan and up
+    ("Jacksonville", 6346, (-81.66, 30.33), 2020.0, NAD83, (0.95, -1.48)),
+    ("Seattle", 6339, (-122.3, 47.6), 2020.0, NAD83, (1.51, -0.32)),
+    ("Vancouver", 3157, (-123.1, 49.25), 2023.4, NAD83, None),  # NAD83(CSRS) without a version
+    ("Toronto", 22817, (-79.4, 43.7), 2018.0, NAD83, None),  # NAD83(CSRS)v8
+    ("Florida, NAD83", 26917, (-81.66, 30.33), 2020.0, NAD83, None),
+    ("Sydney", 7856, (151.2, -33.9), 2026.0, GDA2020, (0.34, 0.0)),
+    ("Paris, ETRS89", 25831, (2.35, 48.85), 2020.0, ETRF2020, (0.74, 0.0)),
+    ("Paris, RGF93 v1", 2154, (2.35, 48.85), 2020.0, ETRF2020, (0.74, 0.0)),
+    ("Paris, RGF93 v2b", 9794, (2.35, 48.85), 2020.0, ETRF2000, None),
+    ("Auckland", 2193, (174.8, -36.9), 2020.0, NEW_ZEALAND[0], None),
+    ("Dunedin", 2193, (170.5, -45.9), 2021.5, NEW_ZEALAND[1], None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "code", "place", "year", "steps", "size"), COUNTRIES)
+def test_national_frames_reach_itrf2020(name, code, place, year, steps, size) -> None:
+    judge = by_proj(steps, *place, 30.0, year)
+    if "+t_epoch=2000" in steps:  # the model's advice: no vertical motion
+        judge[2] = by_proj(steps.replace(BIAS, ""), *place, 30.0, year)[2]
+    found = placed(code, *place, 30.0, at(year))
+    assert np.abs(metres(found, judge)).max() < 1e-3
+    change = metres(found, np.array([*place, 30.0]))
+    assert 0.2 < np.hypot(*change[:2]) < 2.0
+    if size is not None:
+        assert (np.hypot(*change[:2]), change[2]) == pytest.approx(size, abs=0.006)
+
+
+@pytest.mark.parametrize("form", ["WKT1_GDAL", "WKT1_ESRI", "TOWGS84"])
+@pytest.mark.parametrize(
+    ("code", "place"),
+    [(6346, (-81.66, 30.33)), (7856, (151.2, -33.9)), (25831, (2.3, 48.8)), (2193, (174.8, -36.9))],
+)
+def test_frames_are_known_by_their_names_alone(code, place, form) -> None:
+    wkt = CRS.from_epsg(code).to_wkt("WKT1_GDAL" if form == "TOWGS84" else form)
+    wkt = re.sub(r',\s*AUTHORITY\["[^\]]*\]', "", wkt)
+    if form == "TOWGS84":
+        wkt = re.sub(r"(SPHEROID\[[^\]]*\])", r"\1,TOWGS84[0,0,0,0,0,0,0]", wkt)
+    found = through(wkt, code, *place, 30.0, at(2024.0))
+    judge = placed(code, *place, 30.0, at(2024.0))
+    assert np.abs(metres(found, judge)).max() < 1e-4
+
+
+def test_a_geoid_counts_from_the_frame_of_the_file(tmp_path) -> None:
+    """GEOID18 is above NAD83(2011): H + N first, then the frame; EGM grids are above ITRF."""
+    place, height = (-81.66, 30.33), 12.0
+    values = np.full((31, 31), -28.0)
+    for name, expected in (("g2018.gtx", NAD83), ("egm2008.gtx", None)):
+        geoid = write_gtx(tmp_path / name, values, -83.0, 29.0, 0.1)
+        found = placed(6346, *place, height, at(2020.0), geoid=geoid)
+        up = by_proj(NAD83, *place, height - 28, 2020.0)[2] if expected else height - 28
+        assert found[2] == pytest.approx(up, abs=1e-3)
+
+
+# ------------------------------------------------------------------ WGS 84 and dynamic frames
+
+
+def test_wgs84_without_a_frame_is_taken_as_it_is() -> None:
+    wkt = CRS.from_epsg(32650).to_wkt()
+    before = through(wkt, 32650, 117.0, 31.0, 50.0, None)
+    np.testing.assert_array_equal(before, through(wkt, 32650, 117.0, 31.0, 50.0, at(2020.0)))
+    header = header_of(wkt)
+    record = to_wgs84(header, "a.las", epochs=at(2020.8)).describe()["frame"]
+    assert (record["frame"], record["epoch"]) == ("ITRF2020", 2020.8)
+    assert record["source"]["epoch"] == 2020.8
+    assert "WGS 84" in record["source"]["frame"]
+
+
+def test_a_stated_epoch_is_taken_in_wgs84_and_dynamic_frames() -> None:
+    place = (151.2, -33.9)
+    judge = by_proj(plate("AUST", 2010.25), *place, 30.0, 2020.0)
+    judge[2] = by_proj(plate("AUST", 2010.25, bias=""), *place, 30.0, 2020.0)[2]
+    epochs = at(2020.0)._replace(own=2010.25)
+    assert np.abs(metres(placed(32756, *place, 30.0, epochs), judge)).max() < 1e-3
+    wkt = CRS.from_epsg(9000).to_wkt()  # ITRF2014
+    with pytest.raises(InputError, match=r"a\.las.*ITRF2014 move by 57 mm.*lidar_epoch"):
+        through(wkt, 9000, *place, 30.0, at(2020.0))
+    by_column = through(wkt, 9000, *place, 30.0, epochs)
+    to_2020 = GDA2020.split("+step ")[1]
+    steps = to_2020.replace("+dy=0.0001 +dz=-0.0002 +t_epoch=2015", "")
+    steps = steps.replace("+y=0.0009 +z=-0.0014", "+y=0.000425 +z=-0.00045")  # at 2010.25
+    judge = by_proj(f"{steps} +step {plate('AUST', 2010.25)}", *place, 30.0, 2020.0)
+    steps += f" +step {plate('AUST', 2010.25, bias='')}"
+    judge[2] = by_proj(steps, *place, 30.0, 2020.0)[2]
+    assert np.abs(metres(by_column, judge)).max() < 1e-3
+    stated = f"COORDINATEMETADATA[{wkt}, EPOCH[2010.25]]"
+    by_file = through(stated, 9000, *place, 30.0, at(2020.0)._replace(own=2016.0))
+    np.testing.assert_array_equal(by_file, by_column)
+
+
+def test_the_geokey_of_the_epoch_is_read() -> None:
+    keys = [(1024, 0, 1, 2), (2048, 0, 1, 9000), (5120, 34736, 1, 0)]
+    header = header_of("", keys, low=(151.1, -34.0, 0), wkt_bit=False)
+    header.maxs = header.mins + np.array([0.2, 0.2, 100])
+    header.vlrs.append(laspy.VLR("LASF_Projection", 34736, "", np.float64(2010.25).tobytes()))
+    record = to_wgs84(header, "a.las", epochs=at(2020.0)).frame
+    assert record["source"]["epoch"] == 2010.25
+
+
+@pytest.mark.parametrize("bigtiff", ["NO", "YES"])
+def test_the_epoch_of_a_geotiff_is_read(tmp_path, bigtiff) -> None:
+    """rasterio neither reads nor writes it: a key that GDAL can do without is made one."""
+    file = tmp_path / "a.tif"
+    with rasterio.open(
+        file, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32", crs="EPSG:9000",
+        transform=from_origin(151.2, -33.9, 1e-5, 1e-5), BIGTIFF=bigtiff,
+    ) as raster:  # fmt: skip
+        raster.write(np.full((1, 40, 40), 20, np.float32))
+    assert epoch_of_tiff(file) is None
+    data = file.read_bytes()
+    before = struct.pack("<3H", 2057, 34736, 1)  # semi-major axis
+    assert before in data
+    data = data.replace(before, struct.pack("<3H", 5120, 34736, 1))
+    file.write_bytes(data.replace(struct.pack("<d", 6378137.0), struct.pack("<d", 2010.25)))
+    assert epoch_of_tiff(file) == 2010.25
+    record = to_wgs84(raster_header(file), file, epochs=at(2020.0)).frame
+    assert record["source"]["epoch"] == 2010.25
+
+
+def test_the_date_that_nothing_tells_is_said() -> None:
+    change = frame_change(CRS.from_epsg(6318), (-81.66, 30.33), DEFAULT_EPOCH)
+    assert "taken as 2020" in change.notes[0] and "13 mm a year" in change.notes[0]
+    assert not frame_change(CRS.from_epsg(6318), (-81.66, 30.33), Epoch(2020.0, "a sheet")).notes
+
+
+@pytest.mark.parametrize("code", [4326, 4149, 4214, 6668])  # WGS 84, CH1903, Beijing 1954, JGD2011
+def test_other_frames_are_left_to_proj(code) -> None:
+    assert not is_known(CRS.from_epsg(code))
+
+
+def test_a_frame_is_known_without_an_area_of_use() -> None:
+    plain = CRS.from_wkt(CRS.from_epsg(6339).to_wkt("WKT1_GDAL"))
+    assert is_known(plain.geodetic_crs)
+
+
+# ------------------------------------------------------------------ plates
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "place", "within"),
+    [
+        ("EURA", ETRF2020, (10.0, 50.0), 0.010),  # the bias of the origin, 0.9 mm a year
+        ("AUST", GDA2020, (135.0, -25.0), 0.015),
+        ("NOAM", NAD83, (-95.0, 40.0), 0.030),  # NUVEL-1A, of 1994
+    ],
+)
+def test_plates_move_as_proj_moves_the_frames_that_are_fixed_to_them(
+    name, steps, place, within
+) -> None:
+    assert plate_at(*place) == name
+    first, last = (by_proj(steps, *place, 0.0, year) for year in (2012.0, 2022.0))
+    found = np.array(moved(*(np.array([v]) for v in first), name, 10.0))[:, 0]
+    assert np.hypot(*metres(found, last)[:2]) < within
+    assert (
+        0.1
+        < np.hypot(*metres(last, first)[:2])
+        == pytest.approx(10 * speed(*place, name), abs=within)
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [((174.8, -41.3), "AUST"), ((170.97, -42.72), "AUST"), ((172.6, -43.5), "PCFC"),
+     ((-176.5, -44.0), "PCFC"), ((-157.9, 21.3), "PCFC"), ((-118.2, 34.0), "PCFC"),
+     ((-122.3, 47.6), "NOAM"), ((-51.7, 64.2), "NOAM"), ((-9.1, 38.7), "EURA"),
+     ((114.3, 30.6), "EURA"), ((127.0, 37.6), "AMUR"), ((55.3, 25.2), "ARAB"),
+     ((77.2, 28.6), "INDI"), ((-46.6, -23.5), "SOAM"), ((28.0, -26.2), "NUBI"),
+     ((55.5, -21.1), "SOMA"), ((139.7, 35.7), None), ((29.0, 40.0), None)],
+)  # fmt: skip
+def test_plates_of_places(place, name) -> None:
+    assert plate_at(*place) == name
+    assert plate_at(place[0] + 360.0, place[1]) == name
+
+
+# ------------------------------------------------------------------ a file
+
+
+def test_ingest_brings_points_to_the_epoch_of_the_images(tmp_path) -> None:
+    system = CRS.from_epsg(6339).to_3d()  # NAD83(2011) / UTM 10N
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([550_000 + rng.uniform(0, 300, 40), 5_272_000 + rng.uniform(0, 300, 40),
+                           rng.normal(50, 9, 40)])  # fmt: skip
+    xyz = write_las(tmp_path / "a.las", system=system, xyz=xyz)
+    summary = ingest(tmp_path / "a.las", tmp_path / "a.points", epochs=at(2014.82))
+    own = pyproj.Transformer.from_crs(system, "EPSG:6319", always_xy=True).transform(*xyz.T)
+    judge = np.array([by_proj(NAD83, *point, 2014.82) for point in np.transpose(own)])
+    points = everything(PointStore(tmp_path / "a.points"))
+    found = np.column_stack([points.lon, points.lat, points.height])
+    order, theirs = np.argsort(found[:, 0]), np.argsort(judge[:, 0])
+    np.testing.assert_allclose(found[order, :2], judge[theirs, :2], rtol=0, atol=1.5e-9)
+    np.testing.assert_allclose(found[order, 2], judge[theirs, 2], rtol=0, atol=1.5e-4)
+    frame = summary["crs"]["frame"]
+    assert (frame["frame"], frame["epoch"], frame["by"]) == ("ITRF2020", 2014.82, "the test")
+    assert "NAD83(2011)" in frame["source"]["frame"] and frame["source"]["epoch"] is None

@@ -1,0 +1,375 @@
+"""One door: what a height, a place and a value mean is read in one way wherever it enters.
+
+A kind is a raster of one truth, written in one of the ways that the world writes rasters: in feet,
+tenths, another projection, without a nodata value … Each door takes each kind: either as the truth,
+or it refuses the file by name with a remedy. Nothing is taken otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine
+
+from stereotruth.alignment.control_points import read_gcps
+from stereotruth.command.import_gcps import import_gcps
+from stereotruth.errors import InputError
+from stereotruth.evaluation.surface_models import score
+from stereotruth.evaluation.surface_models.reference import RasterReference
+from stereotruth.evaluation.surface_models.score import score_surface_model
+from stereotruth.lidar.geoid import GeoidGrid
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import PointStore
+
+from ..synthetic.analytic_town import EPSG, NORTH, SIDE, WEST, Town, write
+from ..synthetic.las import FT, US_FT, everything, write_gtx
+
+TOWN, CELL = Town(), 0.5
+EAST_M, NORTH_M, UP_M = 2.0, -1.0, 0.5  # of the models that are scored
+N_M = 11.0  # of the geoid
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A way to write heights. ``right``: what doors make of it, or words of the refusal.
+
+    ``crs`` of the grid (EPSG code) and what the file says (``declared``); ``unit`` in metres,
+    ``scale``, ``offset`` of the band; ``fill``: stored value of a twentieth of the cells, in
+    blocks; ``geoid``: the heights count from it; ``given``: its grid is named.
+    """
+
+    name: str
+    right: str = ""
+    crs: int = EPSG
+    declared: str = ""
+    unit: float = 1.0
+    scale: float = 1.0
+    offset: float = 0.0
+    dtype: str = "float32"
+    fill: float | None = None
+    nodata: float | None = None
+    geoid: bool = False
+    given: bool = False
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+FILLS = [
+    Kind(f"fill {value:g}{' scaled' * (scale != 1)}, undeclared", "which", fill=value, scale=scale,
+         dtype="int16" if scale != 1 or value == -32768 else "float32")
+    for value, scale in ((-9999, 1), (-32768, 1), (-32767, 1), (0, 1), (1e20, 1), (3.4e38, 1),
+                         (-999, 1), (-32768, 0.1), (-9999, 0.01), (0, 0.1), (-32767, 0.01))
+]  # fmt: skip
+KINDS = [
+    Kind("plain"),
+    Kind("degrees", crs=4326),
+    Kind("Web Mercator", crs=3857),
+    Kind("turned against north by its projection", crs=32649),
+    Kind("band in feet", unit=FT, more={"units": "ft"}),
+    Kind("band in US survey feet", unit=US_FT, more={"units": "US survey foot"}),
+    Kind("band in decimetres", unit=0.1, more={"units": "dm"}),
+    Kind("band in centimetres", unit=0.01, more={"units": "cm"}, dtype="int32"),
+    Kind("band in fathoms", "fathom", unit=1.8288, more={"units": "fathom"}),
+    Kind("system in US survey feet", unit=US_FT, declared="feet"),
+    Kind("tenths", scale=0.1, dtype="int16", fill=-32768, nodata=-32768),
+    Kind("offset", scale=0.01, offset=40.0, dtype="uint16", fill=65535, nodata=65535),
+    Kind("NaN fill", fill=np.nan),
+    Kind("declared fill", fill=-9999, nodata=-9999),
+    Kind("declared fill of 0", fill=0, nodata=0),
+    Kind("mask", fill=-9999, more={"mask": True}),
+    Kind("alpha", fill=-9999, more={"alpha": True}),
+    *FILLS,
+    Kind("fill 0 beside a declared one", "of 0, which", fill=0, nodata=-9999),
+    Kind("above EGM96", "EGM96", declared=f"EPSG:{EPSG}+5773", geoid=True),
+    Kind("above EGM96, its grid given", declared=f"EPSG:{EPSG}+5773", geoid=True, given=True),
+    Kind("above a geoid in feet", declared=f"EPSG:{EPSG}+6360", geoid=True, given=True, unit=US_FT),
+    Kind("above an undeclared geoid, its grid given", geoid=True, given=True),
+    Kind("declared ellipsoidal, a grid given", declared="3-D", given=True),
+    Kind("depths", "point down", declared=f"EPSG:{EPSG}+5715", geoid=True, given=True),
+    Kind("two units", "counts heights in", declared=f"EPSG:{EPSG}+5773", geoid=True, given=True,
+         unit=FT, more={"units": "ft"}),
+    Kind("RGB", "3 bands of uint8", more={"bands": 3}, dtype="uint8"),
+    Kind("two bands", "2 bands", more={"bands": 2}),
+    Kind("complex", "complex", dtype="complex64"),
+    Kind("turned grid", "north", more={"turned": True}),
+    Kind("south up", "north", more={"south_up": True}),
+    Kind("points, not areas", more={"point": True}),
+]  # fmt: skip
+
+
+def declared_of(kind: Kind) -> pyproj.CRS:
+    """The system that the file declares."""
+    plain = pyproj.CRS(kind.crs)
+    if kind.declared == "feet":
+        text = plain.to_wkt("WKT1_GDAL").replace(
+            'UNIT["metre",1', f'UNIT["US survey foot",{US_FT!r}'
+        )
+        text = text.replace('AUTHORITY["EPSG","9001"]', 'AUTHORITY["EPSG","9003"]')
+        return pyproj.CRS(
+            text.replace(',AUTHORITY["EPSG","32650"]', "").replace("500000", str(5e5 / US_FT))
+        )
+    if kind.declared == "3-D":
+        return plain.to_3d()
+    return pyproj.CRS(kind.declared) if kind.declared else plain
+
+
+def truth(east: np.ndarray, north: np.ndarray, moved: bool) -> np.ndarray:
+    """Ellipsoidal heights of the town at UTM coordinates; NaN outside of it.
+
+    ``moved``: of the model, by metres on the ground, which are 1 / 0.9996 of UTM's.
+    """
+    e, n, up = (EAST_M * 0.9996, NORTH_M * 0.9996, UP_M) if moved else (0.0, 0.0, 0.0)
+    x, y = east - WEST, NORTH - north
+    heights = TOWN.surface(x - e, y + n)[0] + up
+    return np.where((x >= 0) & (y >= 0) & (x <= SIDE) & (y <= SIDE), heights, np.nan)
+
+
+def write_kind(kind: Kind, path: Path, moved: bool) -> Path:
+    """The town's heights as a kind of raster; cells of about half a metre."""
+    system, to_kind = declared_of(kind), pyproj.Transformer.from_crs(EPSG, kind.crs, always_xy=True)
+    west, south, east, north = to_kind.transform_bounds(WEST, NORTH - SIDE, WEST + SIDE, NORTH)
+    n = round(SIDE / CELL)
+    dx, dy = (east - west) / n, (north - south) / n
+    at = Affine(dx, 0, west, 0, -dy, north)
+    if kind.more.get("turned"):
+        at = at * Affine.rotation(10.0)
+    if kind.more.get("south_up"):
+        at = Affine(dx, 0, west, 0, dy, south)
+    col, row = np.meshgrid(np.arange(n) + 0.5, np.arange(n) + 0.5)
+    x, y = at * (col, row)
+    place = to_kind.transform(x, y, direction="INVERSE")
+    heights = truth(*map(np.asarray, place), moved) - N_M * kind.geoid
+    missing = np.isnan(heights)
+    if kind.fill is not None:
+        blocks = np.random.default_rng(3).random((n // 8 + 1, n // 8 + 1)) < 0.05
+        missing |= np.kron(blocks, np.ones((8, 8), bool))[:n, :n]
+    stored = (np.where(missing, 50.0, heights) / kind.unit - kind.offset) / kind.scale
+    dtype = np.dtype(kind.dtype)
+    if dtype.kind in "iu":
+        stored = np.clip(np.rint(stored), np.iinfo(dtype).min, np.iinfo(dtype).max)
+    fill = np.nan if kind.fill is None else kind.fill
+    if dtype.kind == "f" or kind.fill is not None:
+        stored = np.where(missing, fill, stored)
+    if kind.declared == "feet":
+        at = Affine.scale(1 / US_FT) * at
+    bands = kind.more.get("bands", 1) + bool(kind.more.get("alpha"))
+    options = {"driver": "GTiff", "width": n, "height": n, "count": bands, "dtype": dtype}
+    if kind.more.get("point"):
+        options["AREA_OR_POINT"] = "Point"
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+        rasterio.open(
+            path, "w", crs=system.to_wkt(), transform=at, nodata=kind.nodata, **options
+        ) as raster,
+    ):
+        raster.units = (kind.more.get("units", ""),) * bands
+        raster.scales, raster.offsets = (kind.scale,) * bands, (kind.offset,) * bands
+        for band in range(1, bands + 1):
+            raster.write(stored.astype(dtype), band)
+        if kind.more.get("alpha"):
+            raster.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
+            raster.write((~missing * 255).astype(dtype), 2)
+        if kind.more.get("mask"):
+            raster.write_mask(~missing)
+        if kind.more.get("point"):
+            raster.update_tags(AREA_OR_POINT="Point")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("doors")
+    write_gtx(folder / "egm96.gtx", np.full((9, 9), N_M), 115.0, 28.0, 0.5)
+    return folder
+
+
+def door_lidar(file: Path, geoid: Path | None) -> None:
+    """Points of the store against the town."""
+    ingest(file, file.with_suffix(".points"), geoid=geoid)
+    points = everything(PointStore(file.with_suffix(".points")))
+    to_utm = pyproj.Transformer.from_crs(4326, EPSG, always_xy=True)
+    off = points.height - truth(*to_utm.transform(points.lon, points.lat), moved=False)
+    off = off[np.isfinite(off)]
+    assert points.height.size > 100_000 and off.size > 0.99 * points.height.size
+    assert np.median(np.abs(off)) < 0.03 and np.percentile(np.abs(off), 97) < 0.06
+
+
+def door_score(file: Path, geoid: Path | None) -> None:
+    """The shift of a model that was moved, on the ground."""
+    reference = RasterReference(write(file.with_name("truth.tif"), TOWN.heights()))
+    found = score_surface_model(file, reference, geoid=geoid).figures()
+    moved = found["registration"]
+    assert abs(moved["east_m"] - EAST_M) < 0.04 and abs(moved["north_m"] - NORTH_M) < 0.04
+    assert abs(moved["up_m"] - UP_M) < 0.02
+    assert found["cell_m"] == pytest.approx([0.5, 0.5], abs=0.03)
+    assert found["errors"]["off steps"]["mean_absolute_m"] < 0.05
+
+
+def door_reference(file: Path, geoid: Path | None) -> None:
+    """The same truth as a reference of a model that was moved."""
+    model = write_kind(Kind("model"), file.with_name("model.tif"), moved=True)
+    moved = score_surface_model(model, RasterReference(file, geoid)).figures()["registration"]
+    assert abs(moved["east_m"] - EAST_M) < 0.04 and abs(moved["north_m"] - NORTH_M) < 0.04
+    assert abs(moved["up_m"] - UP_M) < 0.02
+
+
+def door_heights(file: Path, geoid: Path | None) -> None:
+    """Heights of control points on hills off the roofs and the fills; none where there is none."""
+    x, y = np.meshgrid(np.linspace(9, SIDE - 9, 9), np.linspace(9, SIDE - 9, 9))
+    heights = truth(WEST + x.ravel(), NORTH - y.ravel(), moved=False)
+    flat = np.abs(heights - 50) < 2
+    x, y, heights = x.ravel()[flat], y.ravel()[flat], heights[flat]
+    lon, lat = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True).transform(
+        WEST + x, NORTH - y
+    )
+    lines = ["id,lon,lat,height,left_col,left_row,right_col,right_row"]
+    points, out = file.with_suffix(".csv"), file.with_suffix(".out.csv")
+    known = []
+    for k, (east, north) in enumerate(zip(lon, lat)):
+        lines.append(f"P{k:02d},{east:.10f},{north:.10f},,{k},1,{k},2")
+        points.write_text("\n".join([lines[0], lines[-1]]))
+        out.unlink(missing_ok=True)
+        try:
+            import_gcps([points], out, heights=file, geoid=geoid)
+        except InputError as error:
+            if "no height for 1 of 1 points" not in str(error):
+                raise
+            continue
+        known.append(read_gcps(out).height[0] - heights[k])
+    assert len(known) > 0.8 * len(heights)
+    assert np.abs(known).max() < 0.08
+
+
+DOORS: dict[str, Callable[[Path, Path | None], None]] = {
+    "lidar": door_lidar,
+    "score-dsm": door_score,
+    "score-dsm --reference": door_reference,
+    "gcps import --heights": door_heights,
+}
+
+
+FAST = ("plain", "Web Mercator")  # of the cases that take a second each
+
+
+def cases() -> Iterator[Any]:
+    for door in DOORS:
+        for kind in KINDS:
+            takes_long = door.startswith("score") and not kind.right and kind.name not in FAST
+            marks = [pytest.mark.slow] if takes_long else []
+            yield pytest.param(door, kind, id=f"{door}, {kind.name}", marks=marks)
+
+
+@pytest.mark.parametrize(("door", "kind"), cases())
+def test_each_kind_at_each_door_is_right_or_refused(door, kind, folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(score, "GROUPS", 2)  # of the jackknife, whose σ nobody asks for here
+    file = write_kind(kind, tmp_path / "a.tif", moved=door == "score-dsm")
+    geoid = folder / "egm96.gtx" if kind.given else None
+    if not kind.right:
+        DOORS[door](file, geoid)
+        return
+    with pytest.raises(InputError) as error:
+        DOORS[door](file, geoid)
+    assert kind.right in str(error.value) and "a.tif" in str(error.value)
+    assert "Remedy: " in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------ geoids
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A way to write undulations of some 11 m; ``right``: words of the refusal, empty if none."""
+
+    name: str
+    right: str = ""
+    unit: float = 1.0
+    scale: float = 1.0
+    offset: float = 0.0
+    dtype: str = "float32"
+    fill: float | None = None
+    nodata: float | None = None
+    crs: str = "EPSG:4326"
+    west: float = 115.0
+    what: str = "geoid"
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+GRIDS = [
+    Grid("GTX", what="gtx"),
+    Grid("GeoTIFF"),
+    Grid("hundredths", scale=0.01, dtype="int16"),
+    Grid("offset", scale=0.01, offset=5.0, dtype="uint16"),
+    Grid("feet", unit=FT, more={"units": "ft"}),
+    Grid("centimetres", unit=0.01, more={"units": "cm"}),
+    Grid("fathoms", "no known unit", unit=1.8288, more={"units": "fathom"}),
+    Grid("across the line of 180 degrees", west=175.0),
+    Grid("from 0 to 360", west=180.2),
+    Grid("declared fill", fill=-9999, nodata=-9999),
+    Grid("NaN fill", fill=np.nan),
+    *(Grid(f"fill {v:g}, undeclared", "which", fill=v) for v in (-9999, -999, 0, 1e20, -32768)),
+    Grid("fill -32768 scaled", "which", fill=-32768, scale=0.01, dtype="int16"),
+    Grid("shifts in plan", "horizontal offset", more={"tags": {"TYPE": "HORIZONTAL_OFFSET"}}),
+    Grid("shifts in plan, two bands", "2 bands", more={"bands": 2}),
+    Grid("shifts between datums", "vertical offset vertical to vertical",
+         more={"tags": {"TYPE": "VERTICAL_OFFSET_VERTICAL_TO_VERTICAL"}}),
+    Grid("shifts between datums, GTX", "shifts between two datums", what="shifts"),
+    Grid("heights of mountains", "which is no undulation", what="mountains"),
+    Grid("heights of a plain", "rougher than a geoid", what="plain"),
+    Grid("RGB", "3 bands of uint8", dtype="uint8", more={"bands": 3}),
+    Grid("complex", "complex", dtype="complex64"),
+    Grid("in metres", "longitude and latitude", crs="EPSG:32650"),
+    Grid("turned", "north-up", more={"turned": True}),
+    Grid("south up", "north-up", more={"south_up": True}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", GRIDS, ids=lambda kind: kind.name)
+def test_each_kind_of_geoid_is_right_or_refused(kind, tmp_path):
+    n, step = 121, 0.05
+    lon, lat = kind.west + step * np.arange(n), 32.0 - step * np.arange(n)
+
+    def undulation(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        return 11.0 + 0.5 * np.sin(np.radians(40 * lon)) + 0.3 * np.cos(np.radians(30 * lat))
+
+    values = undulation(lon[None, :], lat[:, None])
+    rng = np.random.default_rng(0)
+    values = {"shifts": 0.1 * values, "mountains": 40 * values,
+              "plain": values + rng.normal(0, 20, values.shape)}.get(kind.what, values)  # fmt: skip
+    missing = np.zeros(values.shape, bool)
+    missing[:9, 40:70] = kind.fill is not None
+    path = tmp_path / ("g.gtx" if kind.what in ("gtx", "shifts") else "g.tif")
+    if path.suffix == ".gtx":
+        write_gtx(path, values[::-1], kind.west, 32.0 - step * (n - 1), step)
+    else:
+        at = Affine(step, 0, kind.west - step / 2, 0, -step, 32.0 + step / 2)
+        at = at * Affine.rotation(10.0) if kind.more.get("turned") else at
+        at = at * Affine.scale(1, -1) if kind.more.get("south_up") else at
+        stored = (values / kind.unit - kind.offset) / kind.scale
+        stored = np.rint(stored) if np.dtype(kind.dtype).kind in "iu" else stored
+        stored = np.where(missing, kind.fill or 0, stored)
+        bands = kind.more.get("bands", 1)
+        with rasterio.open(
+            path, "w", driver="GTiff", width=n, height=n, count=bands, dtype=kind.dtype,
+            crs=kind.crs, transform=at, nodata=kind.nodata,
+        ) as grid:  # fmt: skip
+            grid.units = (kind.more.get("units", ""),) * bands
+            grid.scales, grid.offsets = (kind.scale,) * bands, (kind.offset,) * bands
+            grid.update_tags(**kind.more.get("tags", {}))
+            for band in range(1, bands + 1):
+                grid.write(stored.astype(kind.dtype), band)
+    places = kind.west + rng.uniform(0.1, 5.9, 500), rng.uniform(26.1, 31.0, 500)
+    if kind.right:
+        with pytest.raises(InputError) as error:
+            GeoidGrid(path)(places[0], np.append(places[1][1:], 31.9))
+        assert kind.right in str(error.value) and path.name in str(error.value)
+        assert "Remedy: " in str(error.value)
+        return
+    found = GeoidGrid(path)((places[0] + 180) % 360 - 180, places[1])
+    np.testing.assert_allclose(found, undulation(*places), atol=0.006)

@@ -1,0 +1,25 @@
+"""What the strips of a site's LiDAR are off, by their overlaps."""
+
+import logging
+from dataclasses import replace
+
+from stereotruth.job import job
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.strip_comparison import compare_strips
+from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.provenance import describe, digest
+
+if __name__ == "__main__":
+    with (
+        job(snakemake.log[0], f"compare_strips {snakemake.wildcards.scene}"),
+        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+    ):
+        stores = [PointStore(path) for path in snakemake.input.points]
+        found = replace(compare_strips(stores), taken_out=snakemake.params.taken_out)
+        if found.sentence:
+            logging.getLogger("stereotruth").warning("warning: %s", found.sentence)
+        made_of = {f"points/{s.path.name}": digest(s.attrs.get("provenance", {})) for s in stores}
+        found.write(
+            snakemake.output.strips,
+            describe(made_of, {"taken_out": found.taken_out}, snakemake.params.code),
+        )
