@@ -112,7 +112,7 @@ def contradicted_by(
     left: np.ndarray,
     right: np.ndarray,
     labels: Labels = fields.LEVEL,
-    noise: float = 0.0,
+    noise: float = 15.0,
     diachronic: bool = False,
 ) -> np.ndarray:
     """Pixels of a small field whose labels the images contradict; ``noise``: of both, DN."""
