@@ -350,7 +350,9 @@ class Planted(NamedTuple):
         far, nearest = distance_transform_edt(kind == 0, return_indices=True)
         kind = np.where(far <= NEAR_PX, kind[tuple(nearest)], 0).astype(np.uint8)
         unlabelled &= kind > 0
-        same &= ~contradicted_by_matching(window, after.labels.disparity)
+        off, found = by_matching(window, after.labels.disparity)
+        # what one of two days shows alone, as a car, matches nowhere
+        same &= found & ~off if scene.diachronic else ~off
         equal = window.of_equal_noise(scene.inputs(scene.stores(folder, 0)).noise)
         return cls(equal, after, labelled, Truth(changed, same, unlabelled, kind))
 
@@ -361,9 +363,9 @@ def _by_lidar(inputs: SceneInputs) -> tuple[PairWindow, WindowLabels]:
     return found.window, with_crowns(found.labels, found.rough, found.window)
 
 
-def contradicted_by_matching(window: PairWindow, disparity: Floats) -> Bools:
-    """Where semi-global matching finds another surface: the LiDAR is older than the images, and
-    what has changed between them in truth is no part of what is planted."""
+def by_matching(window: PairWindow, disparity: Floats) -> tuple[Bools, Bools]:
+    """Where semi-global matching finds another surface, and where it finds any: the LiDAR is older
+    than the images, and what has changed between them in truth is no part of what is planted."""
     known = np.isfinite(disparity)
     low = int(np.floor(disparity[known].min())) - 16
     count = -(-(int(np.ceil(disparity[known].max())) + 16 - low) // 16) * 16
@@ -388,9 +390,11 @@ def contradicted_by_matching(window: PairWindow, disparity: Floats) -> Bools:
         .astype(np.float64)
         / 16.0
     )
+    has_match = found >= low
     with np.errstate(invalid="ignore"):
-        off = (found >= low) & (np.abs(found - disparity) > OFF_PX)
-    return off | binary_dilation(binary_opening(off, np.ones((3, 3))), iterations=BESIDE_PX)
+        off = has_match & (np.abs(found - disparity) > OFF_PX)
+    around = binary_dilation(binary_opening(off, np.ones((3, 3))), iterations=BESIDE_PX)
+    return off | around, has_match
 
 
 def main() -> None:

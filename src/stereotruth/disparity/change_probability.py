@@ -34,7 +34,7 @@ SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
 # change more than all else.
-CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.4, 0.15, 0.03
+CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.3, 0.2, 0.05
 UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 TREES = Path(__file__).with_suffix(".tsv")
 LEARNED = Path(__file__).with_name("change_evidence_learned.tsv")
@@ -109,9 +109,9 @@ def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     doubtful, evidence = change_evidence(compared)
     out = by_itself(evidence, doubtful, diachronic)
     others = with_surroundings(out, doubtful, compared)
-    told = np.stack(evidence)
-    found = probability_by(trees(diachronic)[1], np.concatenate([told, others]))
-    out[doubtful] = as_learned(found, beyond_learned(told, diachronic))
+    figures = np.stack(evidence)
+    by_trees = probability_by(trees(diachronic)[1], np.concatenate([figures, others]))
+    out[doubtful] = as_learned(by_trees, beyond_learned(figures, diachronic))
     return out
 
 

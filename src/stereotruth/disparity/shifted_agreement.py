@@ -251,8 +251,8 @@ def _means_at_shifts(
             correlation[:n], expected,
         )  # fmt: skip
         for far in range(2):
-            of = voters[far]
-            few = Voters(of.value[:n], of.disparity, of.reach, of.every, of.first)
+            which = voters[far]
+            few = Voters(which.value[:n], which.disparity, which.reach, which.every, which.first)
             fill_voters(correlation[:n], part.level, few)
             mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
             here, elsewhere = out[3 * far], out[3 * far + 1]
