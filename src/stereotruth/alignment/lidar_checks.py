@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, ndtri, stdtrit
+from scipy.special import chdtrc, chdtri, ndtri, stdtrit
 
 from ..epipolar.rpc import SensorModel
 from ..lidar.lattice import PER_M
@@ -215,8 +215,9 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
 
 
-def contradiction(alignment: Alignment, found: Estimate) -> float:
-    """Chi-square of the tie points against what is known of the alignment and of the LiDAR in plan.
+def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
+    """Probability that tie points differ so much from what is known of the alignment and of the
+    LiDAR in plan; by all parameters, or, if that is less, by the shift in plan alone.
 
     ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
     """
@@ -239,7 +240,13 @@ def contradiction(alignment: Alignment, found: Estimate) -> float:
     seen = values > 1e-9 * values.max()
     alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
     known = vectors[:, seen].T @ (np.eye(len(values)) + plan @ plan.T) @ vectors[:, seen]
-    return float(alone @ np.linalg.solve(known + np.diag(1.0 / values[seen]), alone))
+    total = known + np.diag(1.0 / values[seen])
+    by_all = float(alone @ np.linalg.solve(total, alone))
+    # of the shift, in LIDAR_PLAN_M, by generalised least squares; its own variance, 1, is in total
+    along = vectors[:, seen].T @ plan
+    pull = along.T @ np.linalg.solve(total, alone)
+    by_shift = float(pull @ np.linalg.solve(along.T @ np.linalg.solve(total, along), pull))
+    return float(min(chdtrc(int(seen.sum()), by_all), chdtrc(2, by_shift)))
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:

@@ -51,7 +51,7 @@ from .equations import Equations, spread_of
 from .lack_of_fit import SharedErrors, with_shared_errors
 from .lidar_checks import (
     HeightOffset,
-    contradiction,
+    chance_of_contradiction,
     control_points_of,
     doubt_at_gcps,
     doubt_by_rpcs,
@@ -286,7 +286,7 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
             f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
             + (", and the points' heights" if with_gcps else "")
         ]
-    if chdtrc(found.contradiction_freedom, contradiction(alignment, found)) > DOUBTFUL:
+    if chance_of_contradiction(alignment, found) > DOUBTFUL:
         return []
     others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
