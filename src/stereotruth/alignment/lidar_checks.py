@@ -15,12 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import chdtri, ndtri, stdtrit
 
 from ..epipolar.rpc import SensorModel
 from ..lidar.lattice import PER_M
 from ..lidar.point_store import PointStore, query_points
 from ..numerics.degrees import metres_per_degree
+from ..numerics.robust import robust_sigma
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
 from .aligned_pair import Alignment, GcpResidual
@@ -182,6 +183,19 @@ def lines_of_sight(alignment: Alignment) -> Floats:
         ends = [np.array(sensor.project(lon, lat, height + z)) for z in (-5.0, 5.0)]
         moved.append((ends[1] - ends[0]) / 10.0)
     return np.array(moved)
+
+
+def scatter_by_heights(alignment: Alignment, along: Floats, across: Floats) -> tuple[float, float]:
+    """Scatter of disparity residuals (px) of tie points, and what of it is explained at most.
+
+    ``along``, ``across`` [n] px: residuals along and across the rows. Both have the scatter of the
+    matches; that along the rows has the LiDAR's heights besides. At a wrong place of the ground
+    the heights of tie points have nothing to do with what the images show there.
+    """
+    px_per_m = float(np.linalg.norm(np.subtract(*lines_of_sight(alignment))))
+    own, found = (robust_sigma(values, 0.0) for values in (across, along))
+    explained = float(np.hypot(own, LIDAR_SIGMA_M * px_per_m))
+    return found, explained * float(np.sqrt(chdtri(along.size - 1, CHANCE) / (along.size - 1)))
 
 
 def _constants(shifts: Floats) -> Floats:

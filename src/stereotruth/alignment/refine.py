@@ -45,6 +45,7 @@ from .adjustment import (
     pull_of,
     with_corrections,
 )
+from .align import PLACES_BY_RPCS
 from .aligned_pair import Alignment, ViewFit
 from .equations import Equations, spread_of
 from .lack_of_fit import SharedErrors, with_shared_errors
@@ -58,6 +59,7 @@ from .lidar_checks import (
     height_by_rpcs,
     heights_of_model,
     pixel_m,
+    scatter_by_heights,
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
@@ -153,6 +155,12 @@ class _Found:
     alignment: Alignment
     halves: tuple[float, float]
     sigma: LabelSigma
+
+
+HEIGHTS_BY_RPCS = (
+    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
+    "told from errors of the RPCs"
+)
 
 
 def _search(
@@ -290,6 +298,32 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
     ]
 
 
+def _widening(
+    doubts: list[str], refined: Alignment, observations: Observations, found: Estimate
+) -> float:
+    """What the covariance is multiplied by where there are doubts: which of two is wrong is not
+    known, nor by how much (Birge's ratio). Adds a doubt to ``doubts`` where the ground may be
+    another."""
+    ratio = max(found.contradiction / found.contradiction_freedom, 1.0) if doubts else 1.0
+    if any(fit.gcps for fit in refined.fits):
+        return ratio
+    scatter, explained = scatter_by_heights(refined, *observations.after[observations.used].T)
+    if scatter <= explained:
+        return ratio
+    doubts.append(
+        f"tie points scatter by {scatter:.2f} px of disparity, where the matches and the heights "
+        f"of a LiDAR explain {explained:.2f} px: without ground control points the images may have "
+        "been placed on other ground; check that the RPCs belong to the images, which may have "
+        "been cut since"
+    )
+    return max(ratio, (scatter / explained) ** 2)
+
+
+def _still_true(warnings: Sequence[str], unrefined: bool) -> list[str]:
+    """Warnings of the alignment before: once refined, places are known by the LiDAR."""
+    return [text for text in warnings if unrefined or text != PLACES_BY_RPCS]
+
+
 def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
     for text in doubts:
         log.warning("warning: %s", text)
@@ -379,22 +413,22 @@ def refine(
             observations, after=observations.before, by_affines=observations.before
         )
         record["after"] = record["before"]
-    doubts += _doubts(alignment, record, found)
+    odd = _doubts(alignment, record, found)
+    ratio = _widening(odd, refined, observations, found)
+    if odd:
+        record["uncertainty_widened_by"] = round(ratio**0.5, 3)
+    covariance, doubts = ratio * covariance, [*doubts, *odd]
     _warn(doubts, strict, left_image, of)
     if not gcps and not doubts:
-        unknown = (
-            f"without ground control points a fault of the LiDAR's heights of less than "
-            f"{offset.told_from_m:.0f} m cannot be told from errors of the RPCs"
-        )
-        log.warning("warning: %s", unknown)
-        doubts = [unknown]
+        doubts = [HEIGHTS_BY_RPCS.format(offset.told_from_m)]
+        log.warning("warning: %s", *doubts)
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
         reference_height=height,
-        warnings=(*alignment.warnings, *doubts),
+        warnings=(*_still_true(alignment.warnings, bool(reason)), *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],

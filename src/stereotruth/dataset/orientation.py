@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..numerics.degrees import for_readers
 from .polynomials import evaluate, fit
 
 if TYPE_CHECKING:
@@ -183,6 +184,7 @@ def orientation(
     ):
         forth, back = view_polynomials(to_sensor, row0, first, size)
         views[view] = {"tile_to_sensor": forth, "sensor_to_tile": back, **sensors[view]}
+    ring = np.column_stack([for_readers(ring[:, 0]), ring[:, 1:]])
     coordinates = [[round(float(v), 9) for v in point] for point in (*ring, ring[0])]
     return {
         "window": {"row0": row0, "col0": col0, "size": size, "unit": "px of the epipolar grid"},

@@ -16,6 +16,7 @@ from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..products.grids import require_complete
 from ..products.provenance import digest, file_sha256
+from .label_doubts import ALIGNMENT, LIDAR, STRIPS, ToldDoubt
 from .orientation import sensor_record
 from .sure_labels import Labels, tile_flags, tile_labels
 
@@ -72,9 +73,15 @@ class SceneStores:
     remark: str
 
     @property
-    def lidar_strips(self) -> Mapping[str, Any] | None:
-        """What the strips of its LiDAR are off; None of one strip."""
-        return (self.lidar or {}).get("strips")
+    def told(self) -> list[ToldDoubt]:
+        """What alignment and LiDAR say of what the labels are worth."""
+        lidar = self.lidar or {}
+        found = [ToldDoubt(ALIGNMENT, text) for text in self.doubts]
+        found += [ToldDoubt(ALIGNMENT, self.remark, True)] * bool(self.remark)
+        found += [ToldDoubt(LIDAR, text) for text in lidar.get("doubts", ())]
+        if strips := lidar.get("strips"):
+            found += [ToldDoubt(STRIPS, strips["sentence"], True)] * bool(strips["sentence"])
+        return found
 
 
 def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> SceneStores:

@@ -93,10 +93,6 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
         for scene, found in summary["quality"]["doubts"].items()
         for doubt in found
     ]
-    lines += [
-        f"Remark on {scene}: {remark}"
-        for scene, remark in summary["quality"].get("alignment_remarks", {}).items()
-    ]
     return [*lines, f"Look at {out_dir}/manifest.csv, {out_dir}/left, right, disp, status"]
 
 

@@ -24,7 +24,7 @@ from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .seen_surface import box_max
-from .shifted_agreement import SHIFTS_PX, shifted_agreement
+from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
 from .status import VEGETATION_CLASSES
 from .surface_means import apart_from_steps, left_and_warped, surface_mean, surface_means
 from .young_crowns import beside_young_crowns
@@ -40,8 +40,8 @@ NEAR_PX = 2  # up to here differences of brightness are averaged
 ALIKE_PX = 4  # for pixels that are alike, for contrast and gain,
 GAIN_PX = 16  # which is held against that up to here
 FAR_PX = 8  # steps farther off do not count
-# Pixels around one that its evidence follows from: brightness beside those near it
-EVIDENCE_PX = NEAR_PX + GAIN_PX + 1
+# Pixels around one that its evidence follows from: the windows of details far off
+EVIDENCE_PX = FAR * SURROUNDINGS_PX + WINDOW_PX // 2 + 2
 LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
 # Both images of the same ground differ by noise; by labels that are off by so many px over the
@@ -54,7 +54,7 @@ class LabelledWindow:
     """A ``window`` of a pair whose images are compared by ``labels``; arrays [h, w].
 
     ``labelled``: pixels that are asked about; ``surface_class`` (ASPRS) of what the labels show;
-    ``noise`` of both images, variances in DN².
+    ``noise`` of both images, variances.
     """
 
     window: PairWindow
@@ -122,7 +122,8 @@ class Evidence(NamedTuple):
 
     ``agreement``: mean correlation of the images' detail over the surface up to SURROUNDINGS_PX
     around a pixel, at its disparity; ``elsewhere``: the greatest at a shifted disparity, by
-    ``shift`` px up or down; ``signal``: what the same ground would agree by, as noise leaves it.
+    ``shift`` px up or down; ``agreement_far``, ``elsewhere_far``: up to FAR times as far;
+    ``signal``: what the same ground would agree by, as noise leaves it.
 
     ``alike``: correlation of the brightness over the pixels that are alike
     (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the edges of shadows
@@ -131,7 +132,9 @@ class Evidence(NamedTuple):
     its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
     GAIN_PX, as a logarithm.
 
-    ``from_step``: px to the next step of the surface, FAR_PX at most; ``slope`` of the disparity.
+    ``from_step``: px to the next step of the surface, FAR_PX at most; ``apart``: share of the
+    surface up to ALIKE_PX that touches no other, without which agreement is lent by what lies
+    beside; ``slope`` of the disparity.
     ``vegetation``, ``young``: 1 where :class:`LabelledWindow` says so.
     """
 
@@ -146,23 +149,29 @@ class Evidence(NamedTuple):
     elsewhere: Singles
     shift: Singles
     signal: Singles
+    agreement_far: Singles
+    elsewhere_far: Singles
     alike: Singles
     alike_around: Singles
     contrast_left: Singles
     contrast_right: Singles
     gain: Singles
     from_step: Singles
+    apart: Singles
     slope: Singles
     vegetation: Singles
     young: Singles
 
 
 def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
-    """Which labelled pixels [h, w] of a window do not agree closely, and the evidence of these."""
+    """Which labelled pixels [h, w] of a window do not agree closely or show trees, and the evidence
+    of these."""
     with_noise, expected = compared.correlation(CLOSE_PX)
     close = np.minimum(with_noise / expected, np.float32(1.0))
     close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
     doubtful = compared.labelled & ~(close_mean > AGREED)
+    # What has replaced a tree may agree closely.
+    doubtful |= compared.labelled & (compared.vegetation | compared.young)
     detail = shifted_agreement(
         compared.labels,
         compared.window,
@@ -186,10 +195,13 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
         detail.elsewhere,
         np.abs(detail.shift),
         detail.signal,
+        detail.here_far,
+        detail.elsewhere_far,
         alike,
         surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
         *_contrasts_and_gain(compared, doubtful),
         _from_step(compared.clear),
+        _apart(compared, doubtful),
         np.abs(compared.labels.slope).sum(axis=0),
         compared.vegetation,
         compared.young,
@@ -235,6 +247,12 @@ def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singl
     ratio = logarithms[0] - logarithms[1]
     wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row)
     return [*contrasts, np.abs(means[0] - means[1] - wide)]
+
+
+def _apart(compared: LabelledWindow, doubtful: Bools) -> Singles:
+    """Share of the surface around [h, w] that touches no other."""
+    of_labels = np.where(compared.labelled, compared.clear, np.nan)
+    return surface_mean(of_labels, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful))
 
 
 def _from_step(clear: Bools) -> Singles:

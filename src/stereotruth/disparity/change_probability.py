@@ -34,10 +34,10 @@ SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
 # change more than all else.
-CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.4, 0.15, 0.03
-LEAST_SIGNAL = 0.2  # share of the detail's variance, with less of which noise leaves nothing to
-UNKNOWN = 0.05  # tell by, and the probability is the share that has changed
+CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.3, 0.2, 0.05
+UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 TREES = Path(__file__).with_suffix(".tsv")
+LEARNED = Path(__file__).with_name("change_evidence_learned.tsv")
 
 
 def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) -> list[Singles]:
@@ -50,7 +50,7 @@ def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) ->
         for around in AROUND
     ]
     means += [
-        alike_mean(known, compared.brightness, *compared.surface, *around, runs)
+        alike_mean(known, compared.brightness, *compared.surface, *around, compared.noise, runs)
         for around in ALIKE_AROUND
     ]
     return [_log_odds(values[doubtful]) for values in (own, *means)]
@@ -70,6 +70,29 @@ def trees(diachronic: bool) -> list[DecisionTrees]:
     return DecisionTrees.load(TREES)[diachronic::2]
 
 
+@cache
+def learned(diachronic: bool) -> Floats:
+    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
+    for one in two thousand at either end."""
+    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
+    return rows[rows[:, 0] == diachronic, 1:].T
+
+
+def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
+    """How many of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]."""
+    low, high = learned(diachronic)[..., None]
+    return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
+
+
+def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
+    """The probability [n], nearer to UNKNOWN the more figures lie ``beyond`` what has been learned:
+    the difference of the log odds is divided by one more than these."""
+    odds, unknown = (
+        np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
+    )
+    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / (1 + beyond))))
+
+
 def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:
     """Probability [h, w] that a pixel has changed, by its own evidence alone; UNCHANGED where it is
     not ``doubtful``. ``diachronic``: whether the images share no light."""
@@ -86,13 +109,12 @@ def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
     doubtful, evidence = change_evidence(compared)
     out = by_itself(evidence, doubtful, diachronic)
     others = with_surroundings(out, doubtful, compared)
-    out[doubtful] = probability_by(trees(diachronic)[1], np.stack([*evidence, *others]))
+    figures = np.stack(evidence)
+    by_trees = probability_by(trees(diachronic)[1], np.concatenate([figures, others]))
+    out[doubtful] = as_learned(by_trees, beyond_learned(figures, diachronic))
     return out
 
 
 def probability_by(fitted: DecisionTrees, features: Singles) -> Floats:
-    """By trees that sum up to log odds, of the ``features`` [k, n], evidence first; UNKNOWN where
-    noise leaves nothing to tell by."""
-    odds = fitted.sum_at(features).astype(np.float64)
-    signal = features[Evidence._fields.index("signal")]
-    return np.where(signal >= LEAST_SIGNAL, 1.0 / (1.0 + np.exp(-odds)), UNKNOWN)
+    """By trees that sum up to log odds, of the ``features`` [k, n], evidence first."""
+    return 1.0 / (1.0 + np.exp(-fitted.sum_at(features).astype(np.float64)))

@@ -27,13 +27,15 @@ from .pixel_labels import Labels
 from .status import WATER_CLASS, Status, is_labelled
 
 Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+
+
+NO_NOISE = 0.0, 0.0
 
 
 class Comparison(NamedTuple):
     """How both images are compared: side of the ``window_px`` of the layer ``correlation``;
-    ``noise`` of both images, variances in DN²; ``diachronic``: whether they share no light."""
+    ``noise`` of both images, variances; ``diachronic``: whether they share no light."""
 
     window_px: int
     noise: tuple[float, float]
@@ -43,14 +45,18 @@ class Comparison(NamedTuple):
 class Contradicted(NamedTuple):
     """What the images of a window say of its labels; arrays [h, w].
 
-    ``changed``: where they contradict these; ``correlation`` of the images over each pixel's
-    surface; ``variance`` (px²) of labels that they do not contradict, though these may have
-    changed.
+    ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
+    contradict, though these may have changed.
     """
 
     changed: Bools
-    correlation: Singles
     variance: Floats | float
+
+
+def least_probability(compared: LabelledWindow) -> Floats:
+    """Of a change, more than which leaves a pixel [h, w] without a label."""
+    by_ground = np.where(compared.young, YOUNG_CHANGED, CHANGED)
+    return np.where(compared.vegetation, CROWN_CHANGED, by_ground)
 
 
 def contradicted(
@@ -67,24 +73,25 @@ def contradicted(
     """
     compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
     probability = probability_of_change(compared, comparison.diachronic)
-    limit = np.where(
-        compared.vegetation, CROWN_CHANGED, np.where(compared.young, YOUNG_CHANGED, CHANGED)
-    )
-    changed = labelled & (probability > limit)
-    correlation, _ = compared.correlation(comparison.window_px)
+    changed = labelled & (probability > least_probability(compared))
     variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
-    return Contradicted(changed, correlation, variance)
+    return Contradicted(changed, variance)
 
 
 def without_changes(
-    labels: WindowLabels, window: PairWindow, comparison: Comparison
+    labels: WindowLabels, window: PairWindow, equal: PairWindow, comparison: Comparison
 ) -> WindowLabels:
     """Labels without those that the images contradict, and without water; with the correlation of
-    the images over each pixel's surface."""
+    the images over each pixel's surface.
+
+    ``equal``: the ``window`` with images of equal noise, as ``comparison`` has it.
+    """
     labelled = is_labelled(labels.status)
-    by_images = contradicted(labels.labels, window, comparison, labelled, labels.surface_class)
+    by_images = contradicted(labels.labels, equal, comparison, labelled, labels.surface_class)
+    as_it_is = LabelledWindow(window, labels.labels, labelled, labels.surface_class, NO_NOISE)
+    correlation, _ = as_it_is.correlation(comparison.window_px)
     changed = by_images.changed | labelled & (labels.surface_class == WATER_CLASS)
     status = labels.status.copy()
     status[changed] = Status.CHANGED
     with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
-    return replace(labels, status=status, labels=with_unseen, correlation=by_images.correlation)
+    return replace(labels, status=status, labels=with_unseen, correlation=correlation)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.image_noise import NoiseCurve
 from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
 from .status import Status
@@ -52,6 +53,15 @@ class PairWindow:
     @cached_property
     def _details(self) -> dict[tuple[float, float], tuple[Detail, Detail]]:
         return {}
+
+    def of_equal_noise(self, noise: tuple[NoiseCurve, NoiseCurve]) -> PairWindow:
+        """With brightness counted in standard deviations of the images' ``noise``, see
+        :meth:`.NoiseCurve.equalised`: :data:`.image_noise.EQUAL` are its variances then."""
+        left, right = (
+            replace(patch, pixels=curve.equalised(patch.pixels))
+            for patch, curve in zip((self.left, self.right), noise)
+        )
+        return replace(self, left=left, right=right)
 
     @property
     def inner(self) -> tuple[slice, slice]:

@@ -268,6 +268,8 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
+        if tasks and inputs.settings.on_surface:
+            _ = inputs.noise  # once, and not by each of the threads
         with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.image_noise import EQUAL
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
@@ -67,21 +68,18 @@ def label_window(
 
 class LidarLabels(NamedTuple):
     """What the points say of a window, before its images are compared: ``labels`` of facets, the
-    surfaces that are ``rough``, and each pixel's ``own`` points; ``comparison``: how the images of
-    the ``window`` are compared."""
+    surfaces that are ``rough``, and each pixel's ``own`` points."""
 
     labels: WindowLabels
     rough: Crowns
     own: OwnPoints
     window: PairWindow
-    comparison: Comparison
 
 
 def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> LidarLabels:
     """Of a window, by the surface of the points around it."""
     settings, scale = scene.settings, scene.scale
     shape, first, projection = window.shape, window.first, points.projection
-    comparison = Comparison(settings.window, scene.noise, settings.diachronic)
 
     # points: what each pixel's own ones say
     own = own_labels(
@@ -109,19 +107,21 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     rough = crowns(visible, scale)
     labels = without_contours(labels, rough, visible, scale)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
-    return LidarLabels(labels, rough, own.points, window, comparison)
+    return LidarLabels(labels, rough, own.points, window)
 
 
 def surface_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:
     """The labels of a window by the surface of the points around it, as far as images agree."""
-    labels, rough, own, window, comparison = lidar_labels(scene, window, points)
+    labels, rough, own, window = lidar_labels(scene, window, points)
     is_rough = labels.status == Status.EDGE_IN_PIXEL
     labels = with_crowns(labels, rough, window)
     # Reasons follow from changes up to REASON_PX off, these from probabilities up to MEANS_PX off,
     # and these from the agreement of the pixels beside. Labels farther off need no images.
     labels = labels.around(window.grown(REASON_PX + MEANS_PX + 1))
-    labels = without_changes(labels, window, comparison)
-    return with_reasons(labels, is_rough, own, window, comparison, scene.scale.px_per_m)
+    equal = window.of_equal_noise(scene.noise)
+    comparison = Comparison(scene.settings.window, EQUAL, scene.settings.diachronic)
+    labels = without_changes(labels, window, equal, comparison)
+    return with_reasons(labels, is_rough, own, equal, comparison, scene.scale.px_per_m)
 
 
 def paper_recipe(scene: SceneInputs, window: PairWindow, points: WindowPoints) -> WindowLabels:

@@ -17,6 +17,7 @@ from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..alignment.strip_uncertainty import with_strips
 from ..epipolar.acquisition import Acquisition, by_sheet
+from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
 from ..epipolar.pair_light import PairLight, pair_light
 from ..epipolar.rpc import RPC
@@ -124,6 +125,11 @@ class SceneInputs:
     @cached_property
     def pair(self) -> Pair:
         """The images with their geometry; its left image is the one that gets labels."""
+        return seen_from(self.view, self._pair)
+
+    @cached_property
+    def _pair(self) -> Pair:
+        """The same, as the images are read."""
         left, right = (require_complete(path) for path in (self.left_store, self.right_store))
         model = EpipolarModel.from_dict(left.attrs["epipolar"])
         uncertainty = LabelUncertainty.none()
@@ -135,19 +141,11 @@ class SceneInputs:
         if self.lidar_strips is not None:
             how = model, self.view, shared_px
             uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
-        return seen_from(
-            self.view,
-            Pair(
-                tuple(
-                    MaskedImage(group["image"], group["mask"])
-                    if "mask" in group
-                    else group["image"]
-                    for group in (left, right)
-                ),
-                model,
-                uncertainty,
-            ),
+        images = (
+            MaskedImage(group["image"], group["mask"]) if "mask" in group else group["image"]
+            for group in (left, right)
         )
+        return Pair(tuple(images), model, uncertainty)
 
     @cached_property
     def lidar_strips(self) -> StripOffsets | None:
@@ -173,12 +171,10 @@ class SceneInputs:
         return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
 
     @cached_property
-    def noise(self) -> tuple[float, float]:
-        """Variances of the noise of both images of the pair, DN²; 0 of a store that has none."""
-        stores = (self.left_store, self.right_store)
-        facts = [require_complete(path).attrs.get("resampling", {}) for path in stores]
-        left, right = (noise.get("noise_dn", 0.0) ** 2 for noise in facts)
-        return (left, right) if self.view == "left" else (right, left)
+    def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
+        """Of both images of the :attr:`pair`, by brightness."""
+        of_images = pair_noise(*self._pair.images, self._pair.model)
+        return of_images if self.view == "left" else of_images[::-1]
 
     @cached_property
     def rays(self) -> Rays:

@@ -30,7 +30,8 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 
-SHIFTS_PX = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
+SHIFTS_PX = (-15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0, -3.0, -2.0, -1.0)
+SHIFTS_PX += (1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0)
 # of what has changed already, over the heights of buildings
 WIDE_SHIFTS_PX = (-40.0, -34.0, -28.0, -23.0, -19.0, -15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0)
 WIDE_SHIFTS_PX += (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0, 19.0)
@@ -40,6 +41,7 @@ SIGNIFICANT = 3.0  # standard deviations of a difference; the greatest of all sh
 INDEPENDENT_PX2 = 4.0
 Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
+FAR = 2  # times as far off more of the surface is asked, which noise hides less
 AT_ONCE = 4  # shifts that are worked on together: which pixels count is the same for all
 TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
 
@@ -51,14 +53,17 @@ class ShiftedAgreement:
     ``here``: at the labels' disparity; ``elsewhere``: the greatest of shifted ones, which is at
     ``shift`` px. NaN where nothing was asked, and where there is nothing to correlate. ``signal``:
     what the images of the same ground would correlate by, as their noise leaves it, the less of the
-    pixel's own and its surface's; 0 where either has no value. ``pixels``: that a mean takes in, at
-    most.
+    pixel's own and its surface's; 0 where either has no value. ``here_far`` and ``elsewhere_far``:
+    the same of the surface up to FAR times as many px. ``pixels``: that a mean of the first takes
+    in, at most.
     """
 
     here: Singles
     elsewhere: Singles
     shift: Singles
     signal: Singles
+    here_far: Singles
+    elsewhere_far: Singles
     pixels: int
 
     @cached_property
@@ -88,8 +93,8 @@ def shifted_agreement(
     whether pixels beside a step count for nothing.
     """
     shape = wanted.shape
-    out = np.full((4, *shape), np.nan, np.float32)
-    pad = reach + window_px // 2 + 1
+    out = np.full((6, *shape), np.nan, np.float32)
+    pad = FAR * reach + window_px // 2 + 1
     images: tuple[Detail, Detail] | None = None
     for top in range(0, shape[0], TILE_PX):
         for side in range(0, shape[1], TILE_PX):
@@ -124,7 +129,7 @@ def _means(
     reach: int,
     shifts: tuple[float, ...],
     apart: bool,
-) -> tuple[Singles, Singles, Singles, Singles]:
+) -> tuple[Singles, ...]:
     """The arrays of :class:`ShiftedAgreement` of a part of a window, of which some pixels are
     ``wanted``."""
     left, right = (image.patch for image in images)
@@ -134,27 +139,27 @@ def _means(
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
     clear = apart_from_steps(disparity) if apart else np.isfinite(disparity)
     every = max(reach // 2, 1)
-    averaged = box_max(wanted, reach)
+    averaged = box_max(wanted, FAR * reach)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
     known = np.isfinite(compared)
     voters = Voters.of((AT_ONCE, rows, cols), reach, every, row)
+    far = Voters.of((AT_ONCE, rows, cols), FAR * reach, FAR * every, row)
     averaged[np.arange(rows) % every != voters.first] = False
     to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
     surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
     level, slope = surface
-    here, elsewhere, shifted = np.full((3, rows, cols), np.nan, np.float32)
+    means = np.full((5, rows, cols), np.nan, np.float32)
     part = _Compared(
         original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
         compared, wanted_runs(known), clear, level, slope,
     )  # fmt: skip
     of_shifts = np.array([0.0, *shifts])
-    _means_at_shifts(
-        part, window_px // 2, of_shifts, to_compare, voters, to_average, here, elsewhere, shifted
-    )
+    _means_at_shifts(part, window_px // 2, of_shifts, to_compare, (voters, far), to_average, means)
+    here, elsewhere, shifted, here_far, elsewhere_far = means
     signal = _signal(images, row, col, disparity)
     around_it = surface_mean(signal, level, slope, reach, every, to_average, row)
-    return here, elsewhere, shifted, np.fmin(signal, around_it)
+    return here, elsewhere, shifted, np.fmin(signal, around_it), here_far, elsewhere_far
 
 
 class _Compared(NamedTuple):
@@ -219,14 +224,13 @@ def _means_at_shifts(
     half: int,
     shifts: Floats,
     to_compare: Steps,
-    voters: Voters,
+    voters: tuple[Voters, Voters],
     to_average: Steps,
-    here: Singles,
-    elsewhere: Singles,
-    shifted: Singles,
+    out: Singles,
 ) -> None:
-    """Mean correlation at the first of the ``shifts``, which is 0 px, to ``here``; the greatest at
-    the others to ``elsewhere``, and which one that is to ``shifted`` [h, w].
+    """Mean correlation, by the first of the ``voters``, at the first of the ``shifts``, which is 0
+    px, to ``out`` [5, h, w]; the greatest at the others, and which one that is; the first two by
+    the other voters.
 
     What has a match counts at all shifts. Where the right image ends it has no detail.
     """
@@ -246,18 +250,23 @@ def _means_at_shifts(
             left, warped[:n], known, counted, part.slope, half, (0.0, 0.0), to_compare,
             correlation[:n], expected,
         )  # fmt: skip
-        few = Voters(voters.value[:n], voters.disparity, voters.reach, voters.every, voters.first)
-        fill_voters(correlation[:n], part.level, few)
-        mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
-        for run in to_average:
-            y = run[0]
-            for k in range(n):
-                for x in range(run[1], run[2]):
-                    if first + k == 0:
-                        here[y, x] = mean[k, y, x]
-                    elif np.isnan(elsewhere[y, x]) or mean[k, y, x] > elsewhere[y, x]:
-                        elsewhere[y, x] = mean[k, y, x]
-                        shifted[y, x] = np.nan if np.isnan(mean[k, y, x]) else several[k]
+        for far in range(2):
+            which = voters[far]
+            few = Voters(which.value[:n], which.disparity, which.reach, which.every, which.first)
+            fill_voters(correlation[:n], part.level, few)
+            mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
+            here, elsewhere = out[3 * far], out[3 * far + 1]
+            for run in to_average:
+                y = run[0]
+                for k in range(n):
+                    for x in range(run[1], run[2]):
+                        if first + k == 0:
+                            here[y, x] = mean[k, y, x]
+                        elif np.isnan(elsewhere[y, x]) or mean[k, y, x] > elsewhere[y, x]:
+                            elsewhere[y, x] = mean[k, y, x]
+                            if far == 0:
+                                shifted = np.nan if np.isnan(mean[k, y, x]) else several[k]
+                                out[2, y, x] = shifted
 
 
 def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:

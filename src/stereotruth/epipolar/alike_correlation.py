@@ -26,6 +26,9 @@ from .surface_correlation import (
 )
 
 ALIKE = 0.1  # share of the centre's brightness by which that of a pixel may differ
+# Standard deviations of the noise: two means of 3 x 3 px differ by 0.5 (of white noise) to 0.9 (of
+# noise whose neighbours correlate by 0.4).
+NOISY = 1.5
 LEAST_PIXELS = 12  # fewer correlate by chance
 
 
@@ -57,14 +60,24 @@ def brightness_of_pair(
 
 @inner
 def alike_of_row(
-    level: Singles, level_warped: Singles, share: float, y: int, x0: int, size: int, c: Singles
+    level: Singles,
+    level_warped: Singles,
+    share: float,
+    noise: tuple[float, float],
+    y: int,
+    x0: int,
+    size: int,
+    c: Singles,
 ) -> None:
-    """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and the ``share``
-    of each by which that of a pixel may differ to be alike, see :func:`is_alike`."""
+    """``c`` [4 * BLOCK]: brightness of both images of ``size`` pixels of a row, and by how much
+    that of a pixel may differ to be alike, see :func:`is_alike`: by the ``share`` of each, or by
+    NOISY standard deviations of the ``noise`` (variances)."""
+    least = np.float32(NOISY * np.sqrt(noise[0]))
+    least_warped = np.float32(NOISY * np.sqrt(noise[1]))
     for k in range(size):
         c[k], c[BLOCK + k] = level[y, x0 + k], level_warped[y, x0 + k]
-        c[2 * BLOCK + k] = share * level[y, x0 + k]
-        c[3 * BLOCK + k] = share * level_warped[y, x0 + k]
+        c[2 * BLOCK + k] = max(share * level[y, x0 + k], least)
+        c[3 * BLOCK + k] = max(share * level_warped[y, x0 + k], least_warped)
 
 
 @inner
@@ -99,7 +112,7 @@ def _alike_correlation(
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        alike_of_row(level, level_warped, share, y, x0, size, bright)
+        alike_of_row(level, level_warped, share, noise, y, x0, size, bright)
         for k in range(size):
             centre[k], centre[BLOCK + k] = left[y, x0 + k], warped[y, x0 + k]
         sums[:] = zero
@@ -154,11 +167,11 @@ def alike_correlation(
     """Correlation of two images [h, w] over the pixels up to ``reach`` px around that are alike.
 
     These lie on the surface of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], and
-    are as bright as it within the share ALIKE in both images, by their ``brightness``
-    (:func:`brightness_of_pair`). ``left`` is 0 and ``warped`` NaN where an image has no value. The
-    coefficient is as it would be without ``noise`` (variances of both images, DN²), 1 at most. NaN
-    with fewer than LEAST_PIXELS, and where noise leaves so little that chance may do as well. Of
-    the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    are as bright as it in both images, by their ``brightness`` (:func:`brightness_of_pair`), within
+    the share ALIKE or by NOISY standard deviations of the noise. ``left`` is 0 and
+    ``warped`` NaN where an image has no value. The coefficient is as it would be without ``noise``
+    (variances of both images), 1 at most. NaN with fewer than LEAST_PIXELS, and where noise leaves
+    so little that chance may do as well. Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
     level, level_warped = brightness
     known = np.isfinite(level_warped) & np.isfinite(disparity) & (left != 0.0)

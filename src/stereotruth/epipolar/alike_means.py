@@ -32,13 +32,15 @@ def _alike_mean(
     level_warped: Singles,
     disparity: Singles,
     slope: Singles,
-    reach: int,
-    every: int,
+    around: tuple[int, int],
+    noise: tuple[float, float],
     runs: Steps,
     out: Singles,
 ) -> None:
     """``counted``: disparity of the pixels that count, else NaN; ``level``, ``level_warped``:
-    brightness of both images. ``runs`` of wanted pixels, outside of which all is NaN."""
+    brightness of both images, by their ``noise``; ``around``: reach, and of how many one counts.
+    ``runs`` of wanted pixels, outside of which all is NaN."""
+    reach, every = around
     rows, cols = disparity.shape
     out[:] = np.nan
     surface = np.empty(3 * BLOCK, np.float32)
@@ -48,7 +50,7 @@ def _alike_mean(
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         surface_of_row(disparity, slope, y, x0, size, surface)
-        alike_of_row(level, level_warped, share, y, x0, size, bright)
+        alike_of_row(level, level_warped, share, noise, y, x0, size, bright)
         sums[:] = zero
         for step_down in range(-reach, reach + 1, every):
             b = y + step_down
@@ -81,14 +83,16 @@ def alike_mean(
     slope: NDArray[np.floating],
     reach: int,
     every: int,
+    noise: tuple[float, float],
     runs: Steps,
 ) -> Singles:
     """Mean of ``values`` [h, w] over the pixels that are alike; NaN where there are none.
 
     These lie up to ``reach`` px around, one of so many (``every``) along each axis, on the surface
     of the pixel, by ``disparity`` (px) and its ``slope`` [2, h, w], have a value, and are as bright
-    as it within the share AS_BRIGHT in both images, by the ``brightness`` [h, w] of these
-    (:func:`.brightness_of_pair`). Of the pixels of ``runs`` (:func:`.wanted_runs`) alone.
+    as it in both images, by the ``brightness`` [h, w] of these (:func:`.brightness_of_pair`),
+    within the share AS_BRIGHT or NOISY standard deviations of the ``noise`` (variances). Of the
+    pixels of ``runs`` (:func:`.wanted_runs`) alone.
     """
     has_value = np.isfinite(values)
     single = [
@@ -99,5 +103,5 @@ def alike_mean(
         )
     ]  # fmt: skip
     out = np.empty(disparity.shape, np.float32)
-    _alike_mean(*single, reach, every, runs, out)
+    _alike_mean(*single, (reach, every), noise, runs, out)
     return out

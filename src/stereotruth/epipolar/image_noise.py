@@ -1,82 +1,225 @@
-"""Noise of an image, and what resampling leaves of it.
+"""Noise of two images of the same ground, and images in which it is the same everywhere.
 
-Noise lowers the correlation of two images of the same ground, the more the weaker its texture is.
-Whoever takes a low correlation for a change has to know the noise.
+Noise is not one number. A tone curve makes it several times greater in shadow than in the light,
+and resampling, pan-sharpening and compression leave noise whose neighbours correlate, of which one
+image alone tells too little: it looks like texture that optics have blurred.
 
-The second differences along rows and columns of an original image remove all of a plane and most of
-a texture that optics have blurred; white noise remains (Immerkaer, CVIU 64, 1996). Where an image
-is flattest, hardly anything else does. Resampled images would not do: noise there is no longer
-white.
+1. *By brightness*: the second differences along rows and columns remove all of a plane and most of
+   a texture that optics have blurred (Immerkaer, CVIU 64, 1996). Where an image is flattest, at
+   each brightness, they give the noise but for a factor, which is the same at all.
+2. *The factor*: parts of the left image are looked for along their rows in the right one. Where the
+   ground is flat, noise is all that both images differ by.
+3. *Equal noise*: brightness is counted in standard deviations of the noise, so that it is the same
+   at all places and in all images: a variance-stabilising transformation (Anscombe 1948). Whoever
+   compares two images then needs to know neither their bits nor their tone curve.
+
+The LiDAR has no say, so that more of it changes nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numerics.cubic_convolution import TAP_POLYNOMIALS
-from .image_reader import Source
+from .model import EpipolarModel
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
-PART_PX = 16  # side of the parts that are compared
-SAMPLE_PX = 130  # side of what is read at a place,
-PLACES = 12  # at so many along each axis at most
-FLATTEST = 0.1  # of the parts
+STEPS = 8.0  # whole numbers that a standard deviation of the noise spans in images of equal noise
+EQUAL = STEPS**2, STEPS**2  # variances of the noise of two such images
+PART_PX, PLACE_PX = 12, 132  # sides of the parts that are compared, and of a place with several
+PLACES = 10  # along each axis, at most
+NEAR_PX = 10  # the parts of a place are looked for so far around what fits most of it
+FLATTEST, LEAST_PARTS = 0.1, 12  # share of the parts of about one brightness; the least number
 SQUARES = 36.0  # of the weights of second differences along both axes, summed
-# Second differences of white noise correlate: PART_PX² of them count as so many free ones. Of a
-# chi-square distribution of these the quantile FLATTEST (Wilson & Hilferty 1931) lies below 1.
-FREE = PART_PX**2 / (35.0 / 18.0) ** 2
-FLATTEST_OF_NOISE = (1.0 - 2.0 / (9.0 * FREE) - 1.2816 * (2.0 / (9.0 * FREE)) ** 0.5) ** 3
-PHASES = 100  # at which a kernel's weights are averaged
+CLASSES, RARE = 16, 0.002  # of brightness; share of the parts at either end that make no class
+# Share of the parts in which least of the expected difference is left, and how much that is of
+# noise whose neighbours correlate by 0.4 (0.62 to 0.78 by the contrast of the texture), with the
+# best of the places that are compared.
+LEAST, LEAST_OF_NOISE = 0.05, 0.7
+ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers
+VALUES = 1 << 16  # of uint16
 
 
-def noise_of(source: Source) -> float:
-    """Standard deviation (DN) of the noise of an image; 0 without a part that is free of nodata.
+class Grid(Protocol):
+    """What is read of an image [y, x], uint16, 0 for nodata."""
 
-    An upper bound where nothing of the image is flat. Parts of one value alone, as fill values and
-    saturated ones, do not count.
+    shape: tuple[int, ...]
+
+    def __getitem__(self, key: tuple[slice, slice]) -> NDArray[np.uint16]: ...
+
+
+class NoiseCurve(NamedTuple):
+    """Standard ``deviation`` (DN) of an image's noise at some ``brightness`` (DN), which
+    increases."""
+
+    brightness: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+    def equalised(self, pixels: NDArray[np.floating]) -> Singles:
+        """The image [h, w] (whole numbers, 0 for nodata) with STEPS per standard deviation of its
+        noise, in whole numbers; 0 stays 0 and nothing else is."""
+        at = np.interp(np.arange(VALUES - 1) + 0.5, self.brightness, self.deviation)
+        table = np.zeros(VALUES)
+        np.cumsum(STEPS / at, out=table[1:])
+        table[1:] = np.maximum(np.rint(table[1:]), 1.0)
+        return table.astype(np.float32)[pixels.astype(np.int64)]
+
+
+class Parts(NamedTuple):
+    """Parts of the left image and what fits them best in the right one; float64 [n].
+
+    ``brightness``, ``greatest`` (DN) and ``rough`` (DN²: mean square of second differences, as a
+    variance of white noise) in either image; ``variance`` (DN²) of the left image less the right
+    one, whose brightness is brought to it.
     """
-    cols, rows = source.size
-    wide, high = min(SAMPLE_PX, cols), min(SAMPLE_PX, rows)
-    squares = np.concatenate(
-        [
-            _mean_squares(source.read(col, row, wide, high).astype(np.float64))
-            for row in _places(rows)
-            for col in _places(cols)
-        ]
+
+    brightness: tuple[Floats, Floats]
+    greatest: tuple[Floats, Floats]
+    rough: tuple[Floats, Floats]
+    variance: Floats
+
+
+def pair_noise(left: Grid, right: Grid, model: EpipolarModel) -> tuple[NoiseCurve, NoiseCurve]:
+    """Of both images of an epipolar pair, by what they differ by.
+
+    No more than rounding where no part of the images can be compared.
+    """
+    parts = _parts_of(left, right, _disparities(model))
+    curves = [_by_brightness(*of_image) for of_image in zip(*parts[:3])]
+    expected = sum(
+        np.interp(level, curve.brightness, curve.deviation) ** 2 * gain**2
+        for level, curve, gain in zip(
+            parts.brightness, curves, (1.0, parts.brightness[0] / parts.brightness[1])
+        )
     )
-    if not squares.size:
-        return 0.0
-    return float(np.sqrt(np.quantile(squares, FLATTEST) / FLATTEST_OF_NOISE))
+    factor = 1.0
+    if parts.variance.size >= LEAST_PARTS:
+        found = np.quantile(parts.variance / expected, LEAST) / LEAST_OF_NOISE
+        factor = max(float(np.sqrt(found)), 1.0)
+    return tuple(
+        NoiseCurve(curve.brightness, tuple(factor * value for value in curve.deviation))
+        for curve in curves
+    )
 
 
-def resampled_noise(noise: float, widening: Sequence[float]) -> float:
-    """Standard deviation (DN) that is left of white ``noise`` on the average over a resampled
-    image.
-
-    ``widening`` of the kernel along each axis (:mod:`.resampling`).
-    """
-    phases = np.arange(PHASES) / PHASES
-    weights = np.stack([np.polyval(np.asarray(tap, np.float64), phases) for tap in TAP_POLYNOMIALS])
-    kept = float((weights**2).sum(axis=0).mean())
-    return float(noise * np.prod([np.sqrt(kept / wider) for wider in widening]))
+def _disparities(model: EpipolarModel) -> tuple[int, int]:
+    """Least and greatest, px, of the heights of the model."""
+    rows, cols = model.shape
+    axes = np.linspace(0.0, cols - 1.0, 5), np.linspace(0.0, rows - 1.0, 5), model.height_range
+    x, y, height = (grid.reshape(-1) for grid in np.meshgrid(*axes))
+    there = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
+    return int(np.floor(np.nanmin(x - there))), int(np.ceil(np.nanmax(x - there)))
 
 
-def _places(size: int) -> NDArray[np.int64]:
-    """First pixels of the samples along an axis."""
-    count = min(PLACES, max(size // SAMPLE_PX, 1))
-    return np.linspace(0, max(size - SAMPLE_PX, 0), count).astype(np.int64)
+def _parts_of(left: Grid, right: Grid, disparities: tuple[int, int]) -> Parts:
+    """Of all places, but for saturated ones."""
+    found = [_parts(left, right, place, disparities) for place in _places(left)]
+    rows = np.concatenate([np.empty((0, 7)), *found]).T
+    parts = Parts(rows[0:2], rows[2:4], rows[4:6], rows[6])
+    if not rows.size:
+        return parts
+    kept = np.all(parts.greatest < parts.greatest.max(axis=1, keepdims=True), axis=0)
+    return Parts(*(values[..., kept] for values in parts))
 
 
-def _mean_squares(pixels: Floats) -> Floats:
-    """Of each part, the mean square of second differences, as variance of the noise; none of parts
-    with nodata or of one value."""
-    across = pixels[:, 2:] - 2.0 * pixels[:, 1:-1] + pixels[:, :-2]
-    both = across[2:] - 2.0 * across[1:-1] + across[:-2]
-    rows, cols = (size // PART_PX for size in both.shape)
-    parts = both[: rows * PART_PX, : cols * PART_PX].reshape(rows, PART_PX, cols, PART_PX)
-    found = (parts**2).mean(axis=(1, 3)) / SQUARES
-    return found[found > 0.0]  # also false for NaN
+def _places(image: Grid) -> Iterator[tuple[int, int]]:
+    """First pixels (row, column) of places all over an image."""
+    starts = [
+        np.linspace(0, size - PLACE_PX, min(PLACES, size // PLACE_PX)).astype(int)
+        for size in image.shape
+    ]
+    for row in starts[0].tolist():
+        for col in starts[1].tolist():
+            yield row, col
+
+
+def _parts(left: Grid, right: Grid, place: tuple[int, int], disparities: tuple[int, int]) -> Floats:
+    """Those of a place, a row of the values of :class:`Parts` each; none with nodata or of one
+    value."""
+    row, col = place
+    rows = slice(row, row + PLACE_PX)
+    # columns of the right image that may show the place
+    first = max(col - disparities[1] - NEAR_PX, 0)
+    end = min(col - disparities[0] + PLACE_PX + NEAR_PX, right.shape[1])
+    if end - first < PLACE_PX:
+        return np.empty((0, 7))
+    here = left[rows, col : col + PLACE_PX].astype(np.float64)
+    there = right[rows, first:end].astype(np.float64)
+    middle = _best_column(here, there)
+    columns = range(max(middle - NEAR_PX, 0), min(middle + NEAR_PX, there.shape[1] - PLACE_PX) + 1)
+    rough, rough_there = _second_differences(here), _second_differences(there)
+    level, greatest = _of_parts(here), _of_parts(here, np.max)
+    own = level, greatest, _of_parts(rough)
+    best = np.full((7, *level.shape), np.inf)
+    for column in columns:
+        at = slice(column, column + PLACE_PX)
+        match = there[:, at]
+        usable = _of_parts((here > 0.0) & (match > 0.0)) == 1.0
+        level_there = _of_parts(match)
+        gain = level / np.where(usable, level_there, 1.0)
+        wide = np.repeat(np.repeat(gain, PART_PX, axis=0), PART_PX, axis=1)
+        variance = np.where(usable, _of_parts((here - wide * match) ** 2), np.inf)
+        values = (
+            level, level_there, greatest, _of_parts(match, np.max),
+            own[2], _of_parts(rough_there[:, at]), variance,
+        )  # fmt: skip
+        best = np.where(variance < best[6], values, best)
+    return best[:, np.isfinite(best[6]) & (best[4:] > 0.0).all(axis=0)].T
+
+
+def _second_differences(values: Floats) -> Floats:
+    """Along both axes, squared, as variances of white noise; 0 at the rim of [h, w]."""
+    out = np.zeros_like(values)
+    across = values[:, 2:] - 2.0 * values[:, 1:-1] + values[:, :-2]
+    out[1:-1, 1:-1] = (across[2:] - 2.0 * across[1:-1] + across[:-2]) ** 2 / SQUARES
+    return out
+
+
+def _of_parts(values: NDArray, of: Callable[..., NDArray] = np.mean) -> Floats:
+    """Means, or else, of the parts of a place."""
+    count = PLACE_PX // PART_PX
+    return of(values.reshape(count, PART_PX, count, PART_PX), axis=(1, 3))
+
+
+def _best_column(here: Floats, there: Floats) -> int:
+    """Column of ``there`` [h, m] from which on it correlates best with ``here`` [h, w], row by
+    row."""
+    size = 1 << int(np.ceil(np.log2(there.shape[1] + here.shape[1])))
+    here, there = (_along_rows(values) for values in (here, there))
+    spectrum = (np.fft.rfft(there, size) * np.conj(np.fft.rfft(here, size))).sum(axis=0)
+    count = there.shape[1] - here.shape[1] + 1
+    product = np.fft.irfft(spectrum, size)[:count]
+    energy = np.concatenate([[0.0], np.cumsum((there**2).sum(axis=0))])
+    energy = energy[here.shape[1] :] - energy[:count]
+    return int(np.argmax(product / np.sqrt(np.maximum(energy, energy.max() / 100.0) + 1.0)))
+
+
+def _along_rows(values: Floats) -> Floats:
+    """Differences of neighbours along the rows, 0 beside nodata."""
+    out = np.zeros_like(values)
+    known = (values[:, 1:] > 0.0) & (values[:, :-1] > 0.0)
+    out[:, 1:] = np.where(known, np.diff(values, axis=1), 0.0)
+    return out
+
+
+def _by_brightness(brightness: Floats, _greatest: Floats, rough: Floats) -> NoiseCurve:
+    """By the brightness (DN) of parts [n] and by how ``rough`` they are; but for a factor."""
+    levels: list[float] = []
+    deviations: list[float] = []
+    if brightness.size >= LEAST_PARTS:
+        edges = np.geomspace(*np.quantile(brightness, [RARE, 1.0 - RARE]), CLASSES + 1)
+        of_class = np.searchsorted(edges[1:-1], brightness)
+        for k in range(CLASSES):
+            chosen = of_class == k
+            if chosen.sum() >= LEAST_PARTS:
+                variance = max(np.quantile(rough[chosen], FLATTEST), ROUNDING)
+                levels.append(float(np.median(brightness[chosen])))
+                deviations.append(float(np.sqrt(variance)))
+    if not levels:
+        return NoiseCurve((0.0,), (float(np.sqrt(ROUNDING)),))
+    return NoiseCurve(tuple(levels), tuple(deviations))

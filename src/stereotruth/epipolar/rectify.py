@@ -25,7 +25,6 @@ from ..products.provenance import digest, file_sha256, source_digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from .acquisition import read_acquisition
 from .colours import COLOURS
-from .image_noise import noise_of, resampled_noise
 from .image_reader import Source
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
@@ -288,8 +287,7 @@ def rectify(
                 strip=strip,
             )
             if strip is None:
-                noise = resampled_noise(noise_of(source), facts["kernel_widening_col_row"])
-                attrs["resampling"] = facts | {"noise_dn": round(noise, 3)}
+                attrs["resampling"] = facts
                 finished.append((grid, store, attrs))
         for grid, store, attrs in finished:
             grid.write_atomically(store, blocks(model.shape, SHARD), attrs)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inlined, inner, kernel
+from ..numerics.degrees import continuous
 from .line_correction import LineCorrection, of_record, read_correction
 
 Floats = NDArray[np.float64]
@@ -224,6 +225,8 @@ class RPC:
     def __post_init__(self) -> None:
         for name in SCALARS:
             value = float(getattr(self, name))
+            if name == "long_off" and abs(value) <= LIMITS[name]:
+                value = float(continuous(value))
             if not np.isfinite(value):
                 raise ValueError(f"{name} is not finite")
             if name.endswith("_scale") and abs(value) < SMALLEST_SCALE:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import CHANGED, probability_of_change
+from stereotruth.disparity.change_probability import (
+    CHANGED,
+    UNKNOWN,
+    as_learned,
+    beyond_learned,
+    learned,
+    probability_of_change,
+)
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
@@ -26,12 +33,12 @@ from ...synthetic.textured_fields import (
     right_of,
 )
 
-NO_NOISE = 0.0, 0.0
+NOISE = 15.0**2, 15.0**2  # a tenth of the contrast of the fields
 INNER = np.s_[20:-20, 20:-20]
 
 
 def probability(
-    window: PairWindow, noise: tuple[float, float] = NO_NOISE, diachronic: bool = True
+    window: PairWindow, noise: tuple[float, float] = NOISE, diachronic: bool = True
 ) -> np.ndarray:
     return probability_of_change(LabelledWindow(window, LEVEL, ALL, GROUND, noise), diachronic)
 
@@ -81,7 +88,7 @@ def test_no_window_changes_it(diachronic: bool) -> None:
     )
     labels = Labels(np.full(shape, 4.0), np.zeros((2, *shape)), np.zeros(shape))
     of = LabelledWindow(
-        window, labels, np.ones(shape, np.bool_), np.full(shape, 2, np.uint8), NO_NOISE
+        window, labels, np.ones(shape, np.bool_), np.full(shape, 2, np.uint8), NOISE
     )
     part = probability_of_change(of, diachronic)
     inner = np.s_[30:-30, 30:-30]
@@ -90,9 +97,21 @@ def test_no_window_changes_it(diachronic: bool) -> None:
 
 def test_what_is_left_to_doubt_goes_into_the_variance() -> None:
     """A label counts as off by a pixel with that probability."""
-    apart = Comparison(9, NO_NOISE, diachronic=True)
+    apart = Comparison(9, NOISE, diachronic=True)
     window = built()
     found = contradicted(LEVEL, window, apart, ALL, GROUND)
     expected = probability(window)
     assert np.array_equal(found.variance, expected)
     assert np.array_equal(found.changed, expected > CHANGED)
+
+
+@LIGHTS
+def test_what_was_never_learned_is_asked_less(diachronic: bool) -> None:
+    """Each figure beyond what trees were fitted to brings a probability nearer to the usual one."""
+    low, high = learned(diachronic).astype(np.float32)
+    middle = (low + high) / 2
+    figures = np.stack([middle, high + 1, np.where(np.arange(low.size) == 3, low - 1, middle)])
+    assert beyond_learned(figures.T, diachronic).tolist() == [0, low.size, 1]
+    found = as_learned(np.full(3, 0.98), np.arange(3))
+    assert found[0] == pytest.approx(0.98) and (np.diff(found) < 0).all() and found[2] > UNKNOWN
+    assert as_learned(np.array([UNKNOWN]), np.array([5])) == pytest.approx(UNKNOWN)

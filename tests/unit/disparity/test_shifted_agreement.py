@@ -28,6 +28,8 @@ from ...synthetic.textured_fields import (
     through_optics,
 )
 
+NOISE = 15.0**2, 15.0**2  # a tenth of the contrast of the fields
+
 
 def grown(by: int) -> PairWindow:
     """Of labels of 4 px: a field that is higher by so many px."""
@@ -63,7 +65,7 @@ def test_what_has_grown_agrees_at_another_disparity(by: int, reach: int) -> None
 @pytest.mark.parametrize("diachronic", [False, True])
 def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
     """Where images share no light, their brightness tells nothing."""
-    comparison = Comparison(9, (0.0, 0.0), diachronic)
+    comparison = Comparison(9, NOISE, diachronic)
     changed = contradicted(LEVEL, shadowed(), comparison, ALL, GROUND).changed
     assert changed.any() != diachronic
 
@@ -71,7 +73,7 @@ def test_shadows_are_changes_of_one_light_alone(diachronic: bool) -> None:
 def test_a_change_is_found_under_another_sun() -> None:
     window = grown(3)
     window.right.pixels[:, 60:] *= 0.2
-    comparison = Comparison(9, (0.0, 0.0), True)
+    comparison = Comparison(9, NOISE, True)
     changed = contradicted(LEVEL, window, comparison, ALL, GROUND).changed
     assert changed[47:73, 58:92].all() and not changed[:30].any()
 
@@ -103,7 +105,7 @@ def test_a_small_crown_that_was_felled(diachronic: bool) -> None:
     labels = Labels(disparity, LEVEL.slope, LEVEL.variance)
     left = through_optics(0)
     window = pair(left, right_of(left, np.full((160, 260), 4)))
-    comparison = Comparison(9, (0.0, 0.0), diachronic)
+    comparison = Comparison(9, NOISE, diachronic)
     changed = contradicted(labels, window, comparison, ALL, classes).changed
     assert changed[57:66, 72:81].all()
     changed[crown] = False
@@ -140,22 +142,23 @@ def test_single_pixels_at_the_borders_of_a_wide_window():
 
 @pytest.mark.parametrize("diachronic", [False, True])
 def test_beside_a_young_crown_labels_are_confirmed(diachronic: bool) -> None:
-    """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings."""
+    """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings.
+    Under two suns half of it may be a shadow that has moved."""
     grown, still, tree = np.s_[56:65, 66:75], np.s_[30:33, 20:23], 5
     classes, disparity = GROUND.copy(), np.full((160, 260), 4)
     classes[59:62, 69:72] = classes[still] = tree
     disparity[20:140, 60:200][grown] += 3
     left = texture()
     window = pair(left, right_of(left, disparity))
-    comparison = Comparison(9, (0.0, 0.0), diachronic)
+    comparison = Comparison(9, NOISE, diachronic)
     changed = contradicted(LEVEL, window, comparison, ALL, classes).changed
-    assert changed[grown].mean() > 0.9
+    assert changed[grown].mean() > (0.35 if diachronic else 0.9)
     assert not changed[25:38, 15:28].any()
 
 
 def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
     """The more, the less the images agree; those of images of one light are as they were."""
-    apart = Comparison(9, (0.0, 0.0), diachronic=True)
+    apart = Comparison(9, NOISE, diachronic=True)
     left = texture()
     right = right_of(left, np.full((160, 260), 4))
     blank = np.full_like(left, 700.0)
@@ -168,7 +171,7 @@ def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
     )
     inner = np.s_[20:-20, 20:-20]
     assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
-    same = Comparison(9, (0.0, 0.0))
+    same = Comparison(9, NOISE)
     assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0
 
 
@@ -204,8 +207,9 @@ def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:
     own = left.pixels[top - left.row :, side - left.col :][:rows, :cols]
     surface = LEVEL.disparity, LEVEL.slope
     clear = apart_from_steps(LEVEL.disparity)
-    found, means = at(window), []
-    for shift in (0, *map(int, SHIFTS_PX)):
+    whole = tuple(shift for shift in SHIFTS_PX if shift % 1.0 == 0.0)
+    found, means = shifted_agreement(LEVEL, window, (0.0, 0.0), 9, 8, ALL, whole), []
+    for shift in (0, *map(int, whole)):
         there = right.pixels[top - right.row :, side - 4 - shift - right.col :][:rows, :cols]
         alone = surface_correlation(own, there, *surface, 9, clear)
         means.append(surface_mean(alone, *surface, 8, 4, None, top))

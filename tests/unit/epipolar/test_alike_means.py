@@ -12,6 +12,7 @@ from stereotruth.epipolar.surface_correlation import wanted_runs
 SHAPE = 40, 60
 EVERY = np.ones(SHAPE, np.bool_)
 FLAT = np.zeros((2, *SHAPE))
+NO_NOISE = 0.0, 0.0
 
 
 def by_hand(
@@ -43,7 +44,7 @@ def test_it_is_the_mean_of_the_pixels_that_are_alike(reach: int, every: int) -> 
     disparity[20:] += 5.0
     given = values, left, right, disparity
     bright = brightness_of_pair(left, right)
-    found = alike_mean(values, bright, disparity, FLAT, reach, every, wanted_runs(EVERY))
+    found = alike_mean(values, bright, disparity, FLAT, reach, every, NO_NOISE, wanted_runs(EVERY))
     expected = np.array(
         [[by_hand(*given, y, x, reach, every) for x in range(SHAPE[1])] for y in range(SHAPE[0])]
     )
@@ -61,7 +62,9 @@ def test_it_ends_at_an_edge_of_either_image() -> None:
     values = np.zeros(SHAPE)
     values[:, 20:40] = 1.0
     bright = brightness_of_pair(left, right)
-    found = alike_mean(values, bright, np.full(SHAPE, 2.0), FLAT, 8, 1, wanted_runs(EVERY))
+    found = alike_mean(
+        values, bright, np.full(SHAPE, 2.0), FLAT, 8, 1, NO_NOISE, wanted_runs(EVERY)
+    )
     beside_edges = np.abs(np.arange(SHAPE[1]) - 19.5) < 2.0  # brightness is of 3 x 3 px
     beside_edges |= np.abs(np.arange(SHAPE[1]) - 39.5) < 2.0
     assert np.array_equal(found[:, ~beside_edges], values[:, ~beside_edges])
@@ -73,5 +76,5 @@ def test_what_is_wanted_has_the_values_that_all_together_have(share: float) -> N
     values, left, right = rng.uniform(0.5, 1.0, (3, *SHAPE))
     given = values, brightness_of_pair(left, right), np.full(SHAPE, 2.0), FLAT, 5, 1
     wanted = rng.uniform(size=SHAPE) < share
-    every, some = (alike_mean(*given, wanted_runs(of)) for of in (EVERY, wanted))
+    every, some = (alike_mean(*given, NO_NOISE, wanted_runs(of)) for of in (EVERY, wanted))
     assert np.array_equal(every[wanted], some[wanted], equal_nan=True)

@@ -1,20 +1,25 @@
-"""The noise of an image by its flattest parts, and what it leaves of a correlation."""
+"""The noise of two images of the same ground by brightness, and images of equal noise."""
 
-from pathlib import Path
+from __future__ import annotations
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.epipolar.image_noise import noise_of, resampled_noise
-from stereotruth.epipolar.image_reader import Source
+from stereotruth.epipolar.image_noise import STEPS, NoiseCurve, pair_noise
 from stereotruth.epipolar.surface_correlation import correlation_and_expected
-from stereotruth.numerics.cubic_convolution import six_point_weights_of_row
-
-from ...synthetic.images import write_image
 
 SIDE = 400
 LEVEL = np.zeros((2, SIDE, SIDE), np.float32)
+SHIFT = 7  # px of disparity
+MODEL = SimpleNamespace(
+    shape=(SIDE, SIDE),
+    height_range=(-30.0, 30.0),
+    epipolar_to_ground=lambda x, y, height: (x, y),
+    ground_to_epipolar=lambda lon, lat, height: np.stack([lon, lat, lon - height, lat]),
+)
 
 
 def texture(seed: int, contrast: float) -> np.ndarray:
@@ -23,32 +28,49 @@ def texture(seed: int, contrast: float) -> np.ndarray:
     return 500.0 + contrast * field / field.std()
 
 
-def noisy(image: np.ndarray, sigma: float, seed: int) -> np.ndarray:
-    """An image with white noise, whole grey values."""
-    noise = np.random.default_rng(seed).normal(scale=sigma, size=image.shape)
-    return np.rint(image + noise).astype(np.uint16)
+def noisy(image: np.ndarray, sigma: np.ndarray | float, seed: int, blur: float = 0.0) -> np.ndarray:
+    """An image with noise, white or of neighbours that correlate, in whole grey values."""
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=image.shape), blur)
+    return np.clip(np.rint(image + sigma * noise / noise.std()), 1, 65535).astype(np.uint16)
 
 
-@pytest.mark.parametrize("sigma", [3.0, 10.0])
-def test_noise_is_that_of_the_flattest_parts(tmp_path: Path, sigma: float) -> None:
-    """With blurred texture of six to twenty times the noise all over, and a rim of nodata."""
-    pixels = noisy(texture(1, 60.0), sigma, 2)
-    pixels[:, :30] = 0
-    with Source(write_image(tmp_path / "noisy.tif", None, pixels)) as source:
-        assert noise_of(source) == pytest.approx(sigma, rel=0.12)
+def shaded_pair(blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Ground in the light and in shadow, where the noise is six times as great; a half of it has
+    texture."""
+    shade = np.arange(SIDE)[:, None] // 60 % 2 == 1
+    has_texture = np.arange(SIDE) < SIDE // 2
+    ground = np.where(has_texture, texture(1, 60.0), 500.0)
+    left = np.where(shade, 0.16, 0.4) * ground
+    sigma = np.where(shade, 6.0, 1.0)
+    right = np.roll(left, -SHIFT, axis=1)
+    return noisy(left, sigma, 3, blur), noisy(right, sigma, 4, blur)
 
 
-def test_resampling_leaves_what_its_kernel_does() -> None:
-    """White noise, shifted by every tenth of a pixel along both axes."""
-    noise = np.random.default_rng(3).normal(size=(300, 300))
-    left = []
-    for phase in np.arange(10) / 10:
-        weights = np.empty((6, 1), np.float32)
-        six_point_weights_of_row(np.array([phase], np.float32), weights)
-        along = np.apply_along_axis(np.convolve, 1, noise, weights[:, 0], "valid")
-        left.append(along.std())
-    assert resampled_noise(1.0, (1.0, 1.0)) == pytest.approx(np.mean(np.square(left)), rel=0.02)
-    assert resampled_noise(1.0, (2.0, 2.0)) == pytest.approx(np.mean(np.square(left)) / 2, rel=0.02)
+@pytest.mark.parametrize("blur", [0.0, 0.55])
+def test_noise_is_known_by_brightness_whether_its_neighbours_correlate(blur: float) -> None:
+    curves = pair_noise(*shaded_pair(blur), MODEL)
+    for curve in curves:
+        dark, lit = np.interp([80.0, 200.0], curve.brightness, curve.deviation)
+        assert dark == pytest.approx(6.0, rel=0.25)
+        assert lit == pytest.approx(1.0, rel=0.25)
+
+
+def test_noise_of_images_without_ground_in_common_is_rounding_at_least() -> None:
+    nothing = np.zeros((SIDE, SIDE), np.uint16)
+    for curve in pair_noise(nothing, nothing, MODEL):
+        assert curve.deviation == pytest.approx((12.0**-0.5,))
+
+
+def test_images_of_equal_noise_have_the_same_at_all_brightness() -> None:
+    curve = NoiseCurve((60.0, 200.0), (6.0, 1.0))
+    levels = np.full((2, 200, 200), 60.0) + 140.0 * np.arange(2)[:, None, None]
+    sigma = np.interp(levels[:, 0, 0], curve.brightness, curve.deviation)
+    for image, of in zip(levels, sigma):
+        equal = curve.equalised(noisy(image, of, 5).astype(np.float32))
+        assert equal.std() == pytest.approx(STEPS, rel=0.15)
+    values = np.arange(65536, dtype=np.float32)[None]
+    equal = curve.equalised(values)[0]
+    assert equal[0] == 0.0 and (equal[1:] > 0.0).all() and (np.diff(equal) >= 0.0).all()
 
 
 @pytest.mark.parametrize("contrast", [10.0, 20.0])
