@@ -126,7 +126,7 @@ def test_strips_are_part_of_what_labels_state():
         )
         assert shared.sigma_px[0] > 0.02
         assert shared.sigma_px[1] == 0.0
-        assert 0.6 < np.std(sites) / sigma < 1.5
+        assert 0.4 < np.std(sites) / sigma < 1.2
         assert not shared.smooth
 
 
