@@ -35,7 +35,7 @@ SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
 # change more than all else.
-CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.3, 0.2, 0.05
+CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.4, 0.2, 0.05
 TREES = Path(__file__).with_suffix(".tsv")
 
 
