@@ -28,16 +28,15 @@ from planted_changes import KINDS, Planted, RealScene
 from stereotruth.disparity.change_evidence import Evidence, LabelledWindow, change_evidence
 from stereotruth.disparity.change_probability import (
     CHANGED,
-    LEARNED,
     TREES,
     UNCHANGED,
     by_itself,
-    learned,
     probability_by,
     trees,
     with_surroundings,
 )
 from stereotruth.disparity.crowns import with_crowns
+from stereotruth.disparity.learned_evidence import LEARNED, learned
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window

@@ -21,6 +21,7 @@ from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
 from .change_evidence import Evidence, LabelledWindow, change_evidence
+from .learned_evidence import as_learned, beyond_learned
 from .surface_means import surface_mean
 
 Floats = NDArray[np.float64]
@@ -34,10 +35,8 @@ SURE = 1e-4  # no mean of probabilities counts as less, nor as nearer to 1
 UNCHANGED = 0.0005  # probability where the images agree closely
 # More probable, a label is left out; one of a crown, and one beside a young crown, sooner: trees
 # change more than all else.
-CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.3, 0.2, 0.05
-UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
+CHANGED, CROWN_CHANGED, YOUNG_CHANGED = 0.4, 0.2, 0.05
 TREES = Path(__file__).with_suffix(".tsv")
-LEARNED = Path(__file__).with_name("change_evidence_learned.tsv")
 
 
 def with_surroundings(own: Floats, doubtful: Bools, compared: LabelledWindow) -> list[Singles]:
@@ -68,29 +67,6 @@ def trees(diachronic: bool) -> list[DecisionTrees]:
     ``diachronic``: whether the images share no light. The table has both of either by turns.
     """
     return DecisionTrees.load(TREES)[diachronic::2]
-
-
-@cache
-def learned(diachronic: bool) -> Floats:
-    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
-    for one in two thousand at either end."""
-    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
-    return rows[rows[:, 0] == diachronic, 1:].T
-
-
-def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
-    """How many of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]."""
-    low, high = learned(diachronic)[..., None]
-    return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
-
-
-def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
-    """The probability [n], nearer to UNKNOWN the more figures lie ``beyond`` what has been learned:
-    the difference of the log odds is divided by one more than these."""
-    odds, unknown = (
-        np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
-    )
-    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / (1 + beyond))))
 
 
 def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import (
-    CHANGED,
+from stereotruth.disparity.change_probability import CHANGED, probability_of_change
+from stereotruth.disparity.image_agreement import Comparison, contradicted
+from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.learned_evidence import (
     UNKNOWN,
     as_learned,
     beyond_learned,
     learned,
-    probability_of_change,
 )
-from stereotruth.disparity.image_agreement import Comparison, contradicted
-from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
 

@@ -1,0 +1,42 @@
+"""How far what both images tell lies outside of what the probabilities were learned from.
+
+Decision trees answer as surely where nothing like it was ever learned. So the range of each figure
+of the evidence lies beside them (bench/change_probability.py), and a pixel beyond it is asked less.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
+LEARNED = Path(__file__).with_suffix(".tsv")
+
+
+@cache
+def learned(diachronic: bool) -> Floats:
+    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
+    for one in two thousand at either end."""
+    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
+    return rows[rows[:, 0] == diachronic, 1:].T
+
+
+def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
+    """How many of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]."""
+    low, high = learned(diachronic)[..., None]
+    return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
+
+
+def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
+    """The probability [n], nearer to UNKNOWN the more figures lie ``beyond`` what has been learned:
+    the difference of the log odds is divided by one more than these."""
+    odds, unknown = (
+        np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
+    )
+    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / (1 + beyond))))
