@@ -18,15 +18,15 @@ STARTS = {
     "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
     "ingest": {"laspy", "numba", "pyproj"},
-    "align": {"cv2", "numba", "pydantic", "rasterio"},
-    "refine": {"cv2", "numba", "pydantic", "rasterio", "scipy.special"},
-    "adjust": {"cv2", "numba", "pydantic", "rasterio", "scipy.special"},
+    "align": {"cv2", "numba", "pydantic", "pyproj", "rasterio"},
+    "refine": {"cv2", "numba", "pydantic", "pyproj", "rasterio", "scipy.special"},
+    "adjust": {"cv2", "numba", "pydantic", "pyproj", "rasterio", "scipy.special"},
     "adjusted_alignment": {"numba"},
     "rectify": {"dask", "numba", "pydantic", "rasterio", "zarr"},
     "project": {"dask", "numba", "pydantic", "zarr"},
     "project_strip": {"dask", "numba", "pydantic", "zarr"},
     "grid_truth": {"numba", "rasterio", "zarr"},
-    "match": {"cv2", "pydantic", "rasterio"},
+    "match": {"pydantic", "rasterio"},
 }
 
 

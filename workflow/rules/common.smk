@@ -24,6 +24,7 @@ from stereotruth.project import (
     stores_of,
     surfaces_of,
 )
+from stereotruth.settings import epoch_year
 from stereotruth.simulate import city_files
 
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))

@@ -18,7 +18,7 @@ rule ingest:
     params:
         script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
-        lidar_epoch=lambda w: SCENES[w.scene].lidar_epoch,
+        lidar_epoch=lambda w: epoch_year(SCENES[w.scene].lidar_epoch),
         epoch=lambda w: epoch_of(w.city),
         acquired=lambda w: ACQUIRED.get(str(LIDAR[w.scene][w.lidar]), []),
         drop_classes=sorted(SETTINGS.ingest.drop_classes),

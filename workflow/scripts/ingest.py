@@ -7,7 +7,6 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.range_copies import prune
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.settings import epoch_year
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None
@@ -28,7 +27,7 @@ if __name__ == "__main__":
                 footprint=None if ground is None else Footprint.of_runs(ground),
                 lidar_crs=parameters["lidar_crs"] or None,
                 geoid=geoid,
-                epochs=Epochs(Epoch(*parameters["epoch"]), epoch_year(parameters["lidar_epoch"])),
+                epochs=Epochs(Epoch(*parameters["epoch"]), parameters["lidar_epoch"]),
                 acquired=snakemake.params.acquired,
                 drop_classes=tuple(parameters["drop_classes"]),
                 provenance=describe(snakemake.input, parameters, snakemake.params.code),

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 
 from ..numerics.degrees import metres_per_degree
 
@@ -118,6 +117,8 @@ def _lines(at: Floats, height: Floats, most: int) -> Floats:
     steps = _steps(at, height, cell)
     if len(steps) < FEWEST:
         return np.zeros((0, 7))
+    from scipy.spatial import cKDTree  # most pairs look for no edges
+
     tree, points = cKDTree(steps[:, :2]), cKDTree(at)
     free, tried = np.ones(len(steps), bool), np.zeros(len(steps), bool)
     lines = []

@@ -30,7 +30,8 @@ from .lack_of_fit import shared_spread, with_shared_errors
 from .line_fit import estimate_with_lines
 from .plan_frame import PlanFrame, with_offsets
 from .robust_fit import BLUNDER_FLOOR
-from .site_lines import PairOfLines, SiteLines, fit_site_lines
+from .site_line_corrections import SiteLines
+from .site_lines import PairOfLines, fit_site_lines
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -14,7 +14,7 @@ from ..epipolar.rpc import SensorModel
 from ..products.files import atomic_file, read_record, sealed
 from .aligned_pair import Alignment, GcpResidual, ViewFit, over_the_image
 from .equations import spread_of
-from .site_lines import SiteLines
+from .site_line_corrections import SiteLines
 from .tie_equations import read_equations
 
 

@@ -19,9 +19,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from rasterio.errors import RasterioError
-
-from ..products.ungeoreferenced import open_raster
 from .sun import sun_over, toward_sun
 
 MAX_BYTES = 5_000_000  # of a file beside an image
@@ -65,6 +62,8 @@ def read_acquisition(image: str | Path, place: tuple[float, float]) -> Acquisiti
                 found = Acquisition(said.time, said.sun, file.name)
                 break
     if found.time is None:
+        from rasterio.errors import RasterioError  # who knows the time needs no GDAL
+
         with suppress(OSError, ValueError, RasterioError):
             tags = _of_tags(image)
             found = Acquisition(tags.time, found.sun or tags.sun, found.source or tags.source)
@@ -195,6 +194,8 @@ def _of_stac(item: Mapping[str, Any]) -> Acquisition | None:
 
 def _of_tags(image: Path) -> Acquisition:
     """The tags of NITF files, and what GDAL finds of a sensor's metadata (domain IMAGERY)."""
+    from ..products.ungeoreferenced import open_raster
+
     with open_raster(image) as dataset:
         tags, imagery = dataset.tags(), dataset.tags(ns="IMAGERY")
     sun = None

@@ -39,7 +39,7 @@ from ..alignment.adjustment import estimate, parameters_of
 from ..alignment.aligned_pair import Alignment, over_the_image
 from ..alignment.equations import PairEquations
 from ..alignment.site_fit import rpc_prior
-from ..alignment.site_lines import SiteLines
+from ..alignment.site_line_corrections import SiteLines
 from ..alignment.tie_equations import read_equations
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
