@@ -6,6 +6,7 @@ is compared. Rows are kept in the folder: a run that was stopped is carried on.
 python bench/refinement.py accuracy
 python bench/refinement.py any --scenes 60
 python bench/refinement.py open --scenes 2 --labels
+python bench/refinement.py jitter --scenes 4
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ SEEDS = {
     "accuracy": 2700,
     "any": 52700,
     "open": 92700,
+    "jitter": 132700,
 }  # of the first scene; nothing is tuned on them
 SIDE_PX = 1400
 DENSITIES = (0.25, 0.5, 1.0, 2.0, 4.0, 12.0)
@@ -112,7 +114,23 @@ def open_draws(count: int) -> Iterator[tuple[Draw, int]]:
             yield draw, 15
 
 
-DRAWS = {"accuracy": accuracy_draws, "any": any_draws, "open": open_draws}
+def jitter_draws(count: int) -> Iterator[tuple[Draw, int]]:
+    """Towns and suburbs of 8 bits, white roofs and blur that differs; the same with an attitude
+    that jitters."""
+    for number in range(count):
+        plain = Draw(
+            SEEDS["jitter"] + number,
+            zones=("town", "suburb")[number % 2],
+            ground_m2=400.0,
+            psf_px=(0.42, 0.6),
+            saturates=0.45,
+            side_px=1100,
+        )
+        for jitter_px in (0.0, 0.18):
+            yield replace(plain, jitter_px=jitter_px), 15
+
+
+DRAWS = {"accuracy": accuracy_draws, "any": any_draws, "open": open_draws, "jitter": jitter_draws}
 
 
 def conditions(draw: Mapping[str, Any], gcps: int) -> str:
@@ -124,6 +142,10 @@ def conditions(draw: Mapping[str, Any], gcps: int) -> str:
         found.append(f"{draw['vehicles']:g} cars/ha")
     if draw["roofs"] == "flat":
         found.append("flat")
+    if draw["saturates"]:
+        found.append("8 bits")
+    if draw["jitter_px"]:
+        found.append(f"jitter {draw['jitter_px']:g} px")
     return ", ".join([draw["zones"], f"{draw['relief_m']:.0f} m", f"{gcps} GCPs", *found])
 
 
@@ -178,6 +200,7 @@ def trial(draw: Draw, gcps: int, with_labels: bool, folder: Path) -> Row:
     except InputError as error:
         return row | {"refused": str(error), "seconds": time.process_time() - start}
     row["applied"] = bool(refined.refinement["applied"])
+    row["by_line"] = bool(refined.refinement.get("by_line", {}).get("used"))
     row["ties"] = 0 if observations is None else int(observations.used.sum())
     row["refined"] = _of_errors(scene, refined, with_sigma=True)
     row["doubts"] = list(refined.warnings)
@@ -223,7 +246,8 @@ def cells(row: Row) -> list[str]:
     refined = row["refined"]
     return [
         *first, f"{refined['bias']:+.3f}", f"{refined['mean_absolute']:.3f}",
-        f"{refined['sigma']:.3f}", str(row["ties"]) + ("" if row["applied"] else " (not applied)"),
+        f"{refined['sigma']:.3f}", str(row["ties"]) + (", by line" if row["by_line"] else "")
+        + ("" if row["applied"] else " (not applied)"),
         str(len(row["doubts"])),
     ]  # fmt: skip
 
@@ -259,7 +283,9 @@ def asked(what: str, rows: list[Row]) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "what", choices=list(DRAWS), help="suburbs and parks, any scenes, or open towns"
+        "what",
+        choices=list(DRAWS),
+        help="suburbs and parks, any scenes, open towns, or an attitude that jitters",
     )
     parser.add_argument("--scenes", type=int, default=10, help="how many are drawn")
     parser.add_argument("--folder", type=Path, default=Path("results/refinement"))

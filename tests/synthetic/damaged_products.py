@@ -144,7 +144,9 @@ def _grid(place: Path) -> Any:
 def _points(place: Path) -> Any:
     store = PointStore(place.parent)
     found = store.query(*store.bounds[:4])
-    return [repr(store.attrs), _digest(found.lon_q, found.lat_q, found.h_q, found.classification)]
+    strips = [store.strips_of(cell) for cell in range(store.cell_row.size)]
+    values = found.lon_q, found.lat_q, found.h_q, found.classification, *strips
+    return [repr(store.attrs), _digest(*values)]
 
 
 def _lines(place: Path) -> Any:

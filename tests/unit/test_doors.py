@@ -21,16 +21,21 @@ from rasterio.transform import Affine
 
 from stereotruth.alignment.control_points import read_gcps
 from stereotruth.command.import_gcps import import_gcps
+from stereotruth.epipolar.rpc import RPC
 from stereotruth.errors import InputError
 from stereotruth.evaluation.surface_models import score
 from stereotruth.evaluation.surface_models.reference import RasterReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
+from stereotruth.lidar.declared_crs import LidarCRS
 from stereotruth.lidar.geoid import GeoidGrid
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.to_wgs84 import check_area
+from stereotruth.numerics.degrees import continuous
 
 from ..synthetic.analytic_town import EPSG, NORTH, SIDE, WEST, Town, write
-from ..synthetic.las import FT, US_FT, everything, write_gtx
+from ..synthetic.las import FT, US_FT, everything, write_gtx, write_las
+from ..synthetic.surveyed_pair import RPCS
 
 TOWN, CELL = Town(), 0.5
 EAST_M, NORTH_M, UP_M = 2.0, -1.0, 0.5  # of the models that are scored
@@ -280,6 +285,33 @@ def test_each_kind_at_each_door_is_right_or_refused(door, kind, folder, tmp_path
     assert "Remedy: " in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Kind("classes", dtype="uint8"), ""),
+        (Kind("classes above EGM96", dtype="uint8", declared=f"EPSG:{EPSG}+5773"), ""),
+        (Kind("two bands", dtype="uint8", more={"bands": 2}), "2 bands of uint8 are no raster of"),
+        (Kind("complex", dtype="complex64"), "no raster of classes"),
+        (Kind("codes of another scheme", dtype="int16", unit=0.1), "which is no class of LAS"),
+        (Kind("degrees", dtype="uint8", crs=4326), "another grid"),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_each_kind_of_classes_is_right_or_refused(kind, words, tmp_path):
+    """Values of some 50 to 70, as producers' own classes may be."""
+    truth_file = write(tmp_path / "truth.tif", TOWN.heights())
+    file = write_kind(kind, tmp_path / "classes.tif", moved=False)
+    if not words:
+        reference = RasterReference(truth_file, classes=file)
+        found = reference.classes.window(slice(0, 9), slice(0, 9))
+        np.testing.assert_array_equal(found, np.rint(TOWN.heights()[:9, :9]))
+        return
+    with pytest.raises(InputError, match=words) as error:
+        reference = RasterReference(truth_file, classes=file)
+        reference.classes.window(slice(0, 350), slice(0, 350))
+    assert "classes.tif" in str(error.value) and "Remedy: " in str(error.value)
+
+
 # ------------------------------------------------------------------------------------------ geoids
 
 
@@ -373,3 +405,104 @@ def test_each_kind_of_geoid_is_right_or_refused(kind, tmp_path):
         return
     found = GeoidGrid(path)((places[0] + 180) % 360 - 180, places[1])
     np.testing.assert_allclose(found, undulation(*places), atol=0.006)
+
+
+# ------------------------------------------------------------------------------- control points
+
+
+def written(heights: float, crs: str, place: tuple[float, float], suffix: str, head: str) -> str:
+    """A point at a place in a system, as the formats have it."""
+    x, y = pyproj.Transformer.from_crs(4326, crs or 4326, always_xy=True).transform(*place)
+    if suffix == ".gcp":
+        return f"{head}P1 {place[1]:.10f} {place[0]:.10f} {heights} 1 1 1 l 1 2 1 1 r 3 4 1 1\n"
+    columns = "id,lon,lat,height,left_col,left_row,right_col,right_row"
+    return f"{head}{columns}\nP1,{x:.10f},{y:.10f},{heights},1,2,3,4\n"
+
+
+POINTS = [
+    ("degrees", "", 40.0, {}, "", 40.0),
+    ("degrees above a geoid", "", 29.0, {"geoid": True}, "", 40.0),
+    ("above EGM96", "EPSG:32650+5773", 29.0, {}, "", "heights are orthometric ('EGM96 height')"),
+    ("above EGM96, grid given", "EPSG:32650+5773", 29.0, {"geoid": True}, "", 40.0),
+    ("said by the file", "EPSG:32650+5773", 29.0, {"unsaid": True}, "# CRS: {crs}\n",
+     "heights are orthometric"),
+    ("said by the file, grid given", "EPSG:32650+5773", 29.0, {"unsaid": True, "geoid": True},
+     "# WKT: {wkt}\n", 40.0),
+    ("in US survey feet", "EPSG:32650+6360", 29.0 / US_FT, {"geoid": True}, "", 40.0),
+    ("ellipsoidal, grid given", "EPSG:4979", 40.0, {"geoid": True}, "", 40.0),
+    ("depths", "EPSG:32650+5715", -29.0, {"geoid": True}, "", "point down"),
+    ("no system", "EPSG:99", 29.0, {}, "", "cannot be used"),
+    (".gcp above a geoid", "EPSG:4326+5773", 29.0, {"unsaid": True}, "# WKT: {wkt}\n",
+     "heights are orthometric"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "crs", "height", "how", "head", "right"), POINTS, ids=str)
+def test_control_points_mean_what_their_system_says(
+    kind, crs, height, how, head, right, folder, tmp_path
+):
+    place = (117.001, 29.829)
+    file = tmp_path / ("a.gcp" if kind.startswith(".gcp") else "a.csv")
+    known = crs not in ("", "EPSG:99")
+    wkt = pyproj.CRS(crs).to_wkt("WKT1_GDAL") if "{wkt}" in head else ""
+    text = written(height, crs if known else "", place, file.suffix, head.format(crs=crs, wkt=wkt))
+    file.write_text(text)
+    options = {"crs": "" if how.get("unsaid") else crs}
+    options |= {"geoid": folder / "egm96.gtx"} if how.get("geoid") else {}
+    if isinstance(right, str):
+        with pytest.raises(InputError) as error:
+            import_gcps([file], tmp_path / "out.csv", **options)
+        assert right in str(error.value) and file.name in str(error.value)
+        assert "Remedy: " in str(error.value) and not (tmp_path / "out.csv").exists()
+        return
+    import_gcps([file], tmp_path / "out.csv", **options)
+    found = read_gcps(tmp_path / "out.csv")
+    assert (found.lon[0], found.lat[0]) == pytest.approx(place, abs=1e-8)
+    assert found.height[0] == pytest.approx(right, abs=2e-3)
+
+
+# ------------------------------------------------------------------------------ points of LiDAR
+
+
+def test_points_that_nobody_measured_are_named(tmp_path):
+    """Half of them flagged as synthetic, 7 m lower; of both kinds of records."""
+    for pdrf, version in ((6, "1.4"), (1, "1.2")):
+        file, flags = tmp_path / f"{pdrf}.las", np.arange(3000) % 2
+        write_las(file, pdrf=pdrf, version=version, synthetic=flags)
+        found = ingest(file, tmp_path / "a.points")
+        assert "1500 of 3000 points" in found["doubts"][0] and "synthetic" in found["doubts"][0]
+        write_las(file, pdrf=pdrf, version=version)
+        assert ingest(file, tmp_path / "a.points")["doubts"] == []
+
+
+@pytest.mark.parametrize("epsg", [32660, 32601])
+def test_points_across_the_line_of_180_degrees_lie_side_by_side(epsg, tmp_path):
+    """Where one degree east of the line is one degree more than 180, whatever the zone says."""
+    to_utm = pyproj.Transformer.from_crs(4326, epsg, always_xy=True)
+    x, y = to_utm.transform(180.0, 30.0)
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([x + rng.uniform(-300, 300, 4000), y + rng.uniform(-300, 300, 4000),
+                           20 + 0.002 * rng.permutation(4000)])  # fmt: skip
+    xyz = write_las(tmp_path / "a.las", 4000, xyz=xyz, system=pyproj.CRS(epsg).to_3d())
+    found = ingest(tmp_path / "a.las", tmp_path / "a.points")
+    west, _, east, _ = found["bounds"][:4]
+    assert 179.99 < west < 180 < east < 180.01 and not any("area" in n for n in found["notes"])
+    store = PointStore(tmp_path / "a.points")
+    points = store.query(179.0, 29.0, 181.0, 31.0)
+    back = np.column_stack([*to_utm.transform(points.lon, points.lat), points.height])
+    order, exact = np.argsort(back[:, 2]), np.argsort(xyz[:, 2])
+    np.testing.assert_allclose(back[order], xyz[exact], atol=2e-3)
+
+
+def test_longitudes_are_compared_on_a_circle():
+    rpc = RPCS["left"].to_dict()
+    for given in (179.99, -179.99, 180.01):
+        at = RPC.from_dict(rpc | {"long_off": given}).localize(2000, 1500, 60.0)
+        assert 179.9 < at[0] < 180.1
+    assert RPC.from_dict(rpc).long_off == rpc["long_off"]
+    lon = np.array([-177.6, 182.39, 244.0, -180.0, np.inf])
+    assert continuous(lon).tolist() == [-177.6, 182.39, -116.0, 180.0, np.inf]
+    area = LidarCRS(pyproj.CRS(32601))
+    assert check_area(area, (179.99, 180.2), (10, 11), "a.las") is None
+    with pytest.raises(InputError, match="outside of the area"):
+        check_area(area, (160.0, 160.1), (10, 11), "a.las")

@@ -25,7 +25,7 @@ REACH = {
     "align": {"alignment", "epipolar", "lidar", "products"},
     "refine": {"alignment", "epipolar", "lidar", "products"},
     "adjust": {"alignment", "epipolar", "lidar", "products"},
-    "adjusted_alignment": {"alignment", "epipolar", "products"},
+    "adjusted_alignment": {"alignment", "epipolar", "lidar", "products"},
     "draw_residuals": {"alignment", "epipolar", "products"},
     "draw_refinement": {"alignment", "epipolar", "products"},
     "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products"},

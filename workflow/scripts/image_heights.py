@@ -15,7 +15,12 @@ if __name__ == "__main__":
         alignment = Alignment.load(snakemake.input.alignment)
         fit = getattr(alignment, f"{view}_fit")
         inputs = open_inputs(
-            getattr(alignment, view), fit.size, snakemake.input.points, snakemake.input.surface, fit
+            getattr(alignment, view),
+            fit.size,
+            snakemake.input.points,
+            snakemake.input.surface,
+            fit,
+            alignment.of_lines(view),
         )
         made_of = inputs.made_of | checksums([snakemake.input.alignment])
         write_image_heights(

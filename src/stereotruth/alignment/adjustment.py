@@ -45,6 +45,7 @@ class Observations:
     at: Floats
     before: Floats
     after: Floats
+    by_affines: Floats
     used: Bools
     of_images: PairEquations
 

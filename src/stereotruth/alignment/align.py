@@ -58,6 +58,10 @@ POOR_SIGMA = 2.0  # px
 CAREFUL_SIGMA = (0.25, 2)
 RPC_SHIFT = 10.0  # px, standard deviation of what an RPC without GCPs is off, and
 RPC_TILT = 3e-4  # of its scale, rotation and shear
+PLACES_BY_RPCS = (
+    f"no ground control points: places on the ground are known to about {RPC_SHIFT:g} px only, as "
+    "the RPCs give them"
+)
 LARGE_SHIFT = 200.0  # px: RPCs err by some 1 to 50 px
 LARGE_TILT = 0.005  # change of scale, rotation or shear; RPCs err by less than 0.001
 
@@ -332,11 +336,7 @@ def from_rpcs(
             )
         )
         sensors.append(sensor)
-    doubt = (
-        f"no ground control points: places on the ground are known to about {RPC_SHIFT:g} px only, "
-        "as the RPCs give them"
-    )
-    log.warning("warning: %s", doubt)
+    log.warning("warning: %s", PLACES_BY_RPCS)
     if provenance is None:
         provenance = describe(
             [left_image, right_image], {"model": model}, source_digest("alignment.align")
@@ -349,6 +349,6 @@ def from_rpcs(
         left_fit=fits[0],
         right_fit=fits[1],
         reference_height=round(float(np.mean([s.rpc.height_off for s in sensors])), 3),
-        warnings=(doubt,),
+        warnings=(PLACES_BY_RPCS,),
         provenance=dict(provenance),
     )

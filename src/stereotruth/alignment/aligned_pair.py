@@ -161,6 +161,13 @@ class Alignment:
         left, right = (fit.covariance for fit in self.fits)
         return np.block([[left, self.cross_covariance], [self.cross_covariance.T, right]])
 
+    def of_lines(self, view: str) -> Floats:
+        """float64[2, 2] px² of the (col, row) of a view by its correction by line, mean of all."""
+        if self.lines_covariance is None:
+            return np.zeros((2, 2))
+        own = slice(0, 2) if view == "left" else slice(2, 4)
+        return self.lines_covariance[:, own, own].mean(axis=0)
+
     @property
     def fits(self) -> tuple[ViewFit, ViewFit]:
         """Left and right."""

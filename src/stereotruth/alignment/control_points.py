@@ -31,6 +31,7 @@ from pyproj.exceptions import CRSError
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
+from ..numerics.degrees import continuous
 from ..products.files import of_text
 from ..settings import epoch_year
 
@@ -134,7 +135,7 @@ def read_gcps(
         file=file,
         ids=tuple(ids),
         line=tuple(points[name][0] for name in ids),
-        lon=values[:, 0].copy(),
+        lon=continuous(values[:, 0]).copy(),
         lat=values[:, 1].copy(),
         height=values[:, 2].copy(),
         left=values[:, 3:5].copy(),

@@ -26,11 +26,11 @@ Floats = NDArray[np.float64]
 
 
 CHANCE = 0.05  # probability of such a rise of the likelihood where sites share nothing
+SURE = 0.001  # the same, from which on their form is told
 UNKNOWNS = 2  # a standard deviation and a length
 LENGTHS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)  # of the covariance, in spacings of the sites
 FEWEST = 12  # sites that tell a covariance
-LEAST = 0.25  # of the variance that labels have at least, whatever the corrections take of it
-SMOOTH = 0.5  # share of the scene over which what is smooth is no step
+LEAST = 0.5  # of the variance that labels have at least, whatever the corrections take of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +39,22 @@ class SharedErrors:
 
     ``sigma_px``: standard deviations, 0 where they are no more than chance; ``length_px`` of the
     left image, over which they fall to 1/e; ``chance``; ``label_px``: the standard deviation of a
-    label's disparity by them, where the corrections are as uncertain as they say. ``extent_px``:
-    longer side of the ground with tie points.
+    label's disparity by them, beside the corrections' own. ``smooth``: a curved surface
+    of second degree over the scene takes them away.
     """
 
     sigma_px: tuple[float, float]
     length_px: tuple[float, float]
     chance: tuple[float, float]
-    label_px: float
-    extent_px: float
-
-    @property
-    def is_smooth(self) -> bool:
-        """Whether the disparities' errors go over most of the scene."""
-        return self.length_px[0] > SMOOTH * self.extent_px
+    label_px: float = 0.0
+    smooth: bool = False
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready."""
-        found: dict[str, Any] = {"sigma_of_labels_px": round(self.label_px, 4)}
+        found: dict[str, Any] = {
+            "sigma_of_labels_px": round(self.label_px, 4),
+            "smooth": self.smooth,
+        }
         for k, name in enumerate(("disparity", "y_parallax")):
             found[name] = {
                 "sigma_px": round(self.sigma_px[k], 4),
@@ -68,21 +66,22 @@ class SharedErrors:
 
 @dataclass(frozen=True, eq=False)
 class _Sites:
-    """Means of m sites: ``at`` [m, 2] px, ``value`` and ``variance`` [m]; ``distance`` [m, m] px
-    and ``trend`` [m, 3], which the affines take."""
+    """Means of m sites: ``value`` and ``variance`` [m]; ``distance`` [m, m] px and ``trend``
+    [m, t], which has no part in the likelihood."""
 
-    at: Floats
     value: Floats
     variance: Floats
     distance: Floats
     trend: Floats
 
     @classmethod
-    def of(cls, at: Floats, value: Floats, variance: Floats) -> _Sites:
+    def of(cls, at: Floats, value: Floats, variance: Floats, *, curved: bool = False) -> _Sites:
+        """At places [m, 2] px; ``curved``: the trend is of second degree, else the affines'."""
         distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
-        middle = at - at.mean(axis=0)
-        trend = np.column_stack([np.ones(len(at)), middle / max(float(np.ptp(at)), 1.0)])
-        return cls(at, value, variance, distance, trend)
+        u, v = ((at - at.mean(axis=0)) / max(float(np.ptp(at)), 1.0)).T
+        squares = [u * u, u * v, v * v] if curved else []
+        trend = np.column_stack([np.ones(len(at)), u, v, *squares])
+        return cls(value, variance, distance, trend)
 
     def twice_log(self, own: float, shared: float, length: float) -> float:
         """Twice the log of the restricted likelihood; standard deviations and a length, px."""
@@ -91,7 +90,7 @@ class _Sites:
             covariance += shared**2 * np.exp(-self.distance / length)
         factor = np.linalg.cholesky(covariance)
         both = solve_triangular(factor, np.column_stack([self.trend, self.value]), lower=True)
-        trend, value = both[:, :3], both[:, 3]
+        trend, value = both[:, :-1], both[:, -1]
         basis, corner = np.linalg.qr(trend)
         left = value - basis @ (basis.T @ value)
         determinant = np.log(np.diag(factor)).sum() + np.log(np.abs(np.diag(corner))).sum()
@@ -101,7 +100,7 @@ class _Sites:
 def _shared_of(sites: _Sites) -> tuple[float, float, float]:
     """Standard deviation and length (px) of what sites share, and its probability by chance."""
     unit = float(np.sqrt(np.median(sites.variance)))
-    near = sites.distance + np.diag(np.full(len(sites.at), np.inf))
+    near = sites.distance + np.diag(np.full(len(sites.value), np.inf))
     spacing = float(np.median(near.min(axis=1)))
     (own,), without = climb(lambda k: sites.twice_log(amount(k[0]) * unit, 0.0, 1.0), (0,))
     best = (without, 0.0, spacing, (own, 0))
@@ -118,11 +117,14 @@ def _shared_of(sites: _Sites) -> tuple[float, float, float]:
     return sigma, length, float(chdtrc(UNKNOWNS, max(top - without, 0.0)))
 
 
-def with_shared_errors(found: Estimate, equations: Equations) -> tuple[Estimate, SharedErrors]:
+def with_shared_errors(
+    found: Estimate, equations: Equations, *, by_line: bool = False
+) -> tuple[Estimate, SharedErrors]:
     """The estimate of a pair's affines with what near sites share counted, and these errors.
 
     Then the parameters are those of generalised least squares; without such errors nothing changes.
-    ``equations``: of ``found``, corrections by line taken off.
+    ``equations``: of ``found``, corrections by line taken off. ``by_line``: there are some. They
+    take a part of what near sites share, so that the rest counts whatever its probability.
     """
     index = np.unique(equations.site, return_inverse=True)[1]
     residuals = equations.observed - equations.design @ found.parameters
@@ -133,23 +135,39 @@ def with_shared_errors(found: Estimate, equations: Equations) -> tuple[Estimate,
     total = np.stack([np.bincount(index, i) for i in information.T], axis=1)
     at = np.stack([np.bincount(index, found.weights * c) for c in equations.at.T], axis=1)
     at = at[known] / np.bincount(index, found.weights)[known, None]
-    none = SharedErrors((0.0, 0.0), (0.0, 0.0), (1.0, 1.0), 0.0, float(np.ptp(at, axis=0).max()))
     if known.sum() < FEWEST:
-        return found, none
-    told = []
-    for k in (0, 1):
-        mean = np.bincount(index, information[:, k] * residuals[:, k])[known] / total[known, k]
-        told.append(_shared_of(_Sites.of(at, mean, 1.0 / total[known, k])))
-    sigma = tuple(s if chance < CHANCE else 0.0 for s, _, chance in told)
-    shared = replace(
-        none,
-        sigma_px=sigma,
-        length_px=tuple(length for _, length, _ in told),
-        chance=tuple(chance for _, _, chance in told),
+        return found, SharedErrors((0.0, 0.0), (0.0, 0.0), (1.0, 1.0))
+    means = [
+        (np.bincount(index, i * r)[known] / t[known], 1.0 / t[known])
+        for i, r, t in zip(information.T, residuals.T, total.T)
+    ]
+    told = [_shared_of(_Sites.of(at, *mean)) for mean in means]
+    sigma = tuple(s if by_line or chance < CHANCE else 0.0 for s, _, chance in told)
+    smooth = told[0][2] < SURE and _shared_of(_Sites.of(at, *means[0], curved=True))[2] > CHANCE
+    shared = SharedErrors(
+        sigma,
+        tuple(length for _, length, _ in told),
+        tuple(chance for _, _, chance in told),
+        smooth=smooth,
     )
     if not any(sigma):
         return found, shared
     return _counted(found, equations, shared, index, known, at)
+
+
+def shared_spread(found: Estimate, equations: Equations, shared: SharedErrors) -> Floats:
+    """Covariance [12, 12] that shared errors add to the right side of a pair's normal equations."""
+    index = np.unique(equations.site, return_inverse=True)[1]
+    count = np.bincount(index)
+    at = np.stack([np.bincount(index, c) / count for c in equations.at.T], axis=1)
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    spread = np.zeros((12, 12))
+    for k in (0, 1):
+        covariance = shared.sigma_px[k] ** 2 * np.exp(-distance / max(shared.length_px[k], 1.0))
+        weighted = found.information[:, k, None] * equations.design[:, k]
+        pull = np.stack([np.bincount(index, w) for w in weighted.T], axis=1)
+        spread += pull.T @ covariance @ pull
+    return spread
 
 
 def _counted(

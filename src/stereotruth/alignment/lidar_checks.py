@@ -15,12 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import chdtrc, chdtri, ndtri, stdtrit
 
 from ..epipolar.rpc import SensorModel
 from ..lidar.lattice import PER_M
 from ..lidar.point_store import PointStore, query_points
 from ..numerics.degrees import metres_per_degree
+from ..numerics.robust import robust_sigma
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
 from .aligned_pair import Alignment, GcpResidual
@@ -29,6 +30,7 @@ Floats = NDArray[np.float64]
 
 
 LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
+LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
 FAR_OFF = 4.0  # deviations that no point of the LiDAR around a control point may lie off it
 CHANCE = 1e-4  # probability that heights without a fault are doubted by the tie points
 CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tell about
@@ -183,6 +185,19 @@ def lines_of_sight(alignment: Alignment) -> Floats:
     return np.array(moved)
 
 
+def scatter_by_heights(alignment: Alignment, along: Floats, across: Floats) -> tuple[float, float]:
+    """Scatter of disparity residuals (px) of tie points, and what of it is explained at most.
+
+    ``along``, ``across`` [n] px: residuals along and across the rows. Both have the scatter of the
+    matches; that along the rows has the LiDAR's heights besides. At a wrong place of the ground
+    the heights of tie points have nothing to do with what the images show there.
+    """
+    px_per_m = float(np.linalg.norm(np.subtract(*lines_of_sight(alignment))))
+    own, found = (robust_sigma(values, 0.0) for values in (across, along))
+    explained = float(np.hypot(own, LIDAR_SIGMA_M * px_per_m))
+    return found, explained * float(np.sqrt(chdtri(along.size - 1, CHANCE) / (along.size - 1)))
+
+
 def _constants(shifts: Floats) -> Floats:
     """Parameters [12] of shifts [2, 2] of both images."""
     parameters = np.zeros(12)
@@ -198,6 +213,40 @@ def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
     sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
     return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
+
+
+def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
+    """Probability that tie points differ so much from what is known of the alignment and of the
+    LiDAR in plan; by all parameters, or, if that is less, by the shift in plan alone.
+
+    ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
+    moved = []
+    for east, north in ((step[0], 0.0), (0.0, step[1])):
+        ends = [
+            np.stack([
+                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
+                for sensor in (alignment.left, alignment.right)
+            ])
+            for sign in (-0.5, 0.5)
+        ]  # fmt: skip
+        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
+    plan = np.stack(moved, axis=1)
+    values, vectors = np.linalg.eigh(found.normal)
+    seen = values > 1e-9 * values.max()
+    alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
+    known = vectors[:, seen].T @ (np.eye(len(values)) + plan @ plan.T) @ vectors[:, seen]
+    total = known + np.diag(1.0 / values[seen])
+    by_all = float(alone @ np.linalg.solve(total, alone))
+    # of the shift, in LIDAR_PLAN_M, by generalised least squares; its own variance, 1, is in total
+    along = vectors[:, seen].T @ plan
+    pull = along.T @ np.linalg.solve(total, alone)
+    by_shift = float(pull @ np.linalg.solve(along.T @ np.linalg.solve(total, along), pull))
+    return float(min(chdtrc(int(seen.sum()), by_all), chdtrc(2, by_shift)))
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:

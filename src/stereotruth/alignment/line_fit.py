@@ -34,7 +34,7 @@ from .adjustment import (
     root_of,
 )
 from .equations import Equations
-from .hill_climb import Steps, amount, climb
+from .hill_climb import WIDEST, Steps, amount, climb
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -43,6 +43,7 @@ Floats = NDArray[np.float64]
 CELLS = 40  # of a spline over the lines: four a period where an image has ten
 LENGTHS = (1 / 32, 1 / 23, 1 / 16, 1 / 11, 1 / 8, 1 / 5.6, 1 / 4)  # of a process, in images
 KEPT = 1e-7  # share of the largest variance that a direction of a process must have
+LOOKED_AT = 3.0  # deviations of the score test, with less of which a length is not looked at
 CHANCE = 0.001  # probability of such a rise of the likelihood if no line is off
 KINDS = 3  # of unknowns of the processes: two standard deviations and a length
 UNKNOWNS = 4 * (CELLS + 3)  # coefficients of a pair
@@ -63,8 +64,8 @@ class LineFit:
     ``covariance`` [k, 4, 4] px² of (col, row) of the left image's lines and of the right image's
     that show the same ground, at ``k`` equal steps of the left image. ``rms_px`` [2]: standard
     deviations of the processes, along lines and across; ``length``: in images.
-    ``noise`` and ``of_site``: standard deviations of a match, and of what a site shares, in units
-    of the match's own.
+    ``noise``: standard deviation of a match in units of its own; ``of_site``: of what a site
+    shares, in units of the noise.
     """
 
     fitted: Floats
@@ -75,14 +76,18 @@ class LineFit:
     rms_px: Floats
     length: float
     chance: float
-    misfits: tuple[float, float, float]
+    halves: _Halves
     noise: float
     of_site: float
 
     @property
     def stands_out(self) -> bool:
         """Whether lines are off by more than chance, and the halves of the sites agree."""
-        return self.chance < CHANCE and bool(ndtr(-self.misfits[2]) < CHANCE)
+        return self.chance < CHANCE and bool(ndtr(-self.halves.clear) < CHANCE)
+
+    def taken(self) -> LineFit:
+        """The same, used whatever chance and halves say."""
+        return replace(self, chance=0.0, halves=replace(self.halves, clear=np.inf))
 
     @property
     def coefficients(self) -> Floats:
@@ -107,16 +112,11 @@ class LineFit:
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready."""
-        before, after, clear = (round(misfit, 3) for misfit in self.misfits)
         return {
             "rms_px": dict(zip(("along_lines", "across"), self.rms_px.round(4).tolist())),
             "length_over_image": round(self.length, 4),
             "probability_by_chance": float(f"{self.chance:.3g}"),
-            "misfit_of_one_half_by_the_other": {
-                "before": before,
-                "after": after,
-                "clear_by_deviations": clear,
-            },
+            "one_half_by_the_other": {k: round(v, 3) for k, v in vars(self.halves).items()},
             "used": self.stands_out,
         }
 
@@ -168,18 +168,13 @@ def _from_all(
     weights = np.ones(len(expected))
     for step in range(STEPS):
         lines = fit_lines(equations, root, expected, weights, rows)
-        size = (
-            np.hypot(
-                *_left(equations, replace(lines, chance=0.0, misfits=(1.0, 0.0, np.inf)), design).T
-            )
-            / expected
-        )
+        size = np.hypot(*_left(equations, lines.taken(), design).T) / expected
         size /= robust_sigma(size, LEAST_SIGMA) / RAYLEIGH
         weights = huber_weights(size) if step < STEPS // 2 else tukey_weights(size)
     return lines
 
 
-def _process(length: float) -> Floats:
+def process(length: float) -> Floats:
     """[n, r]: root of the covariance of a spline's coefficients, of unit variance over the lines.
 
     Squared exponential, without a mean and a trend; ``length`` in images.
@@ -246,6 +241,21 @@ class _Sums:
             2.0 * float(weights.sum()),
         )
 
+    def reduced(self, affine: int, root: Floats) -> _Sums:
+        """Of the ``affine`` first unknowns and of processes [n, r], in place of coefficients."""
+        count, rank = root.shape
+        change = np.zeros((affine + 4 * count, affine + 4 * rank))
+        change[:affine, :affine] = np.eye(affine)
+        for k in range(4):
+            rows = slice(affine + k * count, affine + (k + 1) * count)
+            change[rows, affine + k * rank : affine + (k + 1) * rank] = root
+        return replace(
+            self,
+            normal=change.T @ self.normal @ change,
+            right=change.T @ self.right,
+            site=self.site @ change,
+        )
+
     def sharing(self, of_site: float) -> tuple[Floats, Floats, float, float]:
         """Normal matrix, right side and sum of squares where a site shares an error, and the
         logarithm of the determinant that it adds; ``of_site`` in units of the noise."""
@@ -256,6 +266,19 @@ class _Sums:
         right = self.right - self.site.T @ (share * self.site_right)
         square = self.square - float(np.sum(share * self.site_right**2))
         return normal, right, square, float(np.log1p(of_site**2 * self.total).sum())
+
+
+def sums_of(
+    design: Floats, observed: Floats, weights: Floats, sites: NDArray, of_site: float
+) -> tuple[Floats, Floats]:
+    """Normal matrix [p, p] and right side [p] of :class:`_Sums`; ``of_site`` in units of the noise.
+
+    Blunders have ``weights`` [n] of 0; ``sites`` [n] are numbers of any kind.
+    """
+    used = weights > 0.0
+    index = np.unique(sites[used], return_inverse=True)[1]
+    sums = _Sums.of(design[used], observed[used], weights[used], index)
+    return sums.sharing(of_site)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +304,7 @@ def _posterior(sums: _Sums, of_site: float, variances: Floats) -> _Posterior:
     return _Posterior(mean, noise, -sums.count * float(np.log(noise)) - determinant)
 
 
-def _covariance(normal: Floats, variances: Floats) -> Floats:
+def posterior_covariance(normal: Floats, variances: Floats) -> Floats:
     """[p, p] of unknowns by a normal matrix and prior ``variances`` [p], over the noise's."""
     root = np.sqrt(variances)
     inner = np.eye(len(root)) + root[:, None] * normal * root
@@ -317,53 +340,91 @@ def fit_lines(
     of_affine = design @ affine_root
     of_lines = line_design(design, equations.lines, rows)
     sites = np.unique(equations.site, return_inverse=True)[1]
-    free = np.full(affine_root.shape[1], 1.0 / FREE)
-    plain = _Sums.of(of_affine, observed, weights, sites)
-    (of_site,), without = climb(lambda k: _posterior(plain, amount(k[0]), free).twice_log, (-2,))
+    affine = affine_root.shape[1]
+    free = np.full(affine, 1.0 / FREE)
     # a process of unit variance is worth as much as a match, in px
     unit = float(np.sqrt(np.average(expected**2, weights=weights)))
-    best = (-np.inf, 0.0, (2, 2, of_site))
+    every = _Sums.of(
+        np.concatenate([of_affine, of_lines * unit], axis=-1), observed, weights, sites
+    )
+    length, steps, gain = _likeliest(every, free)
+    root = process(length)
+    both = np.concatenate([of_affine, _reduced(of_lines, root) * unit], axis=-1)
+    variances = _variances(free, steps[:2], root.shape[1])
+    sums = every.reduced(affine, root)
+    found = _posterior(sums, amount(steps[2]), variances)
+    halves = _Halves.of(
+        both, observed, weights, sites, variances, amount(steps[2]), affine,
+        np.sqrt(found.noise),
+    )  # fmt: skip
+    own = slice(affine, None)
+    lines = found.mean[own].reshape(4, -1) * unit @ root.T
+    # Of the lines where the affines are known, whose own uncertainty is that of the estimate: what
+    # both share is known better than either.
+    beside = posterior_covariance(sums.sharing(amount(steps[2]))[0][own, own], variances[own])
+    noise = float(np.sqrt(found.noise))
+    return LineFit(
+        np.round(lines, 6).ravel(),  # so that the count of threads leaves no trace
+        affine_root @ found.mean[:affine],
+        _freedom(beside, variances[own]),
+        rows,
+        covariance_at_lines(
+            beside * found.noise * unit**2 * halves.spread, root, equations.lines, rows
+        ),
+        np.array([amount(k) for k in steps[:2]]) * noise * unit,
+        length,
+        float(chdtrc(KINDS, max(gain, 0.0))),
+        halves,
+        noise,
+        amount(steps[2]),
+    )
+
+
+def _likeliest(every: _Sums, free: Floats) -> tuple[float, Steps, float]:
+    """Length and steps (of both standard deviations, of what sites share) of the greatest
+    likelihood, and twice the logarithm of what it gains on no process."""
+    affine = len(free)
+    plain = every.reduced(affine, np.zeros((CELLS + 3, 0)))
+    (of_site,), without = climb(lambda k: _posterior(plain, amount(k[0]), free).twice_log, (-2,))
+    best = (without, LENGTHS[-1], (-WIDEST, -WIDEST, of_site))
+    start = (2, 2, of_site)
     for length in LENGTHS:
-        root = _process(length)
-        both = np.concatenate([of_affine, _reduced(of_lines, root) * unit], axis=-1)
-        sums = _Sums.of(both, observed, weights, sites)
+        root = process(length)
+        sums = every.reduced(affine, root)
+        if _clearness(sums, amount(of_site), free) < LOOKED_AT:
+            continue
 
         def score(steps: Steps, sums: _Sums = sums, rank: int = root.shape[1]) -> float:
             variances = _variances(free, steps[:2], rank)
             return _posterior(sums, amount(steps[2]), variances).twice_log
 
-        steps, top = climb(score, best[2])
+        start, top = climb(score, start)
         if top > best[0] + 1e-9:
-            best = top, length, steps
+            best = top, length, start
     top, length, steps = best
-    root = _process(length)
-    both = np.concatenate([of_affine, _reduced(of_lines, root) * unit], axis=-1)
-    variances = _variances(free, steps[:2], root.shape[1])
-    sums = _Sums.of(both, observed, weights, sites)
-    found = _posterior(sums, amount(steps[2]), variances)
-    misfits = _misfits_of_halves(
-        both, observed, weights, sites, variances, amount(steps[2]), len(free),
-        np.sqrt(found.noise),
-    )  # fmt: skip
-    own = slice(len(free), None)
-    lines = found.mean[own].reshape(4, -1) * unit @ root.T
-    # Of the lines where the affines are known, whose own uncertainty is that of the estimate: what
-    # both share is known better than either.
-    beside = _covariance(sums.sharing(amount(steps[2]))[0][own, own], variances[own])
-    noise = float(np.sqrt(found.noise))
-    return LineFit(
-        np.round(lines, 6).ravel(),  # so that the count of threads leaves no trace
-        affine_root @ found.mean[: len(free)],
-        _freedom(beside, variances[own]),
-        rows,
-        _covariance_at_lines(beside * found.noise * unit**2, root, equations.lines, rows),
-        np.array([amount(k) for k in steps[:2]]) * noise * unit,
-        length,
-        float(chdtrc(KINDS, max(top - without, 0.0))),
-        misfits,
-        noise,
-        amount(steps[2]) * noise,
-    )
+    return length, steps, top - without
+
+
+def _clearness(sums: _Sums, of_site: float, free: Floats) -> float:
+    """By how many standard deviations the likelihood rises with a process of small variance.
+
+    The score test of a variance; the greater of processes along and across the lines.
+    """
+    affine = len(free)
+    normal, right, square, _ = sums.sharing(of_site)
+    known = np.linalg.inv(normal[:affine, :affine] + np.diag(1.0 / free))
+    taken = known @ normal[:affine, affine:]
+    noise = (square - right[:affine] @ known @ right[:affine]) / sums.count
+    gradient = right[affine:] - taken.T @ right[:affine]
+    information = normal[affine:, affine:] - normal[affine:, :affine] @ taken
+    found = -np.inf
+    rank = len(gradient) // 4
+    for kind in (0, 1):  # of both images
+        own = np.concatenate([np.arange(rank) + rank * k for k in (kind, kind + 2)])
+        part = information[np.ix_(own, own)]
+        rise = gradient[own] @ gradient[own] / noise - np.trace(part)
+        found = max(found, float(rise / np.sqrt(2.0 * np.sum(part**2))))
+    return found
 
 
 def _reduced(of_lines: Floats, root: Floats) -> Floats:
@@ -378,37 +439,58 @@ def _variances(free: Floats, steps: Steps, rank: int) -> Floats:
     return np.concatenate([free, *(np.full(rank, v) for v in (along, across, along, across))])
 
 
-def _misfits_of_halves(
-    design: Floats,
-    observed: Floats,
-    weights: Floats,
-    sites: NDArray,
-    variances: Floats,
-    of_site: float,
-    affine: int,
-    noise: float,
-) -> tuple[float, float, float]:
-    """Mean misfit of one half of the sites by the affine of the other half, and by its lines too.
+@dataclass(frozen=True)
+class _Halves:
+    """What one half of the sites says of the other: mean misfits (standard deviations, TUKEY at
+    most) by its affine alone, ``before``, and by its lines too, ``after``; by how many standard
+    errors the latter is less, ``clear``; ``spread``: variance of what the fit errs by, in that
+    which it states, at least 1."""
 
-    In standard deviations; it counts TUKEY at most, so that blunders say nothing. The third is by
-    how many standard errors the second is less, by its scatter from site to site.
-    """
-    misfits = np.zeros((2, len(sites)))
-    for half in (0, 1):
-        seen = sites % 2 != half
-        for k, count in enumerate((affine, design.shape[-1])):
-            part = design[:, :, :count]
-            sums = _Sums.of(part[seen], observed[seen], weights[seen], sites[seen])
-            found = _posterior(sums, of_site, variances[:count])
-            left = observed[~seen] - part[~seen] @ found.mean
-            misfits[k, ~seen] = np.minimum(np.hypot(*left.T) / noise, TUKEY)
-    gain = np.bincount(sites, misfits[0] - misfits[1])
-    error = np.sqrt(np.sum((gain - gain.mean()) ** 2) / max(len(gain) - 1, 1) * len(gain))
-    before, after = misfits.mean(axis=1)
-    return float(before), float(after), float(gain.sum() / max(error, 1e-12))
+    before: float
+    after: float
+    clear: float
+    spread: float
+
+    @classmethod
+    def of(
+        cls,
+        design: Floats,
+        observed: Floats,
+        weights: Floats,
+        sites: NDArray,
+        variances: Floats,
+        of_site: float,
+        affine: int,
+        noise: float,
+    ) -> _Halves:
+        """Of a design [n, 2, p], the first ``affine`` of whose unknowns are the affine's."""
+        misfits = np.zeros((2, len(sites)))
+        seen_squares = stated = 0.0
+        for half in (0, 1):
+            seen = sites % 2 != half
+            for k, count in enumerate((affine, design.shape[-1])):
+                part = design[:, :, :count]
+                sums = _Sums.of(part[seen], observed[seen], weights[seen], sites[seen])
+                found = _posterior(sums, of_site, variances[:count])
+                left = (observed[~seen] - part[~seen] @ found.mean) / noise
+                misfits[k, ~seen] = np.minimum(np.hypot(*left.T), TUKEY)
+            covariance = posterior_covariance(sums.sharing(of_site)[0], variances)
+            effect = np.einsum("nap,pq,naq->n", design[~seen], covariance, design[~seen])
+            share = weights[~seen]
+            seen_squares += float(np.sum(share * (np.sum(left**2, axis=1) - 2 - 2 * of_site**2)))
+            stated += float(np.sum(share * effect))
+        gain = np.bincount(sites, misfits[0] - misfits[1])
+        error = np.sqrt(np.sum((gain - gain.mean()) ** 2) / max(len(gain) - 1, 1) * len(gain))
+        before, after = misfits.mean(axis=1)
+        return cls(
+            float(before),
+            float(after),
+            float(gain.sum() / max(error, 1e-12)),
+            max(seen_squares / max(stated, 1e-12), 1.0),
+        )
 
 
-def _covariance_at_lines(
+def covariance_at_lines(
     covariance: Floats, root: Floats, lines: Floats, rows: tuple[int, int]
 ) -> Floats:
     """[CELLS + 1, 4, 4] px²: see :class:`LineFit`; ``covariance`` of the processes' unknowns."""

@@ -45,11 +45,13 @@ from .adjustment import (
     pull_of,
     with_corrections,
 )
+from .align import PLACES_BY_RPCS
 from .aligned_pair import Alignment, ViewFit
 from .equations import Equations, spread_of
 from .lack_of_fit import SharedErrors, with_shared_errors
 from .lidar_checks import (
     HeightOffset,
+    chance_of_contradiction,
     control_points_of,
     doubt_at_gcps,
     doubt_by_rpcs,
@@ -57,9 +59,11 @@ from .lidar_checks import (
     height_by_rpcs,
     heights_of_model,
     pixel_m,
+    scatter_by_heights,
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
+from .misfit_causes import LabelSigma, remark_of
 from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
@@ -141,8 +145,8 @@ def _chance(found: Estimate) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What tie points tell: the estimate, errors that it shares, lines, the refined alignment, and
-    :func:`agreement_of_halves`."""
+    """What tie points tell: the estimate, errors that it shares, lines, the refined alignment,
+    :func:`agreement_of_halves`, and what all of it means for labels."""
 
     observations: Observations
     estimate: Estimate
@@ -150,6 +154,13 @@ class _Found:
     lines: LineFit
     alignment: Alignment
     halves: tuple[float, float]
+    sigma: LabelSigma
+
+
+HEIGHTS_BY_RPCS = (
+    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
+    "told from errors of the RPCs"
+)
 
 
 def _search(
@@ -213,13 +224,15 @@ def _search(
             break
         radius = FINEST if change < FINEST / 2 or radius == FINEST else FINE
     equations = replace(equations, observed=total - of_lines @ by_line)
-    found, shared = with_shared_errors(found, equations)
+    by_scatter = found.covariance
+    found, shared = with_shared_errors(found, equations, by_line=lines.stands_out)
     current = with_corrections(alignment, found.parameters, lines.corrections)
     observations = Observations(
         ties,
         np.stack(model.left_to_epipolar(*ties.left.T), axis=1),
         total,
         equations.observed - design @ found.parameters,
+        total - design @ found.parameters,
         found.weights > 0.0,
         of_images,
     )
@@ -227,7 +240,10 @@ def _search(
         return reason
     halves = agreement_of_halves(equations, prior)
     log.info("one half of the sites by the other: misfit %.2f -> %.2f deviations", *halves)
-    return _Found(observations, found, shared, lines, current, halves)
+    sigma = LabelSigma.of(
+        design[:, 0], ties.left[:, 1], rows[0], (by_scatter, found.covariance), lines, shared
+    )
+    return _Found(observations, found, shared, lines, current, halves, sigma)
 
 
 def _placed(
@@ -270,7 +286,7 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
             f"explains ({height.told_from_m:.2f} m); check the LiDAR's vertical datum and unit"
             + (", and the points' heights" if with_gcps else "")
         ]
-    if chdtrc(found.contradiction_freedom, found.contradiction) > DOUBTFUL:
+    if chance_of_contradiction(alignment, found) > DOUBTFUL:
         return []
     others = "the points' coordinates" if with_gcps else "that the RPCs belong to the images"
     return [
@@ -280,6 +296,32 @@ def _doubts(alignment: Alignment, record: Mapping[str, Any], found: Estimate) ->
         f"and {before['y_parallax']['median']:+.2f} px of y-parallax; check the LiDAR's "
         f"coordinate system, and {others}"
     ]
+
+
+def _widening(
+    doubts: list[str], refined: Alignment, observations: Observations, found: Estimate
+) -> float:
+    """What the covariance is multiplied by where there are doubts: which of two is wrong is not
+    known, nor by how much (Birge's ratio). Adds a doubt to ``doubts`` where the ground may be
+    another."""
+    ratio = max(found.contradiction / found.contradiction_freedom, 1.0) if doubts else 1.0
+    if any(fit.gcps for fit in refined.fits):
+        return ratio
+    scatter, explained = scatter_by_heights(refined, *observations.after[observations.used].T)
+    if scatter <= explained:
+        return ratio
+    doubts.append(
+        f"tie points scatter by {scatter:.2f} px of disparity, where the matches and the heights "
+        f"of a LiDAR explain {explained:.2f} px: without ground control points the images may have "
+        "been placed on other ground; check that the RPCs belong to the images, which may have "
+        "been cut since"
+    )
+    return max(ratio, (scatter / explained) ** 2)
+
+
+def _still_true(warnings: Sequence[str], unrefined: bool) -> list[str]:
+    """Warnings of the alignment before: once refined, places are known by the LiDAR."""
+    return [text for text in warnings if unrefined or text != PLACES_BY_RPCS]
 
 
 def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
@@ -355,7 +397,7 @@ def refine(
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
-    record |= {"by_line": result.lines.figures(), "shared_by_near_sites": result.shared.figures()}
+    record |= _misfits(result, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
@@ -367,24 +409,26 @@ def refine(
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
-        observations = replace(observations, after=observations.before)
+        observations = replace(
+            observations, after=observations.before, by_affines=observations.before
+        )
         record["after"] = record["before"]
-    doubts += _doubts(alignment, record, found)
+    odd = _doubts(alignment, record, found)
+    ratio = _widening(odd, refined, observations, found)
+    if odd:
+        record["uncertainty_widened_by"] = round(ratio**0.5, 3)
+    covariance, doubts = ratio * covariance, [*doubts, *odd]
     _warn(doubts, strict, left_image, of)
     if not gcps and not doubts:
-        unknown = (
-            f"without ground control points a fault of the LiDAR's heights of less than "
-            f"{offset.told_from_m:.0f} m cannot be told from errors of the RPCs"
-        )
-        log.warning("warning: %s", unknown)
-        doubts = [unknown]
+        doubts = [HEIGHTS_BY_RPCS.format(offset.told_from_m)]
+        log.warning("warning: %s", *doubts)
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
         reference_height=height,
-        warnings=(*alignment.warnings, *doubts),
+        warnings=(*_still_true(alignment.warnings, bool(reason)), *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],
@@ -395,6 +439,16 @@ def refine(
     )
     _tell(record)
     return refined, observations
+
+
+def _misfits(result: _Found, reason: str) -> dict[str, Any]:
+    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
+    return {
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+    }
 
 
 def _objection(result: _Found, with_gcps: bool) -> str:
@@ -422,6 +476,8 @@ def _tell(record: Mapping[str, Any]) -> None:
             record["used"],
             *(pair[figure] for figure in ("median", "rms", "trend_rms") for pair in (a, b)),
         )
+    if remark := record["remark"]:
+        log.info("%s", remark)
     log.info(
         "refinement %s",
         f"applied: left moved by up to {record['change_of_left']['largest']:.3f} px, right by "

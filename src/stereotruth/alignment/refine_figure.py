@@ -18,19 +18,21 @@ from ..products.rasters import open_raster
 from .aligned_pair import Alignment
 
 Floats = NDArray[np.float64]
+NAMES = ("disparity of LiDAR − that of the images", "y-parallax")
 PICTURE_PX = 1024  # of the left image
 
 
 class _Ties(NamedTuple):
     """n tie points: ``site`` int[n]; place ``left`` [n, 2] in the left image and ``at`` [n, 2] in
-    the epipolar grid, px; residuals (disparity, y-parallax) ``before`` and ``after`` [n, 2], px;
-    which are ``used`` [n]."""
+    the epipolar grid, px; residuals (disparity, y-parallax) ``before``, ``after`` and
+    ``by_affines`` alone [n, 2], px; which are ``used`` [n]."""
 
     site: NDArray[np.int64]
     left: Floats
     at: Floats
     before: Floats
     after: Floats
+    by_affines: Floats
     used: NDArray[np.bool_]
 
     @classmethod
@@ -50,6 +52,7 @@ class _Ties(NamedTuple):
             pairs("epipolar_x_px", "epipolar_y_px"),
             pairs("disparity_before_px", "y_parallax_before_px"),
             pairs("disparity_after_px", "y_parallax_after_px"),
+            pairs("disparity_by_affines_px", "y_parallax_by_affines_px"),
             np.array([row["used"] == "yes" for row in rows]),
         )
 
@@ -79,23 +82,41 @@ def _draw_over_image(axes: Sequence[Axes], ties: _Ties, left_image: str | Path) 
         ax.figure.colorbar(shown, ax=ax, label="disparity of LiDAR − that of the images, px")
 
 
+def _draw_by_line(axes: Sequence[Axes], ties: _Ties) -> None:
+    """Residuals by line of the left image: of the affines alone, and with corrections by line."""
+    lines = ties.left[ties.used, 1]
+    for k, (ax, name) in enumerate(zip(axes, NAMES)):
+        for values, word, colour in (
+            (ties.by_affines, "affines alone", "0.6"),
+            (ties.after, "corrected by line", "C0"),
+        ):
+            ax.plot(lines, values[ties.used, k], ".", color=colour, markersize=3, label=word)
+        ax.axhline(0.0, color="black", linewidth=0.8)
+        ax.set(xlabel="line of the left image, px", ylabel=f"{name}, px")
+        ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+
+
 def draw_refinement(
     alignment: Alignment, csv_file: str | Path, png_file: str | Path, left_image: str | Path
 ) -> None:
     """Draw the tie points of a refined alignment (PNG), by their table (CSV) and the left image.
 
     Medians of the sites as vectors, tie points over the image, coloured by their residuals, and
-    histograms of these. Without tie points the figure says why.
+    histograms of these; where lines are corrected, residuals by line. Without tie points the figure
+    says why.
     """
     ties = _Ties.read(csv_file)
     record = alignment.refinement
     word = "applied" if record["applied"] else f"not applied: {record['reason']}"
-    figure = Figure(figsize=(11.5, 15.0), layout="constrained")
+    by_line = bool(record.get("by_line", {}).get("used"))
+    figure = Figure(figsize=(11.5, 18.0 if by_line else 15.0), layout="constrained")
     figure.suptitle(f"{alignment.scene or 'alignment'}: refinement {word}")
     if ties is None:
         save_figure(png_file, figure)
         return
-    axes = figure.subplots(3, 2, height_ratios=(3, 3, 2))
+    axes = figure.subplots(3 + by_line, 2, height_ratios=(3, 3, 2, 2)[: 3 + by_line])
+    if by_line:
+        _draw_by_line(axes[3], ties)
     _draw_over_image(axes[1], ties, left_image)
     used = ties.used
     states = {"before": ties.before, "after": ties.after}
@@ -124,8 +145,7 @@ def draw_refinement(
         ax.set_title(f"{name}: medians of {len(sites)} sites (× blunders)", loc="left", fontsize=10)
         ax.set(xlabel="x in px of the epipolar grid", ylabel="y in px", aspect="equal")
         ax.invert_yaxis()
-    names = ("disparity of LiDAR − that of the images", "y-parallax")
-    for k, (ax, name, figures) in enumerate(zip(axes[2], names, ("disparity", "y_parallax"))):
+    for k, (ax, name, figures) in enumerate(zip(axes[2], NAMES, ("disparity", "y_parallax"))):
         values = [state[used, k] for state in states.values()]
         bins = np.linspace(*np.percentile(np.concatenate(values), (0.5, 99.5)), 61)
         for (state, _), v, colour in zip(states.items(), values, ("0.7", "C0")):

@@ -25,6 +25,8 @@ COLUMNS = (
     "y_parallax_before_px",
     "disparity_after_px",
     "y_parallax_after_px",
+    "disparity_by_affines_px",
+    "y_parallax_by_affines_px",
 )
 
 
@@ -48,10 +50,11 @@ def _write_table(observations: Observations | None, path: Path) -> None:
             return
         ties = observations.ties
         found = ties.right + ties.shift
+        residuals = observations.before, observations.after, observations.by_affines
         for k in range(len(ties)):
             row = [f"{v:.3f}" for v in (*ties.left[k], *found[k], ties.height[k])]
             row += [f"{v:.3f}" for v in observations.at[k]]
             row += [f"{ties.correlation[k]:.4f}", f"{ties.sigma[k]:.4f}"]
             row += ["yes" if observations.used[k] else "no"]
-            row += [f"{v:.4f}" for v in (*observations.before[k], *observations.after[k])]
+            row += [f"{v:.4f}" for values in residuals for v in values[k]]
             writer.writerow([ties.site[k], *row])

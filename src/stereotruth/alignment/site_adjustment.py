@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.line_correction import LineCorrection, of_record, read_correction
 from ..epipolar.rpc import RPC, SensorModel
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
@@ -110,6 +111,7 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
     if not files:
         return None
     parameters: dict[str, Floats] = {}
+    by_line: dict[str, LineCorrection] = {}
     blocks = []
     for file in sorted({Path(path) for path in files.values()}):
         names = sorted(name for name, path in files.items() if Path(path) == file)
@@ -122,6 +124,8 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
                     remedy="name a copy of results/adjust/<city>.json that has it",
                 )
             parameters[name] = np.array(values["images"][name]["parameters"])
+            if (lines := read_correction(values["images"][name])) is not None:
+                by_line[name] = lines
         order = values["covariance"]["images"]
         index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
         blocks.append(np.array(values["covariance"]["values"])[np.ix_(index, index)])
@@ -131,7 +135,7 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
         end = start + len(block)
         covariance[start:end, start:end] = block
         start = end
-    return FixedImages(parameters, covariance)
+    return FixedImages(parameters, covariance, by_line)
 
 
 def adjust_site(
@@ -194,6 +198,9 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
     if pair.ties is None or fit is None:
         return figures | {"places": 0, "tie_points": 0, "used": 0, "matched": 0.0}
     used = int(fit.used.sum())
+    misfits: dict[str, Any] = {"shared_px": round(fit.shared_px, 6)} if fit.shared_px else {}
+    if fit.lines_covariance is not None:
+        misfits["lines_covariance"] = fit.lines_covariance.tolist()
     return figures | {
         "places": pair.ties.places,
         "tie_points": len(fit.used),
@@ -201,6 +208,7 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
         "matched": round(used / pair.ties.places, 3),
         "misfit": round(fit.misfit, 3),
         "weight": round(fit.weight, 3),
+        **misfits,
         **residual_figures(fit.residuals[fit.used]),
     }
 
@@ -241,6 +249,7 @@ def _image_figures(
         "fixed": is_fixed,
         "parameters": parameters.tolist(),
         "affine": image.start.moved(parameters).tolist(),
+        **of_record(fit.by_line.get(name)),
         "correction": {
             "col": round(float(parameters[2]), 4),
             "row": round(float(parameters[5]), 4),

@@ -14,19 +14,23 @@ depend on the order of images or pairs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.line_correction import LineCorrection
 from ..numerics.robust import huber_weights, robust_sigma, tukey_weights
 from .adjustment import Estimate, Sums, estimate
 from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
 from .aligned_pair import ViewFit
 from .equations import Equations, PairEquations, PlanObservation
+from .lack_of_fit import shared_spread, with_shared_errors
+from .line_fit import estimate_with_lines
 from .plan_frame import PlanFrame, with_offsets
 from .robust_fit import BLUNDER_FLOOR
+from .site_lines import PairOfLines, SiteLines, fit_site_lines
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -79,10 +83,12 @@ class PairToFit:
 
 @dataclass(frozen=True, eq=False)
 class FixedImages:
-    """Corrections that stay: parameters [6] by name, and their covariance [6 n, 6 n] in px²."""
+    """Corrections that stay: parameters [6] by name, their covariance [6 n, 6 n] in px², and by
+    line, of those images that have one."""
 
     parameters: Mapping[str, Floats]
     covariance: Floats
+    by_line: Mapping[str, LineCorrection] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +96,8 @@ class PairFit:
     """A pair's own estimate and what all images together make of it.
 
     ``residuals`` [n, 2] px along and across the rows; ``used`` bool[n]: not a blunder; ``misfit``:
-    the pair against all, in standard deviations; ``weight`` in [0, 1].
+    the pair against all, in standard deviations; ``weight`` in [0, 1]. ``lines_covariance`` and
+    ``shared_px``: see :data:`.aligned_pair.OF_MISFITS`.
     """
 
     estimate: Estimate
@@ -98,6 +105,8 @@ class PairFit:
     used: Bools
     misfit: float
     weight: float
+    lines_covariance: Floats | None
+    shared_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +118,7 @@ class SiteFit:
     ``residuals``, ``leave_one_out`` by name [n, 2] px and ``used`` bool[n] of the control points,
     ``point_sigma`` px of one. ``pairs`` by scene, of those that have tie points. ``scatter``: of
     the pairs against each other, in the standard deviations that each states, at least 1.
+    ``by_line``: corrections by line, of the images that have one.
     """
 
     names: tuple[str, ...]
@@ -120,6 +130,7 @@ class SiteFit:
     point_sigma: float
     pairs: Mapping[str, PairFit]
     scatter: float
+    by_line: Mapping[str, LineCorrection]
 
     def covariance_of(self, *names: str) -> Floats:
         """[6 k, 6 k] px² of the parameters of some images."""
@@ -146,13 +157,16 @@ class _Points:
     index: NDArray[np.int64]
 
     @classmethod
-    def of(cls, images: Sequence[ImageToFit]) -> _Points:
+    def of(cls, images: Sequence[ImageToFit], lines: SiteLines) -> _Points:
         design, delta, index = [np.zeros((0, 2, 6))], [np.zeros((0, 2))], [np.zeros((0, 6), int)]
         for k, image in enumerate(images):
             points = image.points
             if len(points.ids):
+                measured = points.measured
+                if k in lines.corrections:
+                    measured = np.stack(lines.corrections[k].take(*measured.T), axis=1)
                 design.append(image.start.design(*points.predicted.T))
-                delta.append(points.measured - points.predicted)
+                delta.append(measured - points.predicted)
                 index.append(np.tile(_six(k), (len(points.ids), 1)))
         return cls(np.concatenate(design), np.concatenate(delta), np.concatenate(index))
 
@@ -177,20 +191,28 @@ class _Pair:
     estimate: Estimate
     sums: Sums
     spread: Floats
+    lines_covariance: Floats | None
+    shared_px: float
 
     @classmethod
-    def of(cls, pair: PairToFit, images: Mapping[str, ImageToFit], names: Sequence[str]) -> _Pair:
-        ties = pair.ties
-        prior = np.zeros((12, 12))
-        for k, name in enumerate((pair.left, pair.right)):
-            own = slice(6 * k, 6 * k + 6)
-            prior[own, own] = rpc_prior(images[name].start)
-        equations = ties.equations
-        # Blunders are looked for where the tie points were matched.
-        found = estimate(equations.about(ties.linearised_at), prior, ties.common_px)
+    def of(cls, pair: PairToFit, own: PairOfLines, lines: SiteLines) -> _Pair:
+        """Without what corrections by line change, and with what near sites share."""
+        equations, ties = own.equations, pair.ties
+        found = own.estimate
+        if lines.corrections:
+            effect = lines.effect(equations.design, equations.lines, own.images)
+            equations = replace(equations, observed=equations.observed - effect)
+            prior = found.root @ found.root.T
+            found = estimate(equations.about(ties.linearised_at), prior, ties.common_px)
+        about = equations.about(ties.linearised_at)
+        shared = with_shared_errors(found, about, by_line=bool(lines.corrections))[1]
         sums = Sums.of(equations.design, equations.observed, found.information)
-        index = np.concatenate([_six(names.index(name)) for name in (pair.left, pair.right)])
-        return cls(pair.scene, index, equations, found, sums, sums.spread(found.shared))
+        spread = sums.spread(found.shared) + shared_spread(found, equations, shared)
+        index = np.concatenate([_six(k) for k in own.images])
+        covariance = lines.covariance.get(pair.scene)
+        return cls(
+            pair.scene, index, equations, found, sums, spread, covariance, shared.label_px
+        )  # fmt: skip
 
     def misfit(self, x: Floats) -> float:
         """By how many of their standard deviations the observations are off, rms."""
@@ -199,6 +221,27 @@ class _Pair:
         seen = values > SEEN * values.max()
         amounts = (vectors[:, seen].T @ gradient) ** 2 / values[seen]
         return float(np.sqrt(amounts.mean()))
+
+
+def _by_themselves(
+    pairs: Sequence[PairToFit], images: Mapping[str, ImageToFit]
+) -> list[PairOfLines]:
+    """What the tie points of each pair say, RPCs being all that is known besides."""
+    names = list(images)
+    found = []
+    for pair in pairs:
+        of_pair, ties = (pair.left, pair.right), pair.ties
+        prior = np.zeros((12, 12))
+        for k, name in enumerate(of_pair):
+            own = slice(6 * k, 6 * k + 6)
+            prior[own, own] = rpc_prior(images[name].start)
+        rows = tuple(images[name].start.size[1] for name in of_pair)
+        # Blunders are looked for where the tie points were matched.
+        about = ties.equations.about(ties.linearised_at)
+        told = estimate_with_lines(about, prior, ties.common_px, rows)
+        numbers = names.index(pair.left), names.index(pair.right)
+        found.append(PairOfLines(pair.scene, numbers, ties.equations, *told))
+    return found
 
 
 def _point_sigma(lengths: Floats, used: Bools, unknowns: float) -> float:
@@ -217,8 +260,16 @@ def fit_site(
     """Adjust the corrections of all images together; those ``fixed`` keep theirs."""
     by_name = {image.name: image for image in sorted(images, key=lambda image: image.name)}
     names = list(by_name)
-    points = _Points.of(list(by_name.values()))
-    known = [_Pair.of(p, by_name, names) for p in sorted(pairs, key=lambda p: p.scene) if p.ties]
+    tied = [pair for pair in sorted(pairs, key=lambda pair: pair.scene) if pair.ties]
+    by_itself = _by_themselves(tied, by_name)
+    held = () if fixed is None else fixed.parameters
+    lines = fit_site_lines(
+        by_itself,
+        [image.start.size[1] for image in by_name.values()],
+        {k: fixed.by_line.get(name) for k, name in enumerate(names) if name in held},
+    )
+    points = _Points.of(list(by_name.values()), lines)
+    known = [_Pair.of(*both, lines) for both in zip(tied, by_itself)]
     count = 6 * len(names)
     prior = np.zeros((count, count))
     for k, image in enumerate(by_name.values()):
@@ -276,10 +327,13 @@ def fit_site(
                 pair.estimate.weights > 0.0,
                 float(misfit),
                 float(weight),
+                pair.lines_covariance,
+                pair.shared_px,
             )
             for pair, misfit, weight in zip(known, misfits, pair_weights)
         },
         scatter=scatter,
+        by_line={names[k]: one for k, one in lines.corrections.items()},
     )
 
 

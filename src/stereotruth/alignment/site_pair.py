@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ..epipolar.line_correction import read_correction
 from ..epipolar.rpc import SensorModel
 from ..products.files import atomic_file, read_record, sealed
 from .aligned_pair import Alignment, GcpResidual, ViewFit, over_the_image
 from .equations import spread_of
+from .site_lines import SiteLines
 from .tie_equations import read_equations
 
 
@@ -90,8 +92,10 @@ def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
                 covariance=covariance[own, own],
             )
         )
-        sensors.append(SensorModel(sensor.rpc, affine))
+        sensors.append(SensorModel(sensor.rpc, affine, read_correction(image)))
         warnings += [f"image {name}: {text}" for text in image["doubts"]]
+    of_pair = site["pairs"].get(scene.scene, {})
+    lines = of_pair.get("lines_covariance")
     return replace(
         base,
         left=sensors[0],
@@ -99,8 +103,10 @@ def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
         left_fit=fits[0],
         right_fit=fits[1],
         cross_covariance=covariance[:6, 6:],
+        lines_covariance=None if lines is None else np.array(lines),
+        shared_px=of_pair.get("shared_px", 0.0),
         warnings=tuple(warnings),
-        refinement=_refinement(site, scene),
+        refinement=_refinement(site, scene) | {"remark": base.refinement.get("remark", "")},
     ).to_dict()
 
 
@@ -112,11 +118,17 @@ def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
         return record | {"tie_points": 0, "without_own_tie_points": reason}
     equations = ties.equations
     used = site["pairs"].get(scene.scene, {}).get("used")  # none of a pair that came later
-    images = [np.array(site["images"][name]["parameters"]) for name in scene.names]
+    figures = [site["images"][name] for name in scene.names]
+    images = [np.array(of["parameters"]) for of in figures]
+    corrections = {k: one for k, of in enumerate(figures) if (one := read_correction(of))}
+    by_line = SiteLines(corrections, {}).effect(equations.design, equations.lines, (0, 1))
     size = tuple(site["images"][scene.left]["size"])
     spreads = {}
-    for word, parameters in (("before", ties.start), ("after", np.concatenate(images))):
-        values = equations.observed - equations.design @ parameters
+    for word, parameters, lines in (
+        ("before", ties.start, 0.0),
+        ("after", np.concatenate(images), by_line),
+    ):
+        values = equations.observed - equations.design @ parameters - lines
         spreads[word] = {
             name: spread_of(values[:, k], equations.at, size)
             for k, name in enumerate(("disparity", "y_parallax"))

@@ -2,8 +2,8 @@
 
 A point that is off by o = (east, north, up) lies off in the grid of the labelled view, and its
 disparity is off, by e = J o. Images are aligned to all strips together, so that labels of a strip
-are off by e less what the alignment took of it: the mean of e over the pair. This is known of each
-strip, and its square is part of the labels' variance as an error of the alignment is
+are off by e less what the alignment takes of it (:func:`_taken`). This is known of each strip, and
+its square is part of the labels' variance as an error of the alignment is
 (:mod:`.label_uncertainty`), with the variance of the offset itself.
 """
 
@@ -56,8 +56,8 @@ def with_strips(
         offsets = np.zeros_like(offsets)
     covariance = np.array([strip.covariance_m2 for strip in strips.strips])
     effects = np.einsum("rcij,kj->krci", jacobian, offsets)
-    mean = np.einsum("krc,krci->i", shares, np.nan_to_num(effects)) / known.sum()
-    rest = effects - mean
+    together = np.einsum("krc,krci->rci", shares, np.nan_to_num(effects))
+    rest = effects - _taken(together, x, y, known)
     found = np.einsum("krc,krci,krcj->rcij", shares, rest, rest)
     explained = float(np.mean(found[known][:, 0, 0]))
     found += np.einsum("krc,rcia,kab,rcjb->rcij", shares, jacobian, covariance, jacobian)
@@ -65,6 +65,19 @@ def with_strips(
     found[..., 0, 0] -= min(shared_px**2, explained)
     nodes = np.moveaxis(found[..., *_UPPER], -1, 0).round(10)
     return replace(uncertainty, nodes=uncertainty.nodes + nodes, step=STEP)
+
+
+def _taken(effects: Floats, x: Floats, y: Floats, known: NDArray[np.bool_]) -> Floats:
+    """What an alignment takes of ``effects`` [rows, cols, 3] at places: the affine function that
+    fits those of disparity best, and the mean of those of place.
+
+    Corrections of the images are affine, and level ground tells disparity alone.
+    """
+    taken = np.broadcast_to(effects[known].mean(axis=0), effects.shape).copy()
+    design = np.stack([np.ones_like(x), x / x.max(), y / y.max()], axis=-1)
+    found = np.linalg.lstsq(design[known], effects[known][:, 0], rcond=None)[0]
+    taken[..., 0] = design @ found
+    return taken
 
 
 def _ground(model: EpipolarModel, x: Floats, y: Floats, view: str) -> tuple[Floats, Floats]:

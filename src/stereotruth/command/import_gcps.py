@@ -84,18 +84,18 @@ def import_gcps(
         raise InputError("is there already", file=to, remedy="name another file, or remove it")
     kinds = {file.suffix.lower() for file in files}
     if kinds == {".points"}:
-        points, crs, lines = from_qgis(files, crs)
+        points, said, lines = from_qgis(files, crs)
     elif kinds == {".gcp"} and len(files) == 1:
-        points, crs, lines = from_asp(files[0], crs, left, right)
+        points, said, lines = from_asp(files[0], crs, left, right)
     elif len(files) == 1:
-        points, crs, lines = from_csv(files[0], crs)
+        points, said, lines = from_csv(files[0], crs)
     else:
         raise InputError(
             f"{len(files)} files of {', '.join(sorted(kinds))}",
             file=files[0],
             remedy="give two .points (left, right), one .gcp, or one .csv",
         )
-    raster = heights
+    crs, epoch, raster = said.get("crs", ""), epoch or said.get("epoch", ""), heights
     if heights is not None and heights.suffix.lower() in TABLES:
         ground, _ = to_wgs84(points, crs, None, files[0], places_only=True)
         points, raster = with_heights(points, ground, heights), None
@@ -215,11 +215,18 @@ class _Text:
             ) from None
         found = cls(file)
         for number, line in enumerate(text.splitlines(), 1):
-            if said := re.match(r"#\s*(CRS|WKT|EPSG)\s*[:=]\s*(.+)", line, re.IGNORECASE):
-                found.declared.setdefault("crs", said[2].strip())
+            if said := re.match(
+                r"#\s*(CRS|WKT|EPSG|frame|epoch)\s*[:=]\s*(.+)", line, re.IGNORECASE
+            ):
+                key = "epoch" if said[1].lower() == "epoch" else "crs"
+                found.declared.setdefault(key, said[2].strip())
             elif line.strip() and not line.startswith("#"):
                 found.lines.append((number, line))
         return found
+
+    def said(self, crs: str) -> dict[str, str]:
+        """``crs`` and ``epoch`` of the coordinates; ``crs`` that is given goes before."""
+        return self.declared | ({"crs": crs} if crs else {})
 
     def number(self, text: str, what: str, line: int) -> float:
         """A decimal number, NaN for an empty cell. Raises InputError that names the line."""
@@ -259,7 +266,9 @@ def _called(header: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
 # ------------------------------------------------------------------------------------------- QGIS
 
 
-def from_qgis(files: Sequence[Path], crs: str = "") -> tuple[list[Point], str, list[str]]:
+def from_qgis(
+    files: Sequence[Path], crs: str = ""
+) -> tuple[list[Point], dict[str, str], list[str]]:
     """Points of the georeferencer, one file a view; without a column id joined by their place.
 
     Points that are switched off there are left out. Also their system, and what was done.
@@ -306,7 +315,7 @@ def from_qgis(files: Sequence[Path], crs: str = "") -> tuple[list[Point], str, l
     ]
     how = "their ids" if named else "their map coordinates"
     counts = f"{len(views[0])} points of {files[0].name}, {len(views[1])} of {files[1].name}"
-    return points, systems[0], [f"{counts}, joined by {how}"]
+    return points, texts[0].declared | {"crs": systems[0]}, [f"{counts}, joined by {how}"]
 
 
 def _same_place(at: dict, lon: float, lat: float) -> object:
@@ -354,7 +363,7 @@ def _qgis_view(text: _Text) -> list[Point]:
 
 def from_asp(
     file: Path, crs: str = "", left: str = "", right: str = ""
-) -> tuple[list[Point], str, list[str]]:
+) -> tuple[list[Point], dict[str, str], list[str]]:
     """A .gcp file: id lat lon height, three sigmas, then image col row sigma sigma of each image.
 
     ``left``, ``right`` name the images, whole or by a part that only one has; else there have to be
@@ -386,7 +395,7 @@ def from_asp(
             points.append(Point(name, lon, lat, height, **pixels))
     said = ", ".join(f"{view}: {image}" for view, image in views.items())
     done = [f"{len(points)} of {len(rows)} points; {said}"]
-    return points, crs or text.declared.get("crs", ""), done
+    return points, text.said(crs), done
 
 
 def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str, str]:
@@ -418,7 +427,7 @@ def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str,
 # -------------------------------------------------------------------------------------------- CSV
 
 
-def from_csv(file: Path, crs: str = "") -> tuple[list[Point], str, list[str]]:
+def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], list[str]]:
     """A table with a header, of any of the names and separators that are common; its system."""
     text = _Text.read(file)
     header, rows = text.table()
@@ -436,7 +445,7 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], str, list[str]]:
         pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
-    return points, crs or text.declared.get("crs", ""), [f"{len(points)} points of {file.name}"]
+    return points, text.said(crs), [f"{len(points)} points of {file.name}"]
 
 
 TABLES = (".csv", ".txt", ".tsv")

@@ -37,7 +37,7 @@ from ..products.files import atomic_file, atomic_folder, growing_table, write_ta
 from ..products.provenance import describe, file_sha256, own_digest, source_digest
 from .footprints import FOOTPRINTS, feature, write_footprints
 from .ground_looks import write_ground_looks
-from .label_doubts import Doubt, StripDoubt, doubts, surface_figures
+from .label_doubts import Doubt, ToldDoubt, doubts, surface_figures
 from .layer_kinds import column
 from .orientation import save
 from .quality_limits import flag, missed
@@ -327,8 +327,8 @@ def _write_tiles(
         rows = [row for row, _ in written]
         splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
         drawn.append(pool.submit(beside.draw, city, rows, windows, scratch, settings.nodata))
-        strips = {s.scene: of["sentence"] for s in windows.sources if (of := s.lidar_strips)}
-        gates = _gates(city, rows, scene_checks, strips, settings.quality, settings.strict)
+        told = {source.scene: source.told for source in windows.sources}
+        gates = _gates(city, rows, scene_checks, told, settings.quality, settings.strict)
         for source in windows.sources:
             gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             gates["scenes"][source.scene]["lidar"] = source.lidar
@@ -388,27 +388,25 @@ def _gates(
     city: str,
     rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
-    strips: Mapping[str, str],
+    told: Mapping[str, Sequence[ToldDoubt]],
     limits: Limits,
     strict: bool,
 ) -> dict[str, Any]:
     """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
 
-    ``strips``: by scene, what is to be said of the strips of its LiDAR, or nothing. Logs each miss
-    and doubt, or ends a strict run.
+    ``told``: by scene, what earlier stages have said of it. Logs each miss and what the images
+    doubt, or ends a strict run.
     """
     found, problems = {}, []
-    in_doubt: dict[str, list[Doubt | StripDoubt]] = {}
+    in_doubt: dict[str, list[Doubt | ToldDoubt]] = {}
     for scene, checks in scenes.items():
         figures = checks.figures()
         misses = missed(figures, limits)
         found[scene] = figures | {"quality": flag(misses)}
-        in_doubt[scene] = [
-            *doubts(checks.matches.biases, limits.min_agreement),
-            *([StripDoubt(sentence)] if (sentence := strips.get(scene)) else []),
-        ]
+        by_images = doubts(checks.matches.biases, limits.min_agreement)
+        in_doubt[scene] = [*by_images, *told.get(scene, ())]
         problems += [f"scene {scene}: {miss}" for miss in misses]
-        problems += [f"scene {scene}: {doubt}" for doubt in in_doubt[scene] if not doubt.explained]
+        problems += [f"scene {scene}: {doubt}" for doubt in by_images if not doubt.explained]
     labelled = [row for row in rows if row["complete"] == "yes"]
     for row in labelled:
         row["doubt"] = "; ".join(map(str, in_doubt[row["scene"]]))
@@ -424,13 +422,13 @@ def _gates(
             remedy="better control points, images or LiDAR for what is named, another limit "
             "(null: none) in quality of the configuration, or strict: false to have it flagged",
         )
-    remarks = [
+    explained = [
         f"scene {scene}: {doubt}"
         for scene, of in in_doubt.items()
         for doubt in of
         if doubt.explained
     ]
-    for problem in problems + remarks:
+    for problem in problems + explained:
         log.warning("%s: %s", city, problem)
     return {
         "limits": asdict(limits),

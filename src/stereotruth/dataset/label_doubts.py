@@ -39,6 +39,7 @@ REMARK_PX = 0.1
 REACH = 3.0  # scales from the location at which a match no longer counts
 STEPS = 100  # of the iteration, at most
 PARALLAX = "y-parallax"
+ALIGNMENT, LIDAR, STRIPS = ABOUT = ("alignment", "LiDAR", "strips")  # what earlier stages tell of
 JUDGED = (LabelSurface.OPEN_GROUND.words, LabelSurface.ROOFS.words, PARALLAX)
 
 
@@ -109,16 +110,19 @@ class Doubt:
 
 
 @dataclass(frozen=True)
-class StripDoubt:
-    """Strips of the LiDAR that disagree, by their ``sentence``; labels state it in their
-    uncertainty."""
+class ToldDoubt:
+    """What an earlier stage has said of a scene, by its ``sentence``, ``about`` one of ABOUT.
 
+    ``explained``: labels state it in their uncertainty.
+    """
+
+    about: str
     sentence: str
-    explained: bool = True
+    explained: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return {"of": "strips", "text": self.sentence, "explained_by_alignment": self.explained}
+        return {"of": self.about, "text": self.sentence, "explained_by_alignment": self.explained}
 
     def __str__(self) -> str:
         return self.sentence

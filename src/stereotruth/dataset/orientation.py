@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..numerics.degrees import for_readers
 from .polynomials import evaluate, fit
 
 if TYPE_CHECKING:
@@ -45,6 +46,13 @@ VIEWS = {  # by the epipolar model's view_order
     "left looks forward": "left: reference, the forward view; right: the backward view",
     "across track": "left: reference; right: the other view, across the flight direction",
 }
+
+
+OF_LINES = (
+    "The attitude jitters: where sensor_model has by_line, that (col, row) is of the smooth "
+    "sensor, and the image as delivered shows it at (col, row) + (C(row), R(row)), as "
+    "by_line.meaning says."
+)
 
 
 def _nodes(low: float, high: float, count: int) -> Floats:
@@ -171,17 +179,18 @@ def orientation(
     ground = ground_polynomial(model, row0, col0, size, offset, (low, high))
     views = {}
     for view, to_sensor, first in (
-        ("left", model.epipolar_to_left, col0),
-        ("right", model.epipolar_to_right, col0 - offset),
+        ("left", model.left_image.smooth.inverse, col0),
+        ("right", model.right_image.smooth.inverse, col0 - offset),
     ):
         forth, back = view_polynomials(to_sensor, row0, first, size)
         views[view] = {"tile_to_sensor": forth, "sensor_to_tile": back, **sensors[view]}
+    ring = np.column_stack([for_readers(ring[:, 0]), ring[:, 1:]])
     coordinates = [[round(float(v), 9) for v in point] for point in (*ring, ring[0])]
     return {
         "window": {"row0": row0, "col0": col0, "size": size, "unit": "px of the epipolar grid"},
         "right_offset_px": offset,
         "conventions": CONVENTIONS | {"views": VIEWS[model.report["view_order"]]},
-        "to_heights": _recipe(views, ground, offset, height, disparity),
+        "to_heights": _recipe(model, views, ground, offset, height, disparity),
         "ground": ground,
         **views,
         "footprint": {
@@ -195,6 +204,7 @@ def orientation(
 
 
 def _recipe(
+    model: EpipolarModel,
     views: Mapping[str, Any],
     ground: Mapping[str, Any],
     offset: int,
@@ -208,6 +218,7 @@ def _recipe(
         "ground.disparity_range_px.",
         "Original images: left.tile_to_sensor at (x, y) and right.tile_to_sensor at (x - d, y) "
         "give (col, row) in the two images as delivered; sensor_to_tile goes back.",
+        *([OF_LINES] if model.has_lines else []),
         "By rays instead: those two (col, row) and the two corrected_rpc, intersected in space "
         "by any photogrammetric software, give the same point.",
     ]
@@ -217,8 +228,12 @@ def _recipe(
         k = int(np.argmin((rows - middle) ** 2 + (cols - middle) ** 2))
         x, y, d = int(cols[k]), int(rows[k]), float(disparity[rows[k], cols[k]])
         point = evaluate(ground, x, y, d)
-        left = evaluate(views["left"]["tile_to_sensor"], x, y)
-        right = evaluate(views["right"]["tile_to_sensor"], x - d, y)
+        at = evaluate(views["left"]["tile_to_sensor"], x, y)
+        there = evaluate(views["right"]["tile_to_sensor"], x - d, y)
+        left, right = (
+            dict(zip(("col", "row"), sensor.shown_at(place["col"], place["row"])))
+            for sensor, place in ((model.left, at), (model.right, there))
+        )
         steps.append(
             f"Example: left pixel ({x}, {y}) has d = {d:.4f} px, so its match is ({x - d:.4f}, "
             f"{y}) of the right tile, and d in the scene is {d + offset:.4f} px. The formula "

@@ -16,6 +16,7 @@ from ..epipolar.model import EpipolarModel
 from ..errors import InputError
 from ..products.grids import require_complete
 from ..products.provenance import digest, file_sha256
+from .label_doubts import ALIGNMENT, LIDAR, STRIPS, ToldDoubt
 from .orientation import sensor_record
 from .sure_labels import Labels, tile_flags, tile_labels
 
@@ -40,7 +41,8 @@ class SceneFiles(NamedTuple):
 class SceneStores:
     """Opened stores of a scene, its epipolar model, and the meaning of the status values.
 
-    ``doubts``: warnings of the alignment, a refinement that was refused among them.
+    ``doubts``: warnings of the alignment, a refinement that was refused among them; ``remark``: why
+    labels are less sure than the scatter of their tie points, or empty.
     ``disparity``, ``status``, and these of the right view (``of_right``), as the tiles have them.
     ``acquired``: days (ISO) of the left and right image, empty where they are not known. ``light``:
     whether the images share it, and what decided that (:mod:`..epipolar.pair_light`).
@@ -68,11 +70,18 @@ class SceneStores:
     lidar: Mapping[str, Any] | None
     light: Mapping[str, Any] | None
     doubts: tuple[str, ...]
+    remark: str
 
     @property
-    def lidar_strips(self) -> Mapping[str, Any] | None:
-        """What the strips of its LiDAR are off; None of one strip."""
-        return (self.lidar or {}).get("strips")
+    def told(self) -> list[ToldDoubt]:
+        """What alignment and LiDAR say of what the labels are worth."""
+        lidar = self.lidar or {}
+        found = [ToldDoubt(ALIGNMENT, text) for text in self.doubts]
+        found += [ToldDoubt(ALIGNMENT, self.remark, True)] * bool(self.remark)
+        found += [ToldDoubt(LIDAR, text) for text in lidar.get("doubts", ())]
+        if strips := lidar.get("strips"):
+            found += [ToldDoubt(STRIPS, strips["sentence"], True)] * bool(strips["sentence"])
+        return found
 
 
 def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> SceneStores:
@@ -112,7 +121,7 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         inputs[f"{item.scene}/disparity_of_right"] = found
     if item.alignment is not None:
         inputs[f"{item.scene}/alignment"] = file_sha256(item.alignment)
-    gcp_rms, doubts = (None, ()) if item.alignment is None else _told_by(item.alignment)
+    gcp_rms, doubts, remark = (None, (), "") if item.alignment is None else _told_by(item.alignment)
     return SceneStores(
         scene=item.scene,
         left=left["image"],
@@ -139,6 +148,7 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         lidar=disparity.attrs.get("lidar"),
         light=disparity.attrs.get("light"),
         doubts=doubts,
+        remark=remark,
     )
 
 
@@ -149,11 +159,12 @@ def _colours(*views: zarr.Group) -> tuple[tuple[zarr.Array, ...], ...] | None:
     return tuple(tuple(view[name] for name in COLOURS) for view in views)
 
 
-def _told_by(alignment: Path) -> tuple[float | None, tuple[str, ...]]:
+def _told_by(alignment: Path) -> tuple[float | None, tuple[str, ...], str]:
     """The larger of both views' residuals of the GCPs, px of the images (None without GCPs).
 
-    And the warnings of the alignment.
+    And the warnings of the alignment, and the remark of its refinement.
     """
     record = json.loads(Path(alignment).read_text(encoding="utf-8"))
     found = [record[view]["rms"]["after"] for view in ("left", "right")]
-    return max((v for v in found if v is not None), default=None), tuple(record["warnings"])
+    rms = max((v for v in found if v is not None), default=None)
+    return rms, tuple(record["warnings"]), record.get("refinement", {}).get("remark", "")

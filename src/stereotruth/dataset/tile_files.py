@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.warping import agreement, warp_rows
 from ..errors import InputError
+from ..numerics.degrees import turn
 from ..products.files import link
 from ..products.finished_pieces import Ledger
 from ..products.provenance import digest, file_sha256
@@ -295,7 +296,7 @@ def write_tile(
             f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
         ),
         "disparity_nodata": f"{cut.nodata:g}",
-        "lon": f"{lon:.7f}",
+        "lon": f"{turn(lon):.7f}",
         "lat": f"{lat:.7f}",
         **_lidar_days(source, window, known),
         **_light(source),

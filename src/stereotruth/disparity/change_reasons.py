@@ -44,6 +44,9 @@ GROUND_CLASS, TREE_CLASS, BUILDING_CLASS = 2, 5, 6
 AROUND_PX = 16  # up to here the patch is measured, and ground and water beside it are looked for
 VOTES_PX, STRONG = 16, 4  # pixels up to here vote; with positive evidence one counts so many
 QUORUM = 0.03  # share of the pixels that must have a reason
+# A rise that so many of the pixels around share is no chance agreement, which takes any of
+# WIDE_SHIFTS_PX: three of 26 in a row have a ninth.
+COMMON = 0.35
 REASON_PX = AROUND_PX + VOTES_PX  # by which these reach beyond the statuses that they follow from
 CROWN_PX, CROWN_PIXELS = 6, 5  # a tree has grown: up to here the LiDAR has so many pixels of one
 CROP_M = 3.2  # no crop is higher, and no storey lower
@@ -62,7 +65,9 @@ class Evidence(NamedTuple):
     the LiDAR to the images, NaN where these agree nowhere better. Whether the LiDAR's surface
     ``is_low`` enough over the ground around for a vehicle; whether the patch ``is_small`` enough
     for one; whether it ``is_crown``, small enough and with vegetation of the LiDAR in it; whether
-    it ``is_shore``, beside water of the LiDAR and not much higher.
+    it ``is_shore``, beside water of the LiDAR and not much higher. ``is_sure``: the rise is that of
+    most pixels around, and no chance agreement. ``is_unlike``: the images have two lights, so that
+    what is new agrees at no height, and what was there has gone if it does not either.
     """
 
     changed: Bools
@@ -72,6 +77,8 @@ class Evidence(NamedTuple):
     is_small: Bools
     is_crown: Bools
     is_shore: Bools
+    is_sure: Bools
+    is_unlike: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,24 +112,44 @@ def box_count(chosen: Bools, reach: int) -> NDArray[np.int64]:
     return window_sums(np.pad(chosen, reach), 2 * reach + 1)
 
 
-def evidence_of(surface: ChangedSurface, rise: Floats) -> Evidence:
-    """From the ``surface`` of the LiDAR and the ``rise`` (m) [h, w] of what the images show over
-    it."""
+def evidence_of(
+    surface: ChangedSurface, shift: Floats, px_per_m: float, diachronic: bool
+) -> Evidence:
+    """From the ``surface`` of the LiDAR, the ``shift`` (px) [h, w] at which the images agree better
+    (NaN for none), and the disparity of a metre of height; ``diachronic``: of two lights."""
     changed, own = surface.changed, surface.own
     classes = np.where(own.count > 0, own.surface_class, 0)
     ground = -box_max(np.where(classes == GROUND_CLASS, -own.highest, -np.inf), AROUND_PX)
     water = box_max(np.where(classes == WATER_CLASS, own.highest, -np.inf), AROUND_PX)
     vegetation = box_count(np.isin(classes, VEGETATION_CLASSES), CROWN_PX) >= CROWN_PIXELS
+    is_building = changed & (surface.classes == BUILDING_CLASS)
     share = box_count(changed, AROUND_PX) / (2 * AROUND_PX + 1) ** 2
     return Evidence(
         changed=changed,
         surface_class=surface.classes,
-        rise=np.where(changed, rise, np.nan),
+        rise=np.where(changed, shift / px_per_m, np.nan),
         is_low=surface.height - ground <= VEHICLE_M,
         is_small=share <= VEHICLE_SHARE,
         is_crown=vegetation & (share <= CROWN_SHARE),
         is_shore=surface.height < water + SHORE_M,
+        is_sure=is_common(shift, is_building, VOTES_PX) if diachronic else np.isfinite(shift),
+        is_unlike=diachronic,
     )
+
+
+def is_common(shift: Floats, chosen: Bools, reach: int) -> Bools:
+    """Where the ``shift`` (px, of WIDE_SHIFTS_PX; NaN for none) [h, w] of ``chosen`` pixels is that
+    of the share COMMON of those up to ``reach`` px around that have any, or one beside theirs."""
+    out = np.zeros(shift.shape, np.bool_)
+    has_any = chosen & np.isfinite(shift)
+    every = box_count(has_any, reach)
+    steps = np.sort(np.array(WIDE_SHIFTS_PX))
+    for k, step in enumerate(steps):
+        at_step = has_any & (shift == step)
+        if at_step.any():
+            near = has_any & np.isin(shift, steps[max(k - 1, 0) : k + 2])
+            out |= at_step & (box_count(near, reach) >= COMMON * every)
+    return out
 
 
 def pixel_reasons(evidence: Evidence) -> tuple[Bytes, Bools]:
@@ -137,8 +164,8 @@ def pixel_reasons(evidence: Evidence) -> tuple[Bytes, Bools]:
         ((e.surface_class == WATER_CLASS) | (ground & e.is_shore), Reason.WATER),
         (vegetation, Reason.GROWN_OR_FELLED),
         (building & e.is_low & e.is_small, Reason.MOVED),
-        (building & (e.rise > 0), Reason.BUILT),
-        (building & (e.rise < 0), Reason.DEMOLISHED),
+        (building & e.is_sure & (e.rise > 0), Reason.BUILT),
+        (building & (e.is_sure & (e.rise < 0) | e.is_unlike), Reason.DEMOLISHED),
         (building, Reason.NONE),
         (e.is_crown & ~(e.rise < 0), Reason.GROWN_OR_FELLED),
         (e.is_small & (is_open | is_level), Reason.MOVED),
@@ -148,7 +175,8 @@ def pixel_reasons(evidence: Evidence) -> tuple[Bytes, Bools]:
     )
     chosen = np.select([rule for rule, _ in rules], [reason for _, reason in rules], Reason.NONE)
     chosen = np.where(e.changed, chosen, Reason.NONE).astype(np.uint8)
-    return chosen, vegetation | ~is_open | (chosen == Reason.WATER)
+    is_strong = np.where(building, e.is_sure & ~is_open, ~is_open)
+    return chosen, vegetation | is_strong | (chosen == Reason.WATER)
 
 
 def by_votes(reasons: Bytes, is_strong: Bools, evidence: Evidence) -> Bytes:
@@ -187,7 +215,7 @@ def with_reasons(
         return labels
     surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
     by_class = np.isin(surface.classes, (*VEGETATION_CLASSES, WATER_CLASS))
-    votes = window.grown(VOTES_PX)
+    votes = window.grown(REASON_PX)  # what votes has the votes' reach of its own
     asked = np.zeros_like(changed)
     asked[votes] = changed[votes] & ~by_class[votes]
     shifted = shifted_agreement(
@@ -195,6 +223,6 @@ def with_reasons(
         WIDE_SHIFTS_PX,
     )  # fmt: skip
     agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
-    rise = np.where(agrees, shifted.shift / px_per_m, np.nan)
-    evidence = evidence_of(surface, rise)
+    shift = np.where(agrees, shifted.shift, np.float32(np.nan)).astype(np.float64)
+    evidence = evidence_of(surface, shift, px_per_m, comparison.diachronic)
     return replace(labels, change=by_votes(*pixel_reasons(evidence), evidence))

@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -96,8 +96,8 @@ LAYERS = {
 class ImageInputs:
     """An image, the points of its site and their surface.
 
-    ``sensor`` is corrected; ``fit``: the correction and its covariance, None if it counts as exact.
-    ``size``: (cols, rows) px.
+    ``sensor`` is corrected; ``fit``: the correction and its covariance, None if it counts as exact;
+    ``of_lines`` [2, 2] px²: of what is corrected by line. ``size``: (cols, rows) px.
     """
 
     sensor: SensorModel
@@ -105,6 +105,7 @@ class ImageInputs:
     stores: tuple[PointStore, ...]
     surface: SurfaceStore
     fit: ViewFit | None = None
+    of_lines: Floats = field(default_factory=lambda: np.zeros((2, 2)))
 
     @cached_property
     def reference_m(self) -> float:
@@ -184,7 +185,7 @@ class ImageInputs:
         if self.fit is None:
             return np.zeros((2, 2))
         design = self.fit.design((cols.start + cols.stop) / 2, (rows.start + rows.stop) / 2)
-        return design @ self.fit.covariance @ design.T
+        return design @ self.fit.covariance @ design.T + self.of_lines
 
 
 def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str, NDArray] | None:
@@ -381,7 +382,9 @@ def open_inputs(
     point_stores: Sequence[str | Path],
     surface: str | Path,
     fit: ViewFit | None = None,
+    of_lines: Floats | None = None,
 ) -> ImageInputs:
     """Inputs with the stores opened, those of points in the order of their names."""
     stores = open_stores(sorted(map(str, point_stores)))
-    return ImageInputs(sensor, size, stores, SurfaceStore(surface), fit)
+    lines = np.zeros((2, 2)) if of_lines is None else of_lines
+    return ImageInputs(sensor, size, stores, SurfaceStore(surface), fit, lines)

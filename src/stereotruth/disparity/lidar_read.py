@@ -31,9 +31,10 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
     all). ``holes_m2``: ground that both images show in whole cells without a point; ``hole`` (lon,
     lat, degrees): the middle of the largest such place, or None. ``not_read_m2``: ground whose
     points labels may follow from, and which the footprint left out. ``acquired``: first and last
-    day of the points, None unless all files tell them; ``surfaces``: what heights count from, by
-    number of files; ``strips``: what they are off, None of one strip; ``frame`` and epoch of the
-    places, and those of the files. What is missing is logged, and files of different surfaces.
+    day of the points, None unless all files tell them; ``doubts`` about the points; ``surfaces``:
+    what heights count from, by number of files; ``strips``: what they are off, None of one strip;
+    ``frame`` and epoch of the places, and those of the files. What is missing is logged, and files
+    of different surfaces.
     """
     attrs = [PointStore(path).attrs for path in inputs.point_stores]
     nodes = [a["nodes"] for a in attrs if a["nodes"]]
@@ -55,6 +56,7 @@ def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
         "hole": hole,
         "not_read_m2": _not_read(inputs),
         "acquired": _days([a["acquired"] for a in attrs]),
+        "doubts": sorted({text for a in attrs for text in a.get("doubts", ())}),
         "surfaces": _surfaces([a["crs"]["heights"] for a in attrs]),
         "strips": inputs.lidar_strips.report() if inputs.lidar_strips else None,
         "frame": _frame([a["crs"].get("frame") for a in attrs]),

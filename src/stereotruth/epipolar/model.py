@@ -82,6 +82,11 @@ class ImageModel:
         )
         object.__setattr__(self, "packed", packed)
 
+    @property
+    def smooth(self) -> ImageModel:
+        """The model of the smooth sensor's (col, row)."""
+        return self if self.by_line is None else replace(self, by_line=None)
+
     def forward(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:
         """Epipolar (x, y) of image points, px; arrays broadcast."""
         if self.by_line is not None:
@@ -166,7 +171,8 @@ class EpipolarModel:
         object.__setattr__(self, "_sensors", np.stack([self.left.packed(), self.right.packed()]))
 
     @property
-    def _by_line(self) -> bool:
+    def has_lines(self) -> bool:
+        """Whether an image has a correction by line."""
         return self.left_image.by_line is not None or self.right_image.by_line is not None
 
     def left_to_epipolar(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:
@@ -212,7 +218,7 @@ class EpipolarModel:
         """JSON-ready, with the formula: enough to evaluate the model without this software."""
         return {
             "what": "epipolar geometry of a stereo pair: original image <-> rectified image",
-            "formula": FORMULA + BY_LINE * self._by_line,
+            "formula": FORMULA + BY_LINE * self.has_lines,
             "units": "coordinates px, longitude and latitude degrees (WGS 84), heights m "
             "(ellipsoidal)",
             "shape": list(self.shape),

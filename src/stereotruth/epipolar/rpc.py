@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inlined, inner, kernel
+from ..numerics.degrees import continuous
 from .line_correction import LineCorrection, of_record, read_correction
 
 Floats = NDArray[np.float64]
@@ -224,6 +225,8 @@ class RPC:
     def __post_init__(self) -> None:
         for name in SCALARS:
             value = float(getattr(self, name))
+            if name == "long_off" and abs(value) <= LIMITS[name]:
+                value = float(continuous(value))
             if not np.isfinite(value):
                 raise ValueError(f"{name} is not finite")
             if name.endswith("_scale") and abs(value) < SMALLEST_SCALE:
@@ -351,8 +354,11 @@ class SensorModel:
 
     def project(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """True image (col, row) in px of ground points (degrees, degrees, m); arrays broadcast."""
-        at = _batch(project_points, self._packed, lon, lat, height)
-        return at if self.by_line is None else self.by_line.add(*at)
+        return self.shown_at(*_batch(project_points, self._packed, lon, lat, height))
+
+    def shown_at(self, col: Floats, row: Floats) -> tuple[Floats, Floats]:
+        """Where the image has what the smooth sensor has at (col, row), px."""
+        return (col, row) if self.by_line is None else self.by_line.add(col, row)
 
     def localize(self, col: ArrayLike, row: ArrayLike, height: ArrayLike) -> tuple[Floats, Floats]:
         """Ground (lon, lat) in degrees of true image points at ellipsoidal heights in m.

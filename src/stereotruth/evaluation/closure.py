@@ -39,6 +39,7 @@ from ..alignment.adjustment import estimate, parameters_of
 from ..alignment.aligned_pair import Alignment, over_the_image
 from ..alignment.equations import PairEquations
 from ..alignment.site_fit import rpc_prior
+from ..alignment.site_lines import SiteLines
 from ..alignment.tie_equations import read_equations
 from ..epipolar.model import EpipolarModel
 from ..errors import InputError
@@ -303,7 +304,12 @@ class _AlignedPair:
         for k, fit in enumerate(self.alignment.fits):
             prior[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = rpc_prior(fit)
         about = np.concatenate([parameters_of(fit) for fit in self.alignment.fits])
-        found = estimate(self.ties.equations.about(about), prior)
+        sensors = self.alignment.left, self.alignment.right
+        lines = {k: s.by_line for k, s in enumerate(sensors) if s.by_line is not None}
+        equations = self.ties.equations
+        effect = SiteLines(lines, {}).effect(equations.design, equations.lines, (0, 1))
+        equations = replace(equations, observed=equations.observed - effect)
+        found = estimate(equations.about(about), prior)
         return found.parameters, found.covariance
 
 

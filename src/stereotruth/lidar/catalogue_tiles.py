@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import ProjError
 
+from ..numerics.degrees import continuous
 from .declared_crs import interpret
 
 Floats = NDArray[np.float64]
@@ -69,7 +70,15 @@ def in_degrees(rings: list[Floats], crs: CRS | None) -> tuple[Floats, ...]:
     found = tuple(ring if change is None else np.stack(change(*ring)) for ring in rings)
     every = np.hstack(found)
     on_earth = np.isfinite(every).all() and (np.abs(every).max(axis=1) <= [180.0, 90.0]).all()
-    return found if on_earth else ()
+    return tuple(map(_in_one_piece, found)) if on_earth else ()
+
+
+def _in_one_piece(ring: Floats) -> Floats:
+    """A ring whose longitudes do not jump at the line of 180°, as those of footprints; one around
+    the Earth as it is."""
+    if {-180.0, 180.0} <= set(ring[0].tolist()):
+        return ring
+    return np.stack([continuous(ring[0]), ring[1]])
 
 
 def _parted(ring: Floats) -> Floats:

@@ -106,13 +106,12 @@ def _source(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
-class Depths(ValueError):
-    """A system whose vertical axis points down."""
+DEPTHS = "they are depths"  # of a system whose vertical axis points down
 
 
 def _refuse_depths(crs: CRS, axis: Any) -> None:
     if axis.direction.lower() != "up":
-        raise Depths(f"the heights of '{crs.name}' point {axis.direction}: they are depths")
+        raise ValueError(f"the heights of '{crs.name}' point {axis.direction}: {DEPTHS}")
 
 
 def interpret(crs: CRS) -> LidarCRS:
@@ -283,8 +282,6 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     def attempt(what: str, read) -> None:
         try:
             meaning = read()
-        except Depths:
-            raise
         except (ProjError, ValueError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
@@ -350,12 +347,11 @@ def resolve(
 
     Raises InputError if the file declares none and ``lidar_crs`` is empty, and for depths.
     """
-    try:
-        own, problems = header_crs(header)
-    except Depths as error:
+    own, problems = header_crs(header)
+    if depths := [text for text in problems if DEPTHS in text]:  # whatever the sheet says
         raise InputError(
-            str(error), file=file, remedy="write the file again with heights, which point up"
-        ) from None
+            depths[0], file=file, remedy="write the file again with heights, which point up"
+        )
     given = parse_crs(lidar_crs) if lidar_crs else None
     notes: list[str] = []
     if own is None:

@@ -109,6 +109,7 @@ class GeoidGrid:
         self.step_lon, self.step_lat = transform.a, -transform.e
         self.lon_first = transform.c + self.step_lon / 2
         self.lat_first = transform.f - self.step_lat / 2
+        self.is_constant = bool(sample.size) and float(np.ptp(sample)) == 0.0
         self._refuse_level(sample)
         self.around = round(360 / self.step_lon)  # columns once around the Earth
         if self.width < self.around:
@@ -155,7 +156,8 @@ class GeoidGrid:
                 last = max(last, self._first_row + len(rows) - 1)
             with open_raster(self.path, formats=FORMATS) as grid:
                 window = Window(0, first, self.width, last - first + 1)
-                fills = Fills(Values(grid, self.path, UNDULATION, self.unit_m))
+                values = Values(grid, self.path, UNDULATION, self.unit_m)
+                fills = Fills(values, may_be_constant=self.is_constant)
                 rows = self.unit_m * fills.add(*fills.values.raw(window=window))
             fills.refuse()
             self._refuse_other(rows, first)
@@ -177,6 +179,8 @@ class GeoidGrid:
         """Raise InputError if values of a whole grid are too alike, as shifts of datums are."""
         sides = self.height * self.step_lat, self.width * self.step_lon
         known = values[np.isfinite(values)]
+        if self.is_constant:
+            return
         if min(sides) > WIDE_DEG and known.size and np.abs(known).max() < LEAST_SPREAD_M:
             raise self._unusable(
                 f"its values are {known.min():.2f} to {known.max():.2f} m all over "

@@ -18,6 +18,7 @@ import numpy as np
 import pyproj
 
 from ..errors import InputError
+from ..numerics.degrees import turn
 
 MOST = 4  # candidates beside the ellipsoid
 ASSUMED = "ellipsoidal (assumed)"  # how stores say that nothing is declared
@@ -85,7 +86,7 @@ def _every(lon: float, lat: float) -> list[Candidate]:
     file = Path(pyproj.datadir.get_data_dir().split(os.pathsep)[0]) / "proj.db"
     try:
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as register:
-            rows = register.execute(QUERY, {"lon": lon, "lat": lat}).fetchall()
+            rows = register.execute(QUERY, {"lon": float(turn(lon)), "lat": lat}).fetchall()
     except sqlite3.Error:  # of another layout: then there are no names to give
         return []
     surfaces: dict[str, list[tuple[float, str]]] = {}

@@ -48,7 +48,8 @@ def refuse_grid(raster: Any, file: Path) -> None:
     at = raster.transform
     if at.b or at.d or not (at.a > 0 > at.e) or at == rasterio.Affine.identity():
         raise InputError(
-            "its cells are not on a grid with north up, or it has no place on the ground",
+            "the grid is not north-up, or has no place on the ground: cells have to lie on a grid "
+            "with north up",
             file=file,
             remedy="gdalwarp it to its own coordinate system, or give its world file's content "
             "with gdal_translate -a_ullr",
@@ -104,14 +105,14 @@ class HeightRaster:
                 if quantity is not HEIGHT:
                     system = LidarCRS(system.horizontal, ellipsoidal=True)
                 values = Values(source, path, quantity, system.height_unit_m)
+                ends = np.array([transform * (0, shape[0]), transform * (shape[1], 0)])
+                to_wgs84 = transformation(system, path, ends, geoid=geoid)
                 if whole and quantity is HEIGHT:
                     values.refuse_fills()
         except RasterioError as error:
             raise InputError(
                 f"no raster that can be read ({error})", file=path, remedy="give a GeoTIFF"
             ) from None
-        ends = np.array([transform * (0, shape[0]), transform * (shape[1], 0)])
-        to_wgs84 = transformation(system, path, ends, geoid=geoid)
         for note in to_wgs84.notes:
             log.warning("%s: %s", path.name, note)
         return cls(path, to_wgs84, transform, shape, quantity)

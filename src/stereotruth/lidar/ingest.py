@@ -50,6 +50,7 @@ Integers = NDArray[np.int64]
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
 COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
 COARSEST_CELL_M = 30.0  # of a surface model
+MARKED_SHARE = 1e-3  # of points that are marked as synthetic, beyond which labels are in doubt
 FARTHEST_M = 2e5  # heights beyond are no heights
 
 
@@ -146,8 +147,7 @@ def ingest(
 ) -> dict[str, Any]:
     """Bring one file of points into a point store.
 
-    LAS, LAZ and COPC (1.0 to 1.4, any point format), or a surface model as a GeoTIFF
-    (:mod:`.raster_points`).
+    LAS, LAZ, COPC (1.0 to 1.4, any format), or a surface model in GeoTIFF (:mod:`.raster_points`).
 
     Memory is that of a reading chunk and :data:`SCRATCH_POINTS`, whatever the size of the file;
     where it has more points, the others pass through a scratch file without a name, 16 bytes each,
@@ -169,8 +169,8 @@ def ingest(
     degrees, h_min, h_max in m; of no point: where all points of the file are about), ``crs``,
     ``footprint`` (runs of cells, or None), ``acquired`` (first and last day of all points read, and
     what tells them; None where nothing does), ``days`` that points tell themselves (of more than
-    :data:`.gps_times.CODES` none), ``strips`` (what tells them, points by code) and ``notes``
-    (remarks for the user, which are logged too).
+    :data:`.gps_times.CODES` none), ``strips`` (what tells them, points by code),
+    ``notes`` and ``doubts`` (remarks; doubts change what labels are worth), which are logged too.
 
     Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
@@ -226,6 +226,7 @@ def ingest(
             "days": tally.days.days if len(tally.days.days) <= CODES else [],
             "strips": strips,
             "notes": _notes(points, part, transform, tally, bounds),
+            "doubts": _doubts(tally, file),
         }
         about = {"source": file.name, "cells_crc32": cells_crc32}
         _write_attributes(unfinished, about, summary, dict(provenance or {}))
@@ -267,7 +268,7 @@ def _days(tally: PointTally, stated: Sequence[str]) -> dict[str, str] | None:
 
 def _tell(file: Path, summary: Mapping[str, Any], transform: ToWGS84) -> None:
     """What was read and kept, in the log."""
-    for note in summary["notes"]:
+    for note in [*summary["notes"], *summary["doubts"]]:
         log.warning("%s: %s", file.name, note)
     points, nodes = summary["points"], summary["nodes"]
     read, every = (count / 1e6 for count in summary["bytes"])
@@ -350,6 +351,17 @@ def _notes(
     if bounds[4] < -600 or bounds[5] > 9500:
         notes.append(f"heights from {bounds[4]:.1f} to {bounds[5]:.1f} m are implausible")
     return notes
+
+
+def _doubts(tally: PointTally, file: Path) -> list[str]:
+    """What changes the worth of what is made of a file's points."""
+    if tally.synthetic <= MARKED_SHARE * tally.read:
+        return []
+    return [
+        f"{tally.synthetic} of {tally.read} points of {file.name} are marked as synthetic: no "
+        "pulse was reflected there; remove them (their class in ingest.drop_classes, or pdal) if "
+        "they are not of the surface"
+    ]
 
 
 def _write_attributes(

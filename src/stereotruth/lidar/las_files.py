@@ -168,6 +168,7 @@ class PointTally:
     sampled: int = 0
     days: GpsDays = field(default_factory=GpsDays)  # of all points, where they tell them
     strips: StripCodes = field(default_factory=StripCodes)
+    synthetic: int = 0  # of all points: made by somebody, not measured
 
     def take(
         self,
@@ -183,9 +184,12 @@ class PointTally:
         if has_days(header):
             self.days.take(points, attributes[0])
         attributes[1] = self.strips.take(points)
+        extended = header.point_format.id >= 6
+        bit = 1 if extended else 32  # of the flags in LAS 1.4, and of the class byte before
+        self.synthetic += int(np.count_nonzero(raw[:, 15] & bit))
         kept = _unpack(
             raw,
-            header.point_format.id >= 6,
+            extended,
             unwanted,
             np.asarray(header.scales, np.float64),
             np.asarray(header.offsets, np.float64),

@@ -42,6 +42,7 @@ from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
+from ..numerics.degrees import continuous, turn
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .projection_polynomials import PatchedTransform
@@ -85,6 +86,7 @@ class ToWGS84:
         """
         metres = np.asarray(z, np.float64) * self.system.height_unit_m
         lon, lat, height = self._transform(x, y, metres)
+        lon = continuous(lon)
         if self._geoid is not None:
             good = np.isfinite(lon) & np.isfinite(lat)
             base = height if self._heights_follow_datum else metres
@@ -124,6 +126,7 @@ class ToWGS84:
         ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
         x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
         lon, lat, _ = self._exact(x, y, np.zeros(x.size))
+        lon = continuous(lon)
         places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
         places[~np.isfinite(places)] = np.nan
         first, last = places.min(axis=1), places.max(axis=1)
@@ -426,9 +429,11 @@ def check_area(
         area = CRS.from_epsg(code).area_of_use
     if area is None:
         return None
-    beyond = max(area.south - lat[0], lat[1] - area.north)
-    if area.west <= area.east:
-        beyond = max(beyond, area.west - lon[0], lon[1] - area.east)
+    wide = (area.east - area.west) % 360.0 or 360.0
+    middle = area.west + wide / 2
+    off = turn(np.array(lon) - middle)
+    across = float(np.abs(off).max()) - wide / 2
+    beyond = max(area.south - lat[0], lat[1] - area.north, across)
     if beyond <= 0.5:
         return None
     where = (

@@ -24,10 +24,14 @@ def turn(degrees: ArrayLike) -> NDArray[np.float64]:
 def continuous(lon: ArrayLike) -> NDArray[np.float64]:
     """Longitudes in [SEAM_DEG, SEAM_DEG + 360), to the bit those that lie there already."""
     lon = np.asarray(lon, np.float64)
-    beyond = (lon < SEAM_DEG) | (lon >= SEAM_DEG + 360.0)
-    if not beyond.any():
-        return lon
-    return np.where(beyond, (lon - SEAM_DEG) % 360.0 + SEAM_DEG, lon)
+    turns = np.floor((np.where(np.isfinite(lon), lon, 0.0) - SEAM_DEG) / 360.0)
+    return lon - 360.0 * turns if turns.any() else lon
+
+
+def for_readers(lon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Longitudes of one outline as other programs have them, up to 180; those of an outline across
+    the line of 180° go on beyond it, so that it stays in one piece."""
+    return lon - 360.0 if lon.min() >= 180.0 else lon
 
 
 def metres_per_degree(lat: ArrayLike) -> NDArray[np.float64]:

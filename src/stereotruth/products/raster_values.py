@@ -32,7 +32,7 @@ from ..errors import InputError, in_number
 
 Floats = NDArray[np.float64]
 
-FILLS = (0, -1, -99, -999, -9999, -99999, 999, 9999, 99999, 255, -32767, -32768, 32767, 65535)
+FILLS = (0, -1, -99, -999, -9999, -99999, -32767, -32768)  # and the ends of an integer type
 OFTEN = 10
 LEAST = 10  # cells of an extreme that is none of FILLS: fewer are blunders
 FAR = 50.0  # m or px
@@ -172,11 +172,17 @@ class _Value:
 
 
 class Fills:
-    """The rim rule, of windows that are added one after the other."""
+    """The rim rule, of windows that are added one after the other.
 
-    def __init__(self, values: Values) -> None:
-        self.values = values
+    ``may_be_constant``: one value everywhere is no fill, as of a grid that somebody has made of 0.
+    """
+
+    def __init__(self, values: Values, *, may_be_constant: bool = False) -> None:
+        self.values, self.may_be_constant = values, may_be_constant
         self.cells = 0
+        dtype = np.dtype(values.dataset.dtypes[0])
+        ends = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype.kind in "iu" else ()
+        self.fills = frozenset(map(float, (*FILLS, *ends)))
         self.found: dict[float, _Value] = {}
         self.rims = np.zeros(RIMS.size + 1, np.int64)  # of all others, in windows that have one
         # (value, cells) of the two lowest and of the two highest; stored values
@@ -199,11 +205,11 @@ class Fills:
             here += [first]
             for value in sorted(end, reverse=pick is np.max)[2:]:
                 del end[value]
-        fills = {float(v) for v in here} | {float(v) for v in FILLS if np.any(known == v)}
+        fills = {float(v) for v in here} | {v for v in self.fills if np.any(known == v)}
         metres = values * self.values.unit
         for value in fills:
             self._count(self.found.setdefault(value, _Value()), value, raw, there, metres)
-        if fills & set(FILLS) or any(self.found[v].cells >= LEAST for v in fills):
+        if fills & self.fills or any(self.found[v].cells >= LEAST for v in fills):
             plain = np.where(np.isin(raw, list(fills)), np.nan, metres)
             for axis in (0, 1):
                 self.rims += _binned(np.abs(np.diff(plain, axis=axis)))
@@ -233,12 +239,14 @@ class Fills:
         """Raise InputError if a value is a fill."""
         for value, found in sorted(self.found.items()):
             if self._is_fill(value, found):
-                self.values.refuse(value, found.cells, "which stand apart from all around")
+                every = found.cells == self.cells
+                why = "and no other value" if every else "which stand apart from all around"
+                self.values.refuse(value, found.cells, why)
 
     def _is_fill(self, value: float, found: _Value) -> bool:
-        if value in FILLS and found.cells == self.cells > 1:
-            return True
-        if not (value in FILLS or self._stands_apart(value, found)):
+        if value in self.fills and found.cells == self.cells > 1:
+            return not self.may_be_constant
+        if not (value in self.fills or self._stands_apart(value, found)):
             return False
         if found.cells < OFTEN * found.others or not found.rims.sum():
             return False

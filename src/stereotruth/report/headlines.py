@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..dataset.label_doubts import ABOUT, ALIGNMENT, LIDAR
 from ..dataset.split_names import NONE, SPLITS
 from ..products.html_tables import Headline, metres, minus, missed, number, spread
 
@@ -152,16 +153,24 @@ def _pairs(rows: Rows, labelled: Rows) -> Headline:
     return Headline("labelled pairs", str(len(labelled)), note)
 
 
+def _is_told(doubt: Mapping[str, Any]) -> bool:
+    """Whether alignment or LiDAR doubt labels by more than these state."""
+    return doubt.get("of") in (ALIGNMENT, LIDAR) and not doubt["explained_by_alignment"]
+
+
 def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
     doubts = quality.get("doubts", {})
-    doubted = [scene for scene, of in doubts.items() if any(d.get("of") != "strips" for d in of)]
+    doubted = [s for s, of in doubts.items() if any(d.get("of") not in ABOUT for d in of)]
+    told = [s for s, of in doubts.items() if any(map(_is_told, of))]
     if doubted:
         note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
+    if told:
+        note = _and(note, f"alignment or LiDAR of {', '.join(told)} in doubt")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
-    return Headline("limits of quality", text, note, bool(bad or scenes or doubted))
+    return Headline("limits of quality", text, note, bool(bad or scenes or doubted or told))
 
 
 def _of_images(

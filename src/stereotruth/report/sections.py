@@ -292,6 +292,7 @@ def refinement(record: Mapping[str, Any]) -> dict[str, Any] | None:
     return {
         "applied": bool(found.get("applied")),
         "reason": found.get("reason", ""),
+        "remark": found.get("remark", ""),
         "table": table(rows),
         "used": found.get("used"),
         "sites": found.get("sites"),

@@ -21,6 +21,17 @@ import numpy as np
 from ..kernels import inlined, kernel
 from .cities import Jitter
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
+from .jitter_waves import (
+    END,
+    MOST_WAVES,
+    PER_ROW,
+    PHASE,
+    PITCH_WAVE,
+    ROLL_WAVE,
+    WAVE,
+    WAVES,
+    swings,
+)
 from .rpc_cameras import direction_by_rpc, pose_by_rpc, project_by_rpc
 
 ALTITUDE_M = 505e3
@@ -38,10 +49,7 @@ ROLL, PITCH, YAW, TIME_REF = 13, 16, 19, 22  # polynomials of (time - TIME_REF),
 FRAME = 23  # origin and axes of the world frame
 SLOPE = 35  # d(look tangent)/d(row) of a ground point, start value of the solver
 ROWS_MID = 36
-WAVES, WAVE = 37, 38  # number of the waves of jitter, and the first one's fields
-ROLL_WAVE, PITCH_WAVE, PER_ROW, PHASE = 0, 1, 2, 3  # amplitudes and frequency in rad, phase
-MOST_WAVES = 8
-SIZE = WAVE + 4 * MOST_WAVES
+SIZE = END  # of jitter_waves
 
 
 @inlined
@@ -74,11 +82,9 @@ def pose(cam, row, out):
     roll = cam[ROLL] + d * (cam[ROLL + 1] + d * cam[ROLL + 2])
     pitch = cam[PITCH] + d * (cam[PITCH + 1] + d * cam[PITCH + 2])
     yaw = cam[YAW] + d * (cam[YAW + 1] + d * cam[YAW + 2])
-    for k in range(int(cam[WAVES])):
-        at = WAVE + 4 * k
-        swing = math.sin(cam[at + PHASE] + cam[at + PER_ROW] * row)
-        roll += cam[at + ROLL_WAVE] * swing
-        pitch += cam[at + PITCH_WAVE] * swing
+    swing_roll, swing_pitch = swings(cam, row)
+    roll += swing_roll
+    pitch += swing_pitch
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)

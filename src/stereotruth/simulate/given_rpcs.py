@@ -21,6 +21,8 @@ from .rpc_cameras import (
     GROUND_X,
     GROUND_Y,
     INVERSE,
+    PER_COL,
+    PER_LINE,
     ROW0,
     ROWS,
     SIZE,
@@ -147,6 +149,7 @@ def rpc_camera(
     slope = (high - low)[:, :2] / (high - low)[:, 2:]
     ground = low[:, :2] - low[:, 2:] * slope
     cam = np.zeros(SIZE)
+    cam[PER_COL] = cam[PER_LINE] = 1.0
     cam[COL0], cam[COLS] = (cols - 1) / 2, max(cols - 1, 1) / 2
     cam[ROW0], cam[ROWS] = (rows - 1) / 2, max(rows - 1, 1) / 2
     powers = np.column_stack(

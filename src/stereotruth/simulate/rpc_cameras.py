@@ -1,20 +1,23 @@
 """Cameras that see as given RPCs do, for the twin of a place that real images show.
 
 Such a camera is what a pushbroom sensor is over one scene: each line has a position, and each pixel
-looks from there through a ground point, both smooth functions of the image coordinates. Its array
-has the fields below, in the place of those of :mod:`.camera`, whose first, the radius of the orbit,
-is 0. :func:`.given_rpcs.rpc_camera` makes it.
+looks from there through a ground point, both smooth functions of the image coordinates but for
+jitter. Its array has the fields below, in the place of those of :mod:`.camera`, whose first, the
+radius of the orbit, is 0. :func:`.given_rpcs.rpc_camera` makes it.
 """
 
 from __future__ import annotations
 
 from ..kernels import inlined
+from .jitter_waves import END, swings
 
-GROUND_X, GROUND_Y = 1, 11  # cubic polynomials of (u, v): where a pixel looks at z = 0
-STATION_X, STATION_Y, STATION_Z = 21, 24, 27  # of the line: quadratic in v; one height
-COL0, COLS, ROWS = 28, 29, 30  # u = (col − COL0) / COLS, v = (row − ROW0) / ROWS
-INVERSE = 31  # (col, row) per metre of ground, row by row
-ROW0, SIZE = 36, 37
+PER_COL, PER_LINE = 12, 35  # what jitter is measured by: 1, so that it is in px
+ROW0 = 36
+GROUND_X, GROUND_Y = END, END + 10  # cubics of (u, v): where a pixel looks at z = 0
+STATION_X, STATION_Y, STATION_Z = END + 20, END + 23, END + 26  # quadratic in v; one height
+COL0, COLS, ROWS = END + 27, END + 28, END + 29  # u = (col − COL0) / COLS, v likewise by ROW0
+INVERSE = END + 30  # (col, row) per metre of ground, row by row
+SIZE = END + 34
 CLOSE_PX = 1e-7
 
 
@@ -28,19 +31,22 @@ def _cubic(cam, at, u, v):
 
 @inlined
 def pose_by_rpc(cam, row, out):
-    """Write the position of a line to out[:3] and its v to out[3]."""
+    """Write the position of a line to out[:3], its v to out[3], and to out[4:6] what jitter adds to
+    u and v there."""
     v = (row - cam[ROW0]) / cam[ROWS]
     out[0] = cam[STATION_X] + v * (cam[STATION_X + 1] + v * cam[STATION_X + 2])
     out[1] = cam[STATION_Y] + v * (cam[STATION_Y + 1] + v * cam[STATION_Y + 2])
     out[2] = cam[STATION_Z]
     out[3] = v
+    swing_col, swing_row = swings(cam, row)
+    out[4], out[5] = swing_col / cam[COLS], swing_row / cam[ROWS]
 
 
 @inlined
 def direction_by_rpc(cam, line, col):
     """Direction (not normalised, z < 0) of the ray of a column, given its line's pose."""
-    u = (col - cam[COL0]) / cam[COLS]
-    x, y = _cubic(cam, GROUND_X, u, line[3]), _cubic(cam, GROUND_Y, u, line[3])
+    u, v = (col - cam[COL0]) / cam[COLS] + line[4], line[3] + line[5]
+    x, y = _cubic(cam, GROUND_X, u, v), _cubic(cam, GROUND_Y, u, v)
     return x - line[0], y - line[1], -line[2]
 
 

@@ -80,7 +80,10 @@ def fit_rpc(
             np.linspace(heights[0] + inset, heights[1] - inset, levels),
         )
         true = np.column_stack([c.ravel(), r.ravel()])
-        return frame.to_geodetic(locate(cam, frame, true, h.ravel())), true
+        ground = frame.to_geodetic(locate(cam, frame, true, h.ravel()))
+        off = ground[:, 0] - frame.lon
+        ground[:, 0] -= 360.0 * np.sign(off) * (np.abs(off) > 180.0)  # across the line of 180
+        return ground, true
 
     ground, true = cloud(11, 6, 0.0)
     middle = (ground.max(axis=0) + ground.min(axis=0)) / 2

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..products.files import write_table
 from .built_city import surfaces_of
-from .camera import Pass, aim, drift_of_attitude
+from .camera import Pass, aim, drift_of_attitude, jittering
 from .control_points import GCP_COUNT, GCP_NOISE_PX, marks, spread_out, visible_in
 from .dated_worlds import world_of
 from .layout import frame_of
@@ -49,6 +49,8 @@ def camera_of(site: SiteSpec, image: ImageSpec) -> Camera:
     size = image.cols, image.rows
     drawn = image.pose_seed, "left"
     rpc = biased_rpc(cam, frame, relief, size, drawn, margin_m=RPC_MARGIN_M)
+    if image.jitter:  # the RPCs know nothing of it
+        cam = jittering(cam, image.jitter, np.random.default_rng([image.pose_seed, 6]))
     own = by_sun_of(world_of(city, surfaces, image.state), image.sun_deg)
     return Camera(
         image.name, cam, *size, rpc, horizon_of(cam, *size, surfaces), own,

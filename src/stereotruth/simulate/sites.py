@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from .camera import ALTITUDE_M
-from .cities import Canopy, CitySpec, SceneSpec, ViewSpec
+from .cities import Canopy, CitySpec, Jitter, SceneSpec, ViewSpec
 from .training_cities import training_city
 
 FIRST_DAY = datetime(2023, 2, 1, tzinfo=UTC)
@@ -36,7 +36,7 @@ class ImageSpec:
     the city's centre. ``sun_deg``: azimuth and elevation. ``state``: which of the city's two
     states (``left``, ``right``; see :class:`.cities.ViewSpec`) the image shows. ``radiometry``:
     dark value and digital numbers per reflectance. ``pose_seed`` draws yaw, drift of the attitude
-    and the bias of the RPCs.
+    and the bias of the RPCs; ``jitter`` of the attitude.
     """
 
     name: str
@@ -52,6 +52,7 @@ class ImageSpec:
     centre_m: tuple[float, float] = (0.0, 0.0)
     state: str = "left"
     radiometry: tuple[float, float] = (60.0, 1420.0)
+    jitter: Jitter | None = None
 
 
 @dataclass(frozen=True)

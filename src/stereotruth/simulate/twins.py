@@ -20,6 +20,7 @@ from .layout import image_axes
 from .twin_points import extent_of
 
 MARGIN_PX = 30  # of the left image around the points
+MOST_PX = 3200  # a side of 2 km: the patches of a twin take some 4 GB while it is built
 SUN_DEG = (148.0, 54.0)
 # Land use is what the ground looks like where the file tells nothing of it; all else is the file's.
 CHARACTER = Character(
@@ -52,6 +53,12 @@ def twin_city(
     low, high = of.low, of.high
     middle = (low + high) / 2
     lon, lat, _ = of.to_geodetic(middle[None])[0]
+    if not (abs(lon) <= 360 and abs(lat) <= 90):
+        raise InputError(
+            f"lies outside of what {of.crs.name} covers",
+            file=file,
+            remedy="give the coordinate system of the points, as --crs EPSG:2154",
+        )
     base = math.floor(of.unit_m * low[2])
     frame = LocalFrame(float(lon), float(lat), float(base))
     ends = np.array([[high[0], middle[1], low[2]], [middle[0], high[1], low[2]]])
@@ -76,6 +83,12 @@ def twin_city(
         twin=Twin(str(file), crs, half, math.atan2(right[1], right[0]), _read_once(rpcs)),
     )
     cols, rows = size_px or _all_of_it(city, scene, right, up)
+    if max(cols, rows) > MOST_PX:
+        raise InputError(
+            f"would be {cols} x {rows} px of {LEFT_GSD_M} m, and {MOST_PX} are the most",
+            file=file,
+            remedy="give a part of it about its middle, as --size 2000 2000, or cut the file",
+        )
     return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
 
 

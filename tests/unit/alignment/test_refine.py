@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stereotruth.alignment.aligned_pair import Alignment, GcpResidual
 from stereotruth.alignment.label_uncertainty import label_sigma
+from stereotruth.alignment.lidar_checks import lines_of_sight, scatter_by_heights
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_figure import draw_refinement
 from stereotruth.alignment.refine_report import write_refinement
@@ -260,6 +261,16 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
     # The labels' disparities are right all the same, as tie points alone would have them.
     raised = refined.left.project(LON, LAT, HEIGHT + metres)
     assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
+
+
+@pytest.mark.parametrize(("metres", "told"), [(0.02, False), (0.15, False), (0.4, True)])
+def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told):
+    """As of images that were cut, with the RPCs of before: no point says where they look."""
+    alignment, rng = start(NONE, NONE, 10.0), np.random.default_rng(1)
+    px_per_m = np.linalg.norm(np.subtract(*lines_of_sight(alignment)))
+    along, across = rng.normal(0, 1, (2, 80)) * [[np.hypot(0.02, px_per_m * metres)], [0.02]]
+    scatter, explained = scatter_by_heights(alignment, along, across)
+    assert (scatter > explained) == told
 
 
 @pytest.mark.slow

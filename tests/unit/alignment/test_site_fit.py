@@ -186,3 +186,32 @@ def test_without_control_points_images_agree_with_each_other():
     made.images = {n: replace(image, points=empty) for n, image in made.images.items()}
     fit = made.fit()
     assert rms(made.errors(fit, "A") - made.errors(fit, "E")) < 0.1
+
+
+def test_an_image_that_jitters_is_corrected_by_line():
+    """It swings along its columns; what its pairs tell makes one correction, and no other's."""
+    made = Made(11)
+    periods = 2.1 * 2 * np.pi / SIDE
+
+    def swing(at: np.ndarray) -> np.ndarray:
+        return 0.3 * np.sin(periods * at[:, 1] + 1.0)
+
+    pairs = []
+    for pair in made.pairs:
+        equations = pair.ties.equations
+        own = 2 if pair.left == "A" else 8
+        if "A" in (pair.left, pair.right):
+            moved = equations.design[:, :, own] * swing(equations.at)[:, None]
+            equations = replace(equations, observed=equations.observed + moved)
+        pairs.append(replace(pair, ties=replace(pair.ties, equations=equations)))
+    fit = fit_site(list(made.images.values()), pairs)
+    rows = np.arange(50.0, SIDE - 50, 10)
+    at = np.column_stack([rows, rows])
+    found = {name: one.at(rows)[0] for name, one in fit.by_line.items()}
+    for name in "BCDE":
+        left = found["A"] - found[name] - swing(at)
+        trend = np.polyval(np.polyfit(rows, left, 1), rows)  # is the affines'
+        assert np.sqrt(np.mean((left - trend) ** 2)) < 0.03
+    # What all images share no pair sees: their mean is nothing, and A has the most.
+    assert max(found, key=lambda name: np.std(found[name])) == "A"
+    assert all(pair.lines_covariance is not None for pair in fit.pairs.values())

@@ -72,7 +72,7 @@ def moved(model, x, y, offset):
     return after - before
 
 
-def test_labels_of_a_strip_are_off_by_what_the_mean_of_all_leaves(model, strips):
+def test_labels_of_a_strip_are_off_by_what_affine_corrections_leave(model, strips):
     """Without slope by the error of disparity, on a slope by that of the place besides."""
     found = with_strips(LabelUncertainty.none(), strips, model)
     rows, cols = (STEP * np.arange(-(-(n - 1) // STEP) + 1.0) for n in model.shape)
@@ -81,6 +81,8 @@ def test_labels_of_a_strip_are_off_by_what_the_mean_of_all_leaves(model, strips)
     edge = np.nanmedian(lon)
     errors = np.where(lon >= edge, moved(model, x, y, OFFSET), 0.0)
     errors -= errors.mean(axis=1, keepdims=True)
+    plane = np.stack([np.ones_like(x), x, y], axis=1)
+    errors[0] -= plane @ np.linalg.lstsq(plane, errors[0], rcond=None)[0]
     pure = np.abs(lon - edge) > 3 * SQUARE_DEG
     assert 0.3 < pure.mean() < 1.0
     for sx, sy in ((0.0, 0.0), (0.4, -0.2)):
@@ -88,7 +90,7 @@ def test_labels_of_a_strip_are_off_by_what_the_mean_of_all_leaves(model, strips)
         sigma = np.sqrt(found.variance(cols, rows, slope)).reshape(-1)
         expected = np.abs(errors[0] - sx * errors[1] - sy * errors[2])
         assert (
-            np.abs(sigma - expected)[pure].max() < 0.1 * expected.max()
+            np.abs(sigma - expected)[pure].max() < 0.15 * expected.max()
         )  # nodes at the line are of both
 
 

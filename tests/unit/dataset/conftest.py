@@ -21,7 +21,7 @@ def fitted_once() -> Iterator[None]:
     fit = SensorModel.corrected_rpc
 
     def fit_once(self: SensorModel) -> tuple[RPC, float]:
-        key = repr([self.rpc.to_dict(), self.affine.tolist()])
+        key = repr(self.to_dict())
         if key not in FITTED:
             FITTED[key] = fit(self)
         return FITTED[key]

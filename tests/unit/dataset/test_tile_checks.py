@@ -126,6 +126,22 @@ def test_a_small_bias_is_a_doubt_that_names_its_amount(tmp_path, monkeypatch, ca
     assert quality["scenes"]["s1"]["quality"] == "min_agreement"
 
 
+def test_what_the_alignment_doubts_stands_at_the_end(made, tmp_path):
+    """In the last lines, the summary and the manifest; and nothing says then that all is well."""
+    rms = {view: {"rms": {"after": None}} for view in ("left", "right")}
+    alignment = tmp_path / "alignment.json"
+    alignment.write_text(json.dumps({**rms, "warnings": ["RPCs may belong to other pixels"]}))
+    scene = made["clean"].scene._replace(alignment=alignment)
+    summary = run([scene], tmp_path / "Town", size=SIZE, quality=LIMITS, strict=False)
+    lines = summary_lines(summary, "out")
+    assert lines[-2] == "Doubt about s1: RPCs may belong to other pixels"
+    assert not any("within the limits" in line for line in lines)
+    assert summary["quality"]["doubts"]["s1"][0]["of"] == "alignment"
+    assert {row["doubt"] for row in labelled(tmp_path / "Town")} == {
+        "RPCs may belong to other pixels"
+    }
+
+
 def test_rows_that_are_off_are_flagged(made):
     wrong = made["rows"]
     rows = labelled(wrong.out)

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereotruth.disparity.change_reasons import REASON_PX, VEHICLE_M, with_reasons
+from stereotruth.disparity.change_reasons import REASON_PX, VEHICLE_M, is_common, with_reasons
 from stereotruth.disparity.image_agreement import Comparison
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
 from stereotruth.disparity.pixel_labels import Labels, OwnPoints
 from stereotruth.disparity.reason import Reason
+from stereotruth.disparity.shifted_agreement import WIDE_SHIFTS_PX
 from stereotruth.disparity.status import Status
 from stereotruth.simulate.changes import REASONS
 
@@ -72,10 +73,15 @@ def reasons(
 
 
 def at(
-    labels: WindowLabels, points: OwnPoints, window: PairWindow, *, rough: bool = False
+    labels: WindowLabels,
+    points: OwnPoints,
+    window: PairWindow,
+    *,
+    rough: bool = False,
+    comparison: Comparison = COMPARISON,
 ) -> np.ndarray:
     is_rough = np.full(labels.status.shape, rough)
-    return with_reasons(labels, is_rough, points, window, COMPARISON, PX_PER_M).change
+    return with_reasons(labels, is_rough, points, window, comparison, PX_PER_M).change
 
 
 @pytest.mark.parametrize(
@@ -98,6 +104,24 @@ def test_the_reason_follows_from_lidar_and_images(patch, surface_class, above_m,
     assert (change[patch] == reason).mean() > 0.95
     change[patch] = Reason.NONE
     assert not change.any()
+
+
+@pytest.mark.parametrize(
+    "now_m, reason", [(10, Reason.BUILT), (0, Reason.DEMOLISHED), (None, Reason.DEMOLISHED)]
+)
+def test_under_two_suns_a_building_that_agrees_nowhere_has_gone(now_m, reason) -> None:
+    comparison = COMPARISON._replace(diachronic=True)
+    change = reasons(LARGE, BUILDING, 6, now_m, comparison=comparison)
+    assert (change[LARGE] == reason).mean() > 0.95
+
+
+def test_a_chance_agreement_is_no_common_one() -> None:
+    shift = np.random.default_rng(0).choice(WIDE_SHIFTS_PX, (80, 80))
+    every = np.ones(shift.shape, bool)
+    assert is_common(shift, every, 16).mean() < 0.01
+    shift[:, 40:] = 5.0
+    found = is_common(shift, every, 16)
+    assert found[:, 50:].all() and found[:, :20].mean() < 0.01
 
 
 def test_a_tree_that_has_grown_has_one_of_the_lidar_in_it() -> None:
@@ -130,12 +154,17 @@ def test_without_classes_roughness_and_height_decide(above_m, rough, reason) -> 
     assert (change[patch] == reason).mean() > 0.9
 
 
-def test_reasons_follow_from_what_is_near() -> None:
+@pytest.mark.parametrize(
+    "surface_class, above_m, now_m, diachronic",
+    [(GROUND, 0, 6, False), (BUILDING, 6, 10, True), (BUILDING, 6, None, True)],
+)
+def test_reasons_follow_from_what_is_near(surface_class, above_m, now_m, diachronic) -> None:
     """A window has the reasons of a larger one, but within REASON_PX and the reach of the
     comparison of its rim."""
-    labels, points = lidar(LARGE, GROUND, 0)
-    window = images(LARGE, 6)
-    whole = at(labels, points, window)
+    comparison = COMPARISON._replace(diachronic=diachronic)
+    labels, points = lidar(LARGE, surface_class, above_m)
+    window = images(LARGE, now_m)
+    whole = at(labels, points, window, comparison=comparison)
     part, margin = np.s_[30:150, 40:180], REASON_PX + 10
     cut = {name: getattr(points, name)[part] for name in OwnPoints.__dataclass_fields__}
     small = replace(
@@ -144,7 +173,7 @@ def test_reasons_follow_from_what_is_near() -> None:
         cols=slice(COLS.start + 40, COLS.start + 180),
     )
     inner = np.s_[margin:-margin, margin:-margin]
-    change = at(labels.within(part), OwnPoints(**cut), small)[inner]
+    change = at(labels.within(part), OwnPoints(**cut), small, comparison=comparison)[inner]
     assert change.any() and np.array_equal(change, whole[part][inner])
 
 

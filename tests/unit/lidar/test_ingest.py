@@ -220,7 +220,7 @@ def test_coarse_and_quantised_coordinates(tmp_path) -> None:
 
 def test_geoid_that_misses_the_points_names_both_files(tmp_path) -> None:
     head = struct.pack(">4d2i", 10.0, 10.0, 0.1, 0.1, 11, 11)
-    (tmp_path / "small.gtx").write_bytes(head + np.zeros(121, ">f4").tobytes())
+    (tmp_path / "small.gtx").write_bytes(head + np.full(121, 30.0, ">f4").tobytes())
     write_las(tmp_path / "a.laz", system=pyproj.CRS("EPSG:32650+3855"))
     refused(tmp_path / "a.laz", "EGM2008 height.*geoid")
     message = refused(tmp_path / "a.laz", "3000 points", geoid=tmp_path / "small.gtx")
@@ -321,7 +321,7 @@ def test_real_files_are_read_right_or_refused_by_name(tmp_path, name, arguments,
 def test_copc_with_hierarchy_page_is_read_whole(tmp_path) -> None:
     file = REAL / "simple_with_page.copc.laz"
     head = struct.pack(">4d2i", -90.0, -180.0, 1.0, 1.0, 181, 360)
-    (tmp_path / "n.gtx").write_bytes(head + np.zeros(181 * 360, ">f4").tobytes())
+    (tmp_path / "n.gtx").write_bytes(head + np.full(181 * 360, 30.0, ">f4").tobytes())
     with laspy.CopcReader.open(str(file)) as reader:
         whole = reader.query()
     result = ingest(file, tmp_path / "a.points", geoid=tmp_path / "n.gtx")

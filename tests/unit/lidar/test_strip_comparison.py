@@ -129,6 +129,9 @@ def test_damaged_strips_are_refused(made, tmp_path):
         with pytest.raises(InputError) as error:
             store.strips_of(store.cell_row.size - 1)
         assert error.value.file == str(file)
+        file.unlink()
+        with pytest.raises(InputError):
+            PointStore(store.path).strips_of(0)
     finally:
         file.write_bytes(data)
 

@@ -123,3 +123,16 @@ def test_a_doubt_stands_with_the_gates():
     (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "limits of quality")
     assert gates.bad
     assert "images and labels disagree in A-1" in gates.note
+
+
+def test_what_alignment_and_lidar_doubt_stands_there_too():
+    told = {"of": "alignment", "text": "RPCs", "explained_by_alignment": False}
+    for explained in (False, True):
+        quality = {
+            "scenes": {"A-1": SCENE},
+            "doubts": {"A-1": [told | {"explained_by_alignment": explained}]},
+        }
+        every = headlines([ROW], {}, {}, [], quality)
+        (gates,) = (c for c in every if c.title == "limits of quality")
+        assert gates.bad != explained
+        assert ("alignment or LiDAR of A-1 in doubt" in gates.note) != explained

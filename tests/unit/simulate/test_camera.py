@@ -12,6 +12,8 @@ from stereotruth.simulate.camera import locate, project, rays
 from stereotruth.simulate.cities import (
     LEFT_GSD_M,
     RIGHT_GSD_M,
+    Jitter,
+    ViewSpec,
 )
 from stereotruth.simulate.render import prepare
 
@@ -44,3 +46,23 @@ def test_camera_round_trip_and_ground_sampling(ascending: bool) -> None:
     # angles at the ground: those at the satellite times (R + h) / R, and the roll
     assert tilts[0] == pytest.approx(5.4, abs=1.3)
     assert tilts[1] == pytest.approx(28.2, abs=0.8)
+
+
+def test_jitter_swings_lines_by_what_is_asked_and_rpcs_know_nothing_of_it() -> None:
+    plain = prepare(ONE_BOX, ONE_BOX.scenes[0])
+    city = replace(ONE_BOX, left=ViewSpec(jitter=Jitter(0.3, (1.0, 3.0))))
+    ready = prepare(city, city.scenes[0])
+    still, swung = plain.left, ready.left
+    assert np.array_equal(swung.rpc.coefficients, still.rpc.coefficients)
+    assert np.array_equal(ready.right.cam, plain.right.cam)
+    row = np.arange(0.0, still.rows)
+    at = np.column_stack([np.full(row.size, 100.0), row])
+    xyz = locate(swung.cam, ready.frame, at, np.full(row.size, 1864.0))
+    assert np.abs(project(swung.cam, xyz) - at).max() < 1e-5
+    moved = at - project(still.cam, xyz)
+    assert np.sqrt(np.mean(moved**2, axis=0)) == pytest.approx(0.3, rel=0.05)
+    beside = at + np.array([200.0, 0.0])
+    xyz = locate(swung.cam, ready.frame, beside, np.full(row.size, 1864.0))
+    assert np.abs(beside - project(still.cam, xyz) - moved).max() < 0.01
+    waves = np.abs(np.fft.rfft(moved[:, 0]))[1:6]
+    assert set(np.argsort(waves)[-2:] + 1) == {1, 3}

@@ -9,7 +9,8 @@ from rasterio.transform import RPCTransformer
 
 from stereotruth.errors import InputError
 from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.camera import locate, project
+from stereotruth.simulate.camera import jittering, locate, project
+from stereotruth.simulate.cities import Jitter
 from stereotruth.simulate.geodesy import LocalFrame
 from stereotruth.simulate.given_rpcs import NAMES, RATIOS, read_rpc, rpc_camera
 from stereotruth.simulate.layout import frame_of
@@ -63,6 +64,20 @@ def test_a_camera_sees_as_its_rpcs_do(texts):
     xyz = locate(cam, frame, image, rng.uniform(*heights, 300))
     np.testing.assert_allclose(project(cam, xyz), image, atol=1e-6)
     np.testing.assert_allclose(by_gdal(rpc, frame.to_geodetic(xyz)), image, atol=5e-3)
+
+
+def test_a_camera_by_rpcs_jitters(texts):
+    """By as many px rms as it is told, along and across; and points are found again."""
+    frame = frame_of(ONE_BOX)
+    heights = frame.height - 20.0, frame.height + 120.0
+    cam = rpc_camera(read_rpc(texts[1]), frame, SIZE, heights)
+    shaken = jittering(cam, Jitter(0.2), np.random.default_rng(3))
+    rows = np.arange(SIZE[1], dtype=float)
+    image = np.column_stack([np.full(len(rows), 200.0), rows])
+    xyz = locate(shaken, frame, image, np.full(len(rows), frame.height))
+    np.testing.assert_allclose(project(shaken, xyz), image, atol=1e-6)
+    moved = project(cam, xyz) - image
+    np.testing.assert_allclose(moved.std(axis=0), 0.2, rtol=0.25)
 
 
 def test_rpcs_are_moved_over_another_place(texts):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import laspy
@@ -13,7 +14,7 @@ from stereotruth.errors import InputError
 from stereotruth.simulate.built_city import surfaces_of
 from stereotruth.simulate.camera import rays
 from stereotruth.simulate.changes import BUILT, DEMOLISHED, changes_at
-from stereotruth.simulate.cities import Dates
+from stereotruth.simulate.cities import Dates, FlightStrip, Jitter, ViewSpec
 from stereotruth.simulate.city_files import read_city, write_city
 from stereotruth.simulate.dated_worlds import YOUNG
 from stereotruth.simulate.lidar import simulate_lidar_tile
@@ -176,6 +177,10 @@ def test_a_file_without_coordinate_system_is_refused(tmp_path):
     assert given.twin.half_m == pytest.approx((place.HALF_M, place.HALF_M), abs=0.5)
     with pytest.raises(InputError, match="is no coordinate system"):
         twin_city("None", file, crs="EPSG:1")
+    with pytest.raises(InputError, match="lies outside of what"):
+        twin_city("None", file, crs="EPSG:4326")
+    with pytest.raises(InputError, match=r"would be 4000 x 300 px.*as --size"):
+        twin_city("None", file, crs="EPSG:32631", size_px=(4000, 300))
     (tmp_path / "no.laz").write_text("no points")
     with pytest.raises(InputError, match="cannot be read as LAS"):
         twin_city("None", tmp_path / "no.laz")
@@ -184,9 +189,20 @@ def test_a_file_without_coordinate_system_is_refused(tmp_path):
 
 
 def test_a_city_comes_back_from_its_file(house, tmp_path):
-    later = replace(house, right=replace(house.right, sun_deg=(190.0, 40.0)))
-    write_city(later, tmp_path / "city.json")
-    assert read_city(tmp_path / "city.json") == later
+    write_city(house, tmp_path / "city.json")
+    assert read_city(tmp_path / "city.json") == house
+    edited = json.loads((tmp_path / "city.json").read_text()) | {
+        "right": {"sun_deg": [190, 40], "jitter": {"rms_px": 0.18}, "saturates": 0.6},
+        "strips": [{"offset_m": [0.2, 0, 0.06]}, {"offset_m": [-0.2, 0.1, -0.06]}],
+        "dates": {"left": 9, "right": 9, "lidar": 0, "felled": 0.2},
+    }
+    (tmp_path / "city.json").write_text(json.dumps(edited))
+    assert read_city(tmp_path / "city.json") == replace(
+        house,
+        right=ViewSpec((190.0, 40.0), jitter=Jitter(0.18), saturates=0.6),
+        strips=(FlightStrip((0.2, 0.0, 0.06)), FlightStrip((-0.2, 0.1, -0.06))),
+        dates=Dates(9.0, 9.0, 0.0, felled=0.2),
+    )
     (tmp_path / "city.json").write_text('{"name": "A"}')
     with pytest.raises(InputError, match="lon: Field required"):
         read_city(tmp_path / "city.json")

@@ -228,7 +228,7 @@ def test_what_cannot_be_judged_is_refused(judge, points, tmp_path):
     for name, given, words in (
         ("bare", {"transform": from_origin(WEST, NORTH, 1, 1)}, "coordinate system"),
         ("turned", {"crs": EPSG, "transform": rasterio.Affine(1, 0.5, WEST, 0.5, -1, NORTH)},
-         "north up"),
+         "north-up"),
         ("levelled", {"crs": "EPSG:32650+5773", "transform": from_origin(WEST, NORTH, 1, 1)},
          "EGM96"),
     ):  # fmt: skip

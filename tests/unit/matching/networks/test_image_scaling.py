@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereotruth.matching.networks import image_scaling
+from stereotruth.matching.polarity import with_polarity
 
 from ....synthetic.small_networks import method
 
@@ -29,3 +30,14 @@ def test_wide_grey_values_are_brought_to_8_bits_alike_in_all_parts() -> None:
     np.testing.assert_allclose(
         image_scaling.scaled(eight, made.model, None)[1], expected, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("polarity", ["any", "positive", "mirrored"])
+@pytest.mark.parametrize("scaling", ["us3d", "dfc2019", "standardise"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_network_of_each_polarity_and_scaling_says_something(polarity, scaling, channels):
+    """PyTorch refuses arrays that run backwards, as one band in blue-first order did."""
+    asked = with_polarity("n", method(channels=channels, scaling=scaling), polarity)
+    left, right = np.random.default_rng(1).integers(1, 255, (2, 64, 96)).astype(np.uint8)
+    found = asked(left, right, (-64, 0), asked.scaling(left, right))
+    assert found.shape == left.shape and np.isfinite(found).all()
