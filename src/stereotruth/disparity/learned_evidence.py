@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
+LESS = 1.25  # by which the difference of log odds is divided beyond what has been learned
 LEARNED = Path(__file__).with_suffix(".tsv")
 
 
@@ -34,9 +35,9 @@ def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
 
 
 def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
-    """The probability [n], nearer to UNKNOWN the more figures lie ``beyond`` what has been learned:
-    the difference of the log odds is divided by one more than these."""
+    """The probability [n], nearer to UNKNOWN where figures lie ``beyond`` what has been learned:
+    the difference of the log odds is divided by LESS."""
     odds, unknown = (
         np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
     )
-    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / (1 + beyond))))
+    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / np.where(beyond > 0, LESS, 1.0))))

@@ -42,6 +42,7 @@ CLASSES, RARE = 16, 0.002  # of brightness; share of the parts at either end tha
 # best of the places that are compared.
 LEAST, LEAST_OF_NOISE = 0.05, 0.7
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers
+LEAST_SHARE = 0.003  # of the brightness: no two images of the same ground differ by less
 VALUES = 1 << 16  # of uint16
 
 
@@ -219,7 +220,7 @@ def _by_brightness(brightness: Floats, _greatest: Floats, rough: Floats) -> Nois
             if chosen.sum() >= LEAST_PARTS:
                 variance = max(np.quantile(rough[chosen], FLATTEST), ROUNDING)
                 levels.append(float(np.median(brightness[chosen])))
-                deviations.append(float(np.sqrt(variance)))
+                deviations.append(max(float(np.sqrt(variance)), LEAST_SHARE * levels[-1]))
     if not levels:
         return NoiseCurve((0.0,), (float(np.sqrt(ROUNDING)),))
     return NoiseCurve(tuple(levels), tuple(deviations))

@@ -170,7 +170,7 @@ def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
         )
     )
     inner = np.s_[20:-20, 20:-20]
-    assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
+    assert (sure[inner] < 0.002).all() and unsure[inner].min() > sure[inner].max()
     same = Comparison(9, NOISE)
     assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0
 
