@@ -12,7 +12,7 @@ rule simulate_city:
         CONDA
     threads: 1
     resources:
-        mem_mb=lambda w: 8000 if files_of_place(w) else 2000,
+        mem_mb=8000,  # of a twin 2 km wide; a drawn city takes a quarter
         runtime=30,
     params:
         script=content_of("../scripts/simulate_city.py"),
