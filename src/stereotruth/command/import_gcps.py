@@ -148,6 +148,8 @@ def to_wgs84(
     if places_only or not known.any():  # what heights count from is of no account
         system = replace(system, vertical_datum=None, ellipsoidal=True)
         geoid = None
+    elif not crs and geoid is None:  # as control points of a project have them
+        system = replace(system, ellipsoidal=True)
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
     keep_frame = bool(_own_frame(system))
     transform = transformation(system, file, ends, geoid=geoid, keep_frame=keep_frame)
@@ -161,7 +163,10 @@ def to_wgs84(
             remedy="correct its coordinates, or give another --crs",
         )
     spans = ((float(v.min()), float(v.max())) for v in (lon, lat))
-    notes = [*transform.notes, check_area(system, *spans, file)]
+    notes = [
+        *(f"{file.name}: {note}" for note in transform.notes),
+        check_area(system, *spans, file),
+    ]
     if transform.is_orthometric:
         notes.append(f"heights brought to the ellipsoid by {geoid.name}")
     height = height if places_only else np.where(known, lifted, np.nan)

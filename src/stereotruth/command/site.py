@@ -177,13 +177,12 @@ def check_links(
     if not pairs:
         return
     of_city = [name for name, image in images.items() if image.city == city]
-    for text in Links.of(of_city, pairs).sentences:
-        found.say(
-            "pairs",
-            Level.DOUBT,
-            f"{city}: {text}",
-            f"stereotruth pairs {city} names what links them",
-        )
+    links = Links.of(of_city, pairs)
+    if links.unused:  # by choice, as of pairs --most
+        found.say("pairs", Level.FACT, f"{city}: {links.of_unused}")
+    if len(links.groups) > 1:
+        remedy = f"stereotruth pairs {city} names what links them"
+        found.say("pairs", Level.DOUBT, f"{city}: {links.of_groups}", remedy)
 
 
 def _refuse_copies(opened: list[OpenedImage], settings: Configuration) -> None:

@@ -53,14 +53,20 @@ class Links:
     @property
     def sentences(self) -> list[str]:
         """What is not linked, in words; nothing where all images are."""
-        said = []
-        if self.unused:
-            word = "image" if len(self.unused) == 1 else "images"
-            said.append(f"{len(self.unused)} {word} in no pair: {', '.join(self.unused)}")
-        if len(self.groups) > 1:
-            named = "; ".join(", ".join(group) for group in self.groups)
-            said.append(
-                f"{len(self.groups)} groups of images without a pair between them, each adjusted "
-                f"by itself: {named}"
-            )
-        return said
+        said = [self.of_unused] if self.unused else []
+        return [*said, self.of_groups] if len(self.groups) > 1 else said
+
+    @property
+    def of_unused(self) -> str:
+        """Which images are in no pair."""
+        word = "image" if len(self.unused) == 1 else "images"
+        return f"{len(self.unused)} {word} in no pair: {', '.join(self.unused)}"
+
+    @property
+    def of_groups(self) -> str:
+        """Which groups no pair links."""
+        named = "; ".join(", ".join(group) for group in self.groups)
+        return (
+            f"{len(self.groups)} groups of images without a pair between them, each adjusted by "
+            f"itself: {named}"
+        )
