@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from snakemake.exceptions import WorkflowError
+from snakemake.logging import logger
 from snakemake.utils import min_version
 
 from stereotruth.errors import InputError, in_words
@@ -14,10 +14,12 @@ min_version("9.10")
 shell.prefix("set -euo pipefail; export OPENBLAS_NUM_THREADS=1; ")
 
 
-class Refused(WorkflowError):
-    """What users are meant to read: Snakemake shows it without the lines that it came from."""
+class Refused(SystemExit):
+    """What users are meant to read, without the lines that it came from: it ends Snakemake."""
 
-    __traceback__ = None  # where Snakemake looks for them
+    def __init__(self, message):
+        logger.error(f"Refused:\n{message}")
+        super().__init__(1)
 
 
 OWN_CONFIG = Path("config/config.yaml")  # of the working directory; see common.smk
@@ -35,11 +37,10 @@ if has_config:
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/sources.smk"
 include: "workflow/rules/inputs.smk"
 include: "workflow/rules/methods.smk"
-include: "workflow/rules/storage.smk"
 include: "workflow/rules/run.smk"
-include: "workflow/rules/due.smk"
 include: "workflow/rules/simulate.smk"
 include: "workflow/rules/ingest.smk"
 include: "workflow/rules/strips.smk"

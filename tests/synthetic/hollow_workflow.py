@@ -1,9 +1,9 @@
 """The workflow with all of its rules and none of its numerics: each job writes what it has read.
 
-Rules, plans, records and the writing of products are the project's own. The scripts are replaced by
+Rules, plans and the writing of products are the project's own. The scripts are replaced by
 :func:`work`, so that all rules run in seconds, and each product says of which inputs and settings
-it was made: whether one is stale can be read from it. A file ``fault.json`` makes jobs of some
-rules fail, each in its way (:data:`WAYS`) and at a moment of its work (:data:`MOMENTS`).
+it was made: whether one is stale can be read from it. A file ``fault.json`` makes a job of a rule
+fail in one of :data:`WAYS`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import time
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,17 @@ import yaml
 
 from stereotruth.errors import InputError
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import atomic_file, atomic_folder
 from stereotruth.products.inputs import checksum
-from stereotruth.products.records import contents_of, plain, read_record
+from stereotruth.products.making import making
 
-from .forked_snakemake import RUN
+from .forked_snakemake import RUN, runner, start_snakemake
 from .project import Project, copy_project, row_of
 
-WAYS = ("kill", "refuse", "disk", "defect", "node")
-MOMENTS = ("start", "begun", "half", "written", "recorded")
-FAULT, STRUCK = Path("fault.json"), Path("fault.struck")
+# A job is killed, refuses, finds the disk full, has a defect; Snakemake is killed with it, or
+# without it, so that it goes on later; its input is edited while it works, for good or for a while.
+WAYS = ("kill", "refuse", "disk", "defect", "node", "orphan", "edit", "revert")
+FAULT, STRUCK, GO_ON = Path("fault.json"), Path("fault.struck"), Path("go.on")
 SUFFIXES = {".json", ".csv", ".png", ".npz", ".tif", ".laz", ".html", ".md", ".pt", ".tiff"}
 SCRIPT = '''"""Stands in for the script {name}."""
 from tests.synthetic.hollow_workflow import work
@@ -47,6 +47,7 @@ TARGETS = (
     *("score_dsm/Own/Own-1/mine", "data/synthetic/Wuhan/Wuhan-1/truth.zarr"),
     "results/train/cities/net/best.pt",
 )
+WITHOUT_JOB = ("all", "predict", "benchmark", "report", "evaluate")
 CONFIG = {
     "seed": 0,
     "strips": {"Own-1": 2},
@@ -80,7 +81,7 @@ def make_hollow(folder: Path) -> Project:
         script.write_text(SCRIPT.format(name=script.stem))
     run = folder / "workflow/rules/run.smk"
     run.write_text(
-        run.read_text().replace("    say(made())\n", "").replace("    list_pages()\n", "")
+        run.read_text().replace("    say(made(log))\n", "").replace("    list_pages()\n", "")
     )
     for name in GIVEN:
         (folder / "in" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -97,99 +98,127 @@ def make_hollow(folder: Path) -> Project:
     return project
 
 
-def set_seed(project: Project, seed: int) -> None:
-    """Change a setting that is a parameter of many rules."""
-    file = project.folder / "my.yaml"
-    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "seed": seed}))
+class Hollow:
+    """The workflow in a folder, with a city of its own and a synthetic one; nothing made yet.
+
+    ``call``: the targets and settings of its runs; all that there is, if none are given.
+    """
+
+    def __init__(self, folder: Path, call: Sequence[str] = (*TARGETS, "--configfile", "my.yaml")):
+        self.project, self.folder = make_hollow(folder), folder
+        self.call = (*call, "--cores", "16", "--scheduler", "greedy")
+        self.version = 0
+
+    def run(self, *more: str) -> tuple[int, set[str]]:
+        """A run's exit status, and the rules that it planned."""
+        status = start_snakemake(runner(), self.folder, [*self.call, *more], "run.log").wait()
+        return status, self.planned()
+
+    def plan(self) -> set[str]:
+        """The rules that a run would have jobs of."""
+        status, rules = self.run("--dry-run")
+        assert status == 0, self.said()[-4000:]
+        return rules
+
+    def make(self) -> set[str]:
+        """A run that ends well; the rules that it had jobs of."""
+        status, rules = self.run()
+        assert status == 0, self.said()[-4000:]
+        return rules
+
+    def said(self) -> str:
+        return (self.folder / "run.log").read_text()
+
+    def planned(self) -> set[str]:
+        tables = self.said().split("Job stats:")
+        found = re.findall(r"^(\w+)\s+\d+$", tables[-1], flags=re.MULTILINE)
+        return {*found} - {"total", *WITHOUT_JOB} if len(tables) > 1 else set()
+
+    def edit(self, file: str) -> None:
+        """Write a file of the user's anew, by a clock that is off."""
+        self.version += 1
+        place = self.folder / file
+        place.write_text(
+            f"{place.read_text().partition('#')[0]}# {self.version}\nV = {self.version}"
+        )
+        os.utime(place, (1e9, 1e9))
+
+    def set_seed(self, seed: int) -> None:
+        """Change a setting that is a parameter of many rules."""
+        file = self.folder / "my.yaml"
+        file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "seed": seed}))
+
+    def fail(self, way: str, *rules: str, file: str = "") -> set[str]:
+        """A run in which a job of each rule fails, or has its input ``file`` edited; which did."""
+        struck = self.folder / STRUCK
+        struck.unlink(missing_ok=True)
+        (self.folder / FAULT).write_text(json.dumps({"rules": rules, "way": way, "file": file}))
+        status, _ = self.run("--keep-going")
+        (self.folder / FAULT).unlink()
+        assert struck.exists() and (status or way == "edit"), (rules, self.said()[-4000:])
+        return {*struck.read_text().split()}
+
+    def stale(self) -> list[str]:
+        """Products that are not of the inputs that are there."""
+        found = []
+        tops = "results tiles dataset dataset_kitti originals benchmark audit submission score_dsm"
+        for top in (*tops.split(), "data"):
+            for file in sorted((self.folder / top).rglob("*")):
+                hidden = any(part.startswith(".") for part in file.relative_to(self.folder).parts)
+                if hidden or not file.is_file() or file.name == "1":
+                    continue
+                for path, was in json.loads(file.read_text())["inputs"].items():
+                    if checksum(self.folder / path) != was:
+                        found.append(f"{file.relative_to(self.folder)} of {path}")
+        return found
 
 
 def work(snakemake: Any) -> None:
     """Write into each product what it is made of; or fail, if that is asked."""
-    fail_at = fault_of(snakemake.rule)
-    with job(snakemake.log[0], snakemake.rule):
-        fail_at("start")
-        with atomic_outputs(snakemake.input, snakemake.output, snakemake.params):
-            fail_at("begun")
-            inputs = {path: checksum(path) for path in contents_of(snakemake.input)}
-            settings = plain(snakemake.params)
-            text = json.dumps({"inputs": inputs, "settings": settings}, sort_keys=True)
-            for path in snakemake.output:
-                if Path(path).suffix in SUFFIXES:
-                    with atomic_file(path) as scratch:
-                        scratch.write_text(text)
-                else:
-                    with atomic_folder(path) as scratch:
-                        (scratch / "content.json").write_text(text)
-                        (scratch / "more").mkdir()
-                        (scratch / "more/1").write_text("1")
-                fail_at("half")
-            fail_at("written")
-        fail_at("recorded")
+    # what is read of the strips of a grid tells nothing of its pixels
+    inputs = [path for path in snakemake.input if Path(path).parent.name != "strips"]
+    with job(snakemake.log[0], snakemake.rule), making(snakemake.input, snakemake.output):
+        sums = {path: checksum(path) for path in inputs}
+        settings = {name: str(value) for name, value in snakemake.params.items()}
+        text = json.dumps({"inputs": sums, "settings": settings}, sort_keys=True)
+        for path in snakemake.output:
+            if Path(path).suffix in SUFFIXES:
+                with atomic_file(path) as scratch:
+                    scratch.write_text(text)
+            else:
+                with atomic_folder(path) as scratch:
+                    (scratch / "content.json").write_text(text)
+                    (scratch / "more").mkdir()
+                    (scratch / "more/1").write_text("1")
+            fail_perhaps(snakemake.rule)
 
 
-def fault_of(rule: str) -> Callable[[str], None]:
-    """Fails the job of a rule at the moment that is asked for, if one is."""
-    try:
-        fault = json.loads(FAULT.read_text()).get(rule, {})
-    except FileNotFoundError:
-        fault = {}
-
-    def fail_at(moment: str) -> None:
-        if fault.get("moment") != moment:
-            return
-        with STRUCK.open("a") as stream:
-            stream.write(f"{rule}\n")
-        if fault["way"] == "refuse":
+def fail_perhaps(rule: str) -> None:
+    """Fail after the first product if the job's rule is asked to."""
+    fault = json.loads(FAULT.read_text()) if FAULT.exists() else {"rules": []}
+    if rule not in fault["rules"]:
+        return
+    with STRUCK.open("a") as stream:
+        stream.write(f"{rule}\n")
+    match fault["way"]:
+        case "refuse":
             raise InputError("asked to refuse", file=FAULT, remedy="none")
-        if fault["way"] == "disk":
+        case "disk":
             raise OSError(errno.ENOSPC, "No space left on device", "product")
-        if fault["way"] == "defect":
+        case "defect":
             raise RuntimeError("asked to fail")
-        if fault["way"] == "node":
+        case "edit" | "revert":
+            file = Path(fault["file"])
+            text = file.read_text()
+            file.write_text("edited meanwhile\n")
+            if fault["way"] == "revert":
+                file.write_text(text)
+        case "orphan":
             os.kill(int(os.environ[RUN]), signal.SIGKILL)  # Snakemake, of which this is a job
-        os.kill(os.getpid(), signal.SIGKILL)
-        time.sleep(60)
-
-    return fail_at
-
-
-def contents(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """All hollow products that are there, and what they say of themselves."""
-    tops = "results tiles dataset dataset_kitti originals benchmark audit submission score_dsm data"
-    for top in tops.split():
-        for file in sorted((folder / top).rglob("*")):
-            hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-            if not hidden and file.is_file() and file.name != "1":
-                product = file.parent if file.name == "content.json" else file
-                yield str(product.relative_to(folder)), json.loads(file.read_text())
-
-
-def stale(folder: Path, seed: int) -> list[str]:
-    """Products that are not of the inputs and settings that are there, or are not whole.
-
-    A product in the middle that was deleted stands for what its record says, if that is of what is
-    there.
-    """
-    found, here = [], Path.cwd()
-    os.chdir(folder)
-
-    @cache
-    def now(path: str) -> str:
-        if Path(path).exists():
-            return checksum(path)
-        record = read_record(path)
-        if record is None or record.settings.get("seed", seed) != seed:
-            return ""
-        if any(now(name) != was for name, was in record.inputs.items()):
-            return ""
-        return record.outputs[path]
-
-    try:
-        for product, content in contents(folder):
-            wrong = [path for path, was in content["inputs"].items() if now(path) != was]
-            found += [f"{product} of {path}" for path in wrong]
-            if seed not in (content["settings"].get("seed", seed),):
-                found.append(f"{product}: seed")
-    finally:
-        os.chdir(here)
-    return found
+            while not GO_ON.exists():
+                time.sleep(0.05)
+        case way:
+            if way == "node":
+                os.kill(int(os.environ[RUN]), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(60)

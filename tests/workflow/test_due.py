@@ -1,57 +1,255 @@
-"""The private parts of Snakemake that due.smk replaces are as it takes them to be."""
+"""What is due after edits, failures and kills, with all rules and without their numerics.
+
+The edits are the rows of the table in docs/explanation/reruns.md.
+"""
 
 from __future__ import annotations
 
-import inspect
-import re
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-import snakemake.cli  # noqa: F401  first: the others import in a circle
-from snakemake.dag import DAG
-from snakemake.exceptions import InputFunctionException
-from snakemake.io import _IOFile
-from snakemake.jobs import Job
-from snakemake.persistence import PersistenceBase
+import yaml
 
-REMEDY = "this Snakemake has others: see workflow/rules/due.smk, or bound the version"
+from ..synthetic.hollow_workflow import GO_ON, Hollow
+from ..synthetic.project import row_of
+
+pytestmark = pytest.mark.slow
+STRIPS = {"rectify": {"rectify_strip"}, "project": {"project_strip", "project_right"}}
+OF_TILES = {"evaluate_images", "report_city", "originals", "dataset", "audit", "match", "score"}
+OF_TILES |= {"submission", "benchmark_tables", "train"}
+OF_TRUTH = {"evaluate_truth", "evaluate_truth_city"}  # only of the synthetic city
+OF_IMAGES = {"predict_scene", "dsm", "score_dsm"}
+PROJECT = {"project", *STRIPS["project"], "export", *OF_TILES}
+RECTIFY = {"rectify", "rectify_strip", *OF_IMAGES, *PROJECT}
+GRID_TRUTH = {"grid_truth", *OF_TRUTH}
+REFINE = {"refine", "draw_refinement"}
+ALIGN = {"align", "draw_residuals", *REFINE}
+METHOD = {"match", "score", "submission", "benchmark_tables", *OF_IMAGES}
+FILES: list[tuple[str, set[str]]] = [
+    ("in/gcps.csv", {*ALIGN, *RECTIFY}),
+    ("in/left.tif", {"surface", *ALIGN, *RECTIFY}),
+    ("in/left.tif.msk", {"surface", *ALIGN, *RECTIFY}),  # a new one
+    ("in/lidar/1.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
+    ("in/lidar/3.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),  # a new one
+    ("geoid.tif", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
+    ("mine.py", METHOD),
+    ("helper.py", METHOD),  # which mine.py imports
+]
+KEYS: list[tuple[str, Any, set[str]]] = [
+    (
+        "ingest.drop_classes",
+        [7],
+        {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY, *GRID_TRUTH},
+    ),
+    ("alignment.model", "shift", {*ALIGN, *RECTIFY, *GRID_TRUTH}),
+    ("alignment.refine", False, {*RECTIFY, *GRID_TRUTH}),
+    ("rectify.panchromatic", 1, {*REFINE, *RECTIFY, *GRID_TRUTH}),
+    ("project.edge_margin_px", 1, {*PROJECT, *OF_TRUTH}),
+    (
+        "tiles.size",
+        512,
+        {"export", *OF_TILES, *OF_TRUTH, "training_city", "training_cities"},
+    ),
+    ("quality.max_gcp_rms_px", 2, {"export", *OF_TILES, *OF_TRUTH}),
+    ("evaluation.building_share", 0.03, {"export", *OF_TILES, *OF_TRUTH}),
+    ("strict", True, {*ALIGN, *RECTIFY, *GRID_TRUTH}),
+    ("dataset.catalogs", ["croissant"], OF_TILES - {"evaluate_images", "report_city", "originals"}),
+    ("report.sliders", 5, {"report_city"}),
+    ("benchmark.bootstrap", 20, {"score", "submission", "benchmark_tables"}),
+    ("predict.block_px", 256, OF_IMAGES),
+    ("strips", 1, set()),
+]
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments"),
-    [
-        (PersistenceBase.params_changed, ["self", "job", "file"]),
-        (PersistenceBase.has_metadata, ["self", "job"]),
-        (PersistenceBase.incomplete, ["self", "job"]),
-        (PersistenceBase.has_outdated_metadata, ["self", "job"]),
-        (PersistenceBase.input_changed, ["self", "job", "file"]),
-        (PersistenceBase.code_changed, ["self", "job", "file"]),
-        (Job.outputs_older_than_script_or_notebook, ["self"]),
-        (Job.cleanup, ["self", "skip_outputs"]),
-        (_IOFile.is_newer, ["self", "time"]),
-        (DAG.check_output_mtime, ["self", "job", "expanded_output"]),
-        (PersistenceBase.started, ["self", "job", "external_jobid"]),
-        (PersistenceBase.save_iocache, ["self"]),
-        (
-            InputFunctionException.__init__,
-            ["self", "msg", "wildcards", "lineno", "snakefile", "rule"],
-        ),
-    ],
-)
-def test_a_function_that_is_replaced_is_there(function, arguments):
-    assert list(inspect.signature(function).parameters) == arguments, REMEDY
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Hollow:
+    hollow = Hollow(tmp_path_factory.mktemp("hollow") / "project")
+    hollow.make()
+    return hollow
 
 
-def test_a_plan_asks_these_questions_and_no_others():
-    """What makes a job due in a plan of this Snakemake; each is answered from our records."""
-    source = inspect.getsource(DAG.update_needrun)
-    asked = set(re.findall(r"workflow\.persistence\.(\w+)", source))
-    assert asked == {
-        "input_checksums",  # only of files that are newer
-        "has_metadata",
-        "has_outdated_metadata",
-        "params_changed",
-        "input_changed",
-        "code_changed",
-        "software_stack_changed",  # of conda and containers: Snakemake's own
-    }, REMEDY
-    assert "f.is_newer" in source, REMEDY
+@pytest.fixture
+def rules_after(made) -> Iterator[Callable[[str, bytes], set[str]]]:
+    """The rules that are planned after a file has other content, which it then loses again."""
+    before: dict[Path, bytes | None] = {}
+
+    def plan(name: str, content: bytes) -> set[str]:
+        file = made.folder / name
+        before.setdefault(file, file.read_bytes() if file.exists() else None)
+        file.write_bytes(content)
+        return made.plan()
+
+    yield plan
+    for file, content in before.items():
+        if content is None:
+            file.unlink()
+        else:
+            file.write_bytes(content)
+
+
+@pytest.mark.parametrize(("file", "rules"), FILES)
+def test_an_edited_file(rules_after, file, rules):
+    assert rules_after(file, b"import helper\n# edited\nEDITED = 1\n") == rules
+
+
+@pytest.mark.parametrize(("key", "value", "rules"), KEYS)
+def test_an_edited_key(made, rules_after, key, value, rules):
+    config = yaml.safe_load((made.folder / "my.yaml").read_text())
+    *above, last = key.split(".")
+    place = config
+    for name in above:
+        place = place.setdefault(name, {})
+    place[last] = value
+    assert rules_after("my.yaml", yaml.safe_dump(config).encode()) == rules
+
+
+def test_an_edited_script(made, rules_after):
+    script = "workflow/scripts/report_city.py"
+    text = (made.folder / script).read_bytes()
+    assert rules_after(script, text + b"# a comment\n") == set()
+    assert rules_after(script, text + b"EDITED = 1\n") == {"report_city"}
+
+
+def test_what_says_nothing_makes_nothing(made):
+    """Times of users' files and scripts, absolute paths, an edit that was taken back."""
+    for file in (*(made.folder / "in").rglob("*"), *(made.folder / "workflow").rglob("*.*")):
+        os.utime(file)
+    sheet, gcps = made.folder / "my_scenes.tsv", made.folder / "in/gcps.csv"
+    sheet.write_text(sheet.read_text().replace("in/gcps", f"{made.folder}/in/gcps"))
+    assert made.plan() == set()
+    state, text = gcps.stat(), gcps.read_text()
+    gcps.write_text("gcps.tsv\n")  # of the same size, at the same time
+    os.utime(gcps, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert "align" in made.plan()
+    gcps.write_text(text)
+    assert made.plan() == set()
+
+
+def test_products_in_the_middle_may_be_absent(made, tmp_path):
+    """Whoever deletes results for their size keeps tiles that follow the configuration."""
+    kept = shutil.move(made.folder / "results/rectify", tmp_path / "rectify")
+    try:
+        assert made.plan() == set()
+        made.edit("geoid.tif")
+        assert {"ingest", "rectify", "project", "export"} <= made.plan()
+    finally:
+        shutil.move(kept, made.folder / "results/rectify")
+        (made.folder / "geoid.tif").write_text("geoid\n")
+
+
+def test_snakemake_says_so_too(made):
+    """By --summary and --list-changes; --touch takes what is there for made."""
+    before = (made.folder / "geoid.tif").read_text()
+    made.edit("geoid.tif")
+    made.run("--list-changes", "params")
+    changed = set(made.said().split())
+    assert "tiles/Own" in changed and "tiles/Wuhan" not in changed
+    made.run("--summary")
+    (row,) = (line for line in made.said().splitlines() if line.startswith("tiles/Own\t"))
+    assert row.endswith("params changed\tupdate pending")
+    (made.folder / "geoid.tif").write_text(before)
+    assert made.plan() == set()
+
+
+def test_a_copy_with_its_times_and_snakemakes_own_folder_is_at_rest(made, tmp_path):
+    """Elsewhere, also of a folder that is read-only, where Snakemake makes no plan."""
+    copy = shutil.copytree(made.folder, tmp_path / "copy", symlinks=True)
+    said = subprocess.run(
+        ["snakemake", *made.call, "--dry-run"], cwd=copy, capture_output=True, text=True
+    )
+    assert said.returncode == 0 and "Nothing to be done" in said.stdout, said
+
+
+EDITS = ("in/gcps.csv", "in/lidar/1.laz", "mine.py")  # they and the seed reach most rules
+FAILS = ("kill", "refuse", "disk", "defect", "node")
+
+
+def test_jobs_that_fail_are_made_again_with_all_that_follows(made):
+    """In each rule once, some at a time; the same command again makes what is due, and no more."""
+    todo = made.run("--forceall", "--dry-run")[1]
+    assert len(todo) > 30
+    rounds = 0
+    while todo:
+        rounds += 1
+        for file in EDITS:
+            made.edit(file)
+        made.set_seed(rounds)
+        due = made.plan()
+        if not due & todo:  # no setting reaches the rest: their scripts do
+            for rule in todo - {"project_right"}:
+                made.edit(f"workflow/scripts/{rule}.py")
+            due = made.plan()
+        failed = made.fail(FAILS[rounds % len(FAILS)], *sorted(due & todo)[rounds % 3 :: 3])
+        assert failed <= made.make()
+        assert made.stale() == []
+        assert made.plan() == set()
+        todo -= failed
+
+
+@pytest.mark.parametrize(("rule", "way"), [("align", "revert"), ("rectify", "edit")])
+def test_an_input_that_is_edited_during_a_run(made, rule, way):
+    """While its job reads it, and taken back before anybody looks; or when that one has ended."""
+    made.edit("in/gcps.csv")
+    made.fail(way, rule, file="in/gcps.csv")
+    assert {"align", "refine"} <= made.make()
+    assert made.stale() == []
+    assert made.plan() == set()
+
+
+def test_a_late_job_of_a_killed_run_is_waited_for(made):
+    """It was stopped, goes on when the next run is at work, and what that one makes stays."""
+    made.edit("in/gcps.csv")
+    made.fail("orphan", "align")
+    made.edit("in/gcps.csv")
+    threading.Timer(5.0, (made.folder / GO_ON).touch).start()
+    begin = time.monotonic()
+    assert "align" in made.make()
+    assert time.monotonic() - begin > 4.0
+    assert made.stale() == []
+    assert made.plan() == set()
+
+
+SCENES = ("Own-1", "Own-2", "Own-3")  # two that share an image, and one of images of its own
+
+
+def test_control_points_make_their_group_again_and_no_other_pair(tmp_path):
+    """Labels of a site's pairs: none of them reads LiDAR again."""
+    labels = [f"results/project/Own/{scene}.zarr" for scene in SCENES]
+    site = Hollow(tmp_path / "project", (*labels, "--configfile", "site.yaml"))
+    for name in ("third.tif", "other_left.tif", "other_right.tif", "other.csv"):
+        (site.folder / "in" / name).write_text(f"{name}\n")
+    first = row_of(Path("in"), scene="Own-1", city="Own")
+    second = first | {"scene": "Own-2", "right_image": "in/third.tif"}
+    images = {f"{view}_image": f"in/other_{view}.tif" for view in ("left", "right")}
+    third = first | images | {"scene": "Own-3", "gcps": "in/other.csv"}
+    site.project.add_scene("site", [first, second, third])
+    site.make()
+
+    def scenes_of(file: str) -> dict[str, list[str]]:
+        site.edit(file)
+        site.make()
+        said = site.said()
+        return {
+            stage: [scene for scene in SCENES if f"{words} scene {scene}" in said]
+            for stage, words in SAID.items()
+        }
+
+    group, alone = ["Own-1", "Own-2"], ["Own-3"]
+    assert scenes_of("in/gcps.csv") == {stage: group for stage in SAID} | {"ingest": []}
+    assert scenes_of("in/other.csv") == {stage: alone for stage in SAID} | {"ingest": []}
+
+
+SAID = {
+    "ingest": "of",
+    "align": "Aligning",
+    "refine": "Refining the alignment of",
+    "rectify": "Making epipolar images of",
+    "project": "Projecting the point cloud of",
+}

@@ -20,6 +20,7 @@ rule adjust:
         mem_mb=2000,
         runtime=30,
     params:
+        sources=upstream("adjust"),
         script=content_of("../scripts/adjust.py"),
         pairs=lambda w: {s: [*ADJUSTED[s], SCENES[s].gcps] for s in adjusted_pairs(w.city)},
         fixed=lambda w: fixed_images(w),
@@ -50,6 +51,7 @@ rule adjusted_alignment:
         mem_mb=1000,
         runtime=10,
     params:
+        sources=upstream("adjusted_alignment"),
         script=content_of("../scripts/adjusted_alignment.py"),
         images=lambda w: ADJUSTED[w.scene],
         code=source_digest("alignment.site_pair"),

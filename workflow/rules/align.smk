@@ -22,6 +22,7 @@ rule align:
         mem_mb=1000,
         runtime=10,
     params:
+        sources=upstream("align"),
         script=content_of("../scripts/align.py"),
         names=lambda wildcards: IMAGE_NAMES[wildcards.scene],
         model=SETTINGS.alignment.model,
@@ -56,6 +57,7 @@ rule draw_residuals:
         mem_mb=1000,
         runtime=10,
     params:
+        sources=upstream("draw_residuals"),
         script=content_of("../scripts/draw_residuals.py"),
         code=source_digest("alignment.align_figure"),
     message:

@@ -16,6 +16,7 @@ rule audit:
         mem_mb=4000,
         runtime=240,
     params:
+        sources=upstream("audit"),
         script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=asdict(SETTINGS.audit),

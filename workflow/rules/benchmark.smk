@@ -18,6 +18,7 @@ rule match:
         mem_mb=6000,
         runtime=480,
     params:
+        sources=upstream("match"),
         script=content_of("../scripts/match.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
@@ -50,6 +51,7 @@ rule score:
         mem_mb=2000,
         runtime=120,
     params:
+        sources=upstream("score"),
         script=content_of("../scripts/score.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
@@ -87,6 +89,7 @@ rule submission:
         mem_mb=1000,
         runtime=30,
     params:
+        sources=upstream("submission"),
         script=content_of("../scripts/submission.py"),
         code=source_digest("matching.benchmark.submission"),
     message:
@@ -140,6 +143,7 @@ rule benchmark_tables:
         mem_mb=2000,
         runtime=30,
     params:
+        sources=upstream("benchmark_tables"),
         script=content_of("../scripts/benchmark_tables.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,

@@ -14,7 +14,6 @@ from stereotruth.project import (
     check_fixed,
     days_of_pair,
     file_of_image,
-    is_made,
     is_synthetic,
     lidar_days,
     lidar_of,

@@ -16,6 +16,7 @@ rule grid_truth:
         mem_mb=3000,
         runtime=60,
     params:
+        sources=upstream("grid_truth"),
         script=content_of("../scripts/grid_truth.py"),
         code=source_digest("evaluation.epipolar_truth", "simulate.city_files"),
     message:
@@ -48,6 +49,7 @@ rule evaluate_truth:
         mem_mb=3000,
         runtime=60,
     params:
+        sources=upstream("evaluate_truth"),
         script=content_of("../scripts/evaluate_truth.py"),
         code=source_digest("evaluation.labels_against_truth"),
     message:
@@ -84,6 +86,7 @@ rule evaluate_truth_city:
         mem_mb=3000,
         runtime=60,
     params:
+        sources=upstream("evaluate_truth_city"),
         script=content_of("../scripts/evaluate_truth_city.py"),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("evaluation.labels_against_truth"),

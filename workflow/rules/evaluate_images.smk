@@ -44,6 +44,7 @@ rule evaluate_images:
         mem_mb=2000,
         runtime=30,
     params:
+        sources=upstream("evaluate_images"),
         script=content_of("../scripts/evaluate_images.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         code=source_digest("evaluation.labels_against_images"),

@@ -41,6 +41,7 @@ rule export:
         mem_mb=4000,
         runtime=60,
     params:
+        sources=upstream("export"),
         script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         acquired=lambda w: [days_of_pair(IMAGE_NAMES[s.scene], IMAGES) for s in scenes_of(w.city)],
@@ -78,6 +79,7 @@ rule originals:
         mem_mb=2000,
         runtime=60,
     params:
+        sources=upstream("originals"),
         script=content_of("../scripts/originals.py"),
         images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
         code=source_digest("dataset.originals"),
@@ -105,6 +107,7 @@ rule dataset:
         mem_mb=1000,
         runtime=60,
     params:
+        sources=upstream("dataset"),
         script=content_of("../scripts/dataset.py"),
         catalogs={
             "catalogs": list(SETTINGS.dataset.catalogs),

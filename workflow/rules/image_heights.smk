@@ -21,6 +21,7 @@ rule image_heights:
         mem_mb=4000,
         runtime=240,
     params:
+        sources=upstream("image_heights"),
         script=content_of("../scripts/image_heights.py"),
         view=lambda w: scene_of_image(w.image)[1],
         code=source_digest("disparity.image_heights"),

@@ -16,6 +16,7 @@ rule ingest:
         runtime=60,
         copies_gb=str(SETTINGS.ingest.copies_gb),
     params:
+        sources=upstream("ingest"),
         script=content_of("../scripts/ingest.py"),
         lidar_crs=lambda w: SCENES[w.scene].lidar_crs,
         lidar_epoch=lambda w: epoch_year(SCENES[w.scene].lidar_epoch),

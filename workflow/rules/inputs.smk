@@ -5,16 +5,11 @@ from functools import cache
 from stereotruth.epipolar.image_files import files_beside
 
 
-def given(path):
-    """A file that users give: it lies here, also where the products go to object storage."""
-    return local(str(path))
-
-
 def with_files_beside(scene, view):
     """An image of a scene, and all that is read with it and with its mask: edits are seen."""
     image, mask = getattr(scene, f"{view}_image"), getattr(scene, f"{view}_mask")
     if is_synthetic(scene):
-        return [str(image)]
+        return [given(image)]
     beside = [file for of in (image, mask) if of for file in files_beside(of)]
     return [given(file) for file in (image, *dict.fromkeys(beside))]
 
@@ -44,8 +39,6 @@ def given_in(column):
 
     def file_of(wildcards):
         path = getattr(SCENES[wildcards.scene], column)
-        if is_made(path):
-            return path
         return given(path) if path else []
 
     return file_of
@@ -127,8 +120,7 @@ def truth_of_city(city, kind):
 
 
 def lidar_file(wildcards):
-    scene, file = SCENES[wildcards.scene], LIDAR[wildcards.scene][wildcards.lidar]
-    return str(file) if is_synthetic(scene) else given(file)
+    return given(LIDAR[wildcards.scene][wildcards.lidar])
 
 
 @cache
@@ -189,12 +181,8 @@ def point_stores_of_city(wildcards):
 def images_of_surface(wildcards):
     """The images that the surface of some points is for, each once."""
     scenes = [SCENES[scene] for scene, first in SURFACES.items() if first == wildcards.scene]
-    files = (
-        str(image) if is_synthetic(scene) else given(image)
-        for scene in scenes
-        for image in (scene.left_image, scene.right_image)
-    )
-    return list(dict.fromkeys(files))
+    images = (image for scene in scenes for image in (scene.left_image, scene.right_image))
+    return [given(image) for image in dict.fromkeys(images)]
 
 
 def beside_images_of_surface(wildcards):
@@ -226,7 +214,7 @@ def scene_of_image(image):
     for scene, names in sorted(IMAGE_NAMES.items()):
         if image in names:
             return SCENES[scene], ("left", "right")[names.index(image)]
-    raise WorkflowError(
+    raise Refused(
         f"{SETTINGS.scenes}: no scene names image {image!r}, so that it has no correction. "
         "Remedy: stereotruth pairs CITY writes rows of pairs"
     )

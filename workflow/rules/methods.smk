@@ -36,7 +36,7 @@ def dataset_folder(name):
             f"benchmark.datasets.{name}.root: {root}: no such folder. "
             "Remedy: name the dataset's folder"
         )
-    return root
+    return given(root)
 
 
 def is_own_dataset(name):
@@ -105,7 +105,7 @@ def method_files(name, dataset):
     """
     try:
         kind = kind_of(name, method_settings(name).entry)
-        return [str(file) for file in kind.files(method_entry(name, dataset))]
+        return [given(file) for file in kind.files(method_entry(name, dataset))]
     except InputError as error:
         raise Refused(f"benchmark.methods.{name}: {error}")
 

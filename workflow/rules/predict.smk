@@ -19,6 +19,7 @@ rule predict_scene:
         runtime=720,
         dask=SETTINGS.dask.scheduler_address or "",
     params:
+        sources=upstream("predict_scene"),
         script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
@@ -48,6 +49,7 @@ rule dsm:
         runtime=240,
         dask=SETTINGS.dask.scheduler_address or "",
     params:
+        sources=upstream("dsm"),
         script=content_of("../scripts/dsm.py"),
         settings=asdict(SETTINGS.predict.dsm),
         code=source_digest("matching.scenes.surface_model"),
@@ -76,6 +78,7 @@ rule score_dsm:
         mem_mb=3000,
         runtime=240,
     params:
+        sources=upstream("score_dsm"),
         script=content_of("../scripts/score_dsm.py"),
         code=source_digest("evaluation.surface_models.page"),
         templates=templates_of("evaluation", "surface_models", "page.html.jinja"),

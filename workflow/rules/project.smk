@@ -24,6 +24,7 @@ rule project:
         runtime=240,
         dask=SETTINGS.dask.scheduler_address or "",
     params:
+        sources=upstream("project"),
         script=content_of("../scripts/project.py"),
         view="left",
         settings=PROJECTION,
@@ -51,6 +52,7 @@ use rule project as project_right with:
     benchmark:
         "logs/project_right/{city}/{scene}.tsv"
     params:
+        sources=upstream("project_right"),
         script=content_of("../scripts/project.py"),
         view="right",
         settings=PROJECTION,
@@ -81,6 +83,7 @@ rule project_strip:
         mem_mb=4000,
         runtime=120,
     params:
+        sources=upstream("project_strip"),
         script=content_of("../scripts/project_strip.py"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",

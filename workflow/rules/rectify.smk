@@ -21,6 +21,7 @@ rule rectify:
         mem_mb=2000,
         runtime=120,
     params:
+        sources=upstream("rectify"),
         script=content_of("../scripts/rectify.py"),
         bands=asdict(SETTINGS.rectify),
         code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
@@ -50,6 +51,7 @@ rule rectify_strip:
         mem_mb=2000,
         runtime=60,
     params:
+        sources=upstream("rectify_strip"),
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=asdict(SETTINGS.rectify),

@@ -26,6 +26,7 @@ rule refine:
         mem_mb=2000,
         runtime=30,
     params:
+        sources=upstream("refine"),
         script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
@@ -60,6 +61,7 @@ rule draw_refinement:
         mem_mb=1000,
         runtime=10,
     params:
+        sources=upstream("draw_refinement"),
         script=content_of("../scripts/draw_refinement.py"),
         code=source_digest("alignment.refine_figure"),
     message:

@@ -32,6 +32,7 @@ rule report_city:
         mem_mb=2000,
         runtime=60,
     params:
+        sources=upstream("report_city"),
         script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
         code=source_digest("report.page"),
@@ -67,6 +68,7 @@ rule report_site:
         mem_mb=2000,
         runtime=30,
     params:
+        sources=upstream("report_site"),
         script=content_of("../scripts/report_site.py"),
         images=lambda w: {
             name: [file_of_image(row), row.acquired, row.sun_azimuth, row.sun_elevation]

@@ -1,20 +1,22 @@
 """One run at a time, and its last lines."""
 
+import shutil
 import sys
 
 from stereotruth.products.locks import FileLock
-from stereotruth.products.records import all_records
-from stereotruth.products.runs import Run, begin_run
 
 LOCKS = []  # held until this process ends
 
+if BUCKET and SETTINGS.strips != 1:
+    raise Refused(
+        "strips: jobs that write parts of one store need a file system that all see, and products "
+        f"go to {BUCKET}. Remedy: take strips out of the configuration"
+    )
 
-def refuse_second_run():
-    """End this run if another one works in this directory.
 
-    Snakemake's own lock stays when it is killed; this one does not (profiles/default turns the
-    other off).
-    """
+onstart:
+    # Snakemake's own lock stays when it is killed; this one does not (profiles/default turns the
+    # other off).
     lock = FileLock(".snakemake/run.lock")
     if not lock.take(Path.cwd(), wait=False):
         raise Refused(
@@ -24,29 +26,11 @@ def refuse_second_run():
     LOCKS.append(lock)
 
 
-if not workflow.is_main_process:  # the Snakemake inside a job of the cluster, maybe a late one
-    try:
-        Run().refuse_older()
-    except InputError as error:
-        raise Refused(str(error))
-elif STORAGE.default_storage_provider:
-    BUCKET = bucket_records()
-
-
-onstart:
-    refuse_second_run()
-    if BUCKET:
-        keep_in_bucket(BUCKET)
-    begin_run()
-
-
-def made():
+def made(logs):
     """What the last lines of a run say: what it has made, its figures, and where to look."""
-    from stereotruth.last_lines import last_lines  # takes a second, and no plan needs it
+    from stereotruth.last_lines import last_lines, products_of  # take a second; no plan needs it
 
-    products = [
-        product_name(path) for job in all_records() if job.run == Run().name for path in job.outputs
-    ]
+    products = products_of(logs)
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
     ]
@@ -73,15 +57,14 @@ def say(text):
 
 
 onsuccess:
-    if BUCKET:
-        BUCKET.keep_states(Run().name)
-    tidy_copies()
-    say(made())
+    if (
+        BUCKET and not workflow.storage_settings.keep_storage_local
+    ):  # what killed jobs have left
+        shutil.rmtree(workflow.storage_settings.local_storage_prefix, ignore_errors=True)
+    say(made(log))
 
 
 onerror:
-    if BUCKET:
-        BUCKET.keep_states(Run().name)
     list_pages()
     from stereotruth.last_lines import complaints
 

@@ -15,6 +15,7 @@ rule simulate_city:
         mem_mb=8000,  # of a twin 2 km wide; a drawn city takes a quarter
         runtime=30,
     params:
+        sources=upstream("simulate_city"),
         script=content_of("../scripts/simulate_city.py"),
         code=source_digest("simulate.built_city", "simulate.city_files"),
     message:
@@ -41,6 +42,7 @@ rule simulate_image:
         mem_mb=3000,
         runtime=30,
     params:
+        sources=upstream("simulate_image"),
         script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.render", "simulate.city_files"),
@@ -69,6 +71,7 @@ rule simulate_lidar:
         mem_mb=3000,
         runtime=30,
     params:
+        sources=upstream("simulate_lidar"),
         script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
@@ -99,6 +102,7 @@ rule simulate_truth:
         mem_mb=3000,
         runtime=30,
     params:
+        sources=upstream("simulate_truth"),
         script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
         code=source_digest("simulate.truth", "simulate.control_points", "simulate.city_files"),

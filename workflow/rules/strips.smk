@@ -17,6 +17,7 @@ rule compare_strips:
         mem_mb=2000,
         runtime=60,
     params:
+        sources=upstream("compare_strips"),
         script=content_of("../scripts/compare_strips.py"),
         taken_out=SETTINGS.ingest.strips == "adjusted",
         code=source_digest("lidar.strip_comparison"),
@@ -45,6 +46,7 @@ rule move_strips:
         mem_mb=2000,
         runtime=60,
     params:
+        sources=upstream("move_strips"),
         script=content_of("../scripts/move_strips.py"),
         code=source_digest("lidar.strip_moves"),
     message:

@@ -19,6 +19,7 @@ rule surface:
         mem_mb=4000,
         runtime=240,
     params:
+        sources=upstream("surface"),
         script=content_of("../scripts/surface.py"),
         code=source_digest("surface.make_surface", "epipolar.shown_ground"),
     message:

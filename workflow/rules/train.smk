@@ -1,7 +1,7 @@
 rule train:
     input:
         dataset=lambda w: dataset_folder(w.dataset),
-        initial=lambda w: training_of(w.method)["initial_weights"] or [],
+        initial=lambda w: [given(f) for f in [training_of(w.method)["initial_weights"]] if f],
     output:
         weights="results/train/{dataset}/{method}/best.pt",
         curves="results/train/{dataset}/{method}/curves.csv",
@@ -26,6 +26,7 @@ rule train:
         mem_mb=12000,
         runtime=2880,
     params:
+        sources=upstream("train"),
         script=content_of("../scripts/train.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         kind=lambda w: method_settings(w.method).kind,

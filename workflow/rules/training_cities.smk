@@ -19,6 +19,7 @@ rule training_city:
         mem_mb=3000,
         runtime=60,
     params:
+        sources=upstream("training_city"),
         script=content_of("../scripts/training_city.py"),
         size=SETTINGS.tiles.size,
         seed=SETTINGS.seed,
@@ -50,6 +51,7 @@ rule training_cities:
         mem_mb=500,
         runtime=30,
     params:
+        sources=upstream("training_cities"),
         script=content_of("../scripts/training_cities.py"),
         code=source_digest("evaluation.exact_tiles"),
     message:

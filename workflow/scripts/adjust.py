@@ -6,14 +6,14 @@ from stereotruth.alignment.site_adjustment import adjust_site
 from stereotruth.alignment.site_pair import ScenePair, write_site
 from stereotruth.job import job
 from stereotruth.lidar.frames import Epoch
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe, file_sha256
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"adjust {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         pairs = [
             ScenePair(scene, left, right, Path(alignment), Path(equations), gcps or None)

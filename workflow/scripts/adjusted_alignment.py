@@ -9,14 +9,14 @@ from stereotruth.alignment.site_pair import (
     write_site,
 )
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     scene, given = snakemake.wildcards.scene, snakemake.input
     with (
         job(snakemake.log[0], f"adjusted alignment {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         site = read_site(given.site)
         pair = ScenePair(

@@ -9,7 +9,7 @@ from stereotruth.alignment.control_points import TooFewPoints, read_gcps
 from stereotruth.errors import InputError
 from stereotruth.job import job
 from stereotruth.lidar.frames import Epoch
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
@@ -18,7 +18,7 @@ if __name__ == "__main__":
     epoch = Epoch(*snakemake.params.epoch)
     with (
         job(snakemake.log[0], f"align {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(

@@ -4,15 +4,15 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.html_page import INDEX
+from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params
     with (
         job(snakemake.log[0], f"audit {name}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         audit(
             StereoDataset.of(name, params.dataset),

@@ -5,15 +5,15 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.html_page import INDEX
+from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with (
         job(snakemake.log[0], f"benchmark {of.dataset}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         compare(
             StereoDataset.of(of.dataset, params.dataset),

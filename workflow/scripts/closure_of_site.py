@@ -4,15 +4,15 @@ from pathlib import Path
 
 from stereotruth.evaluation.closure import PairFiles, closure, write_closure
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.grids import require_complete
+from stereotruth.products.making import making
 from stereotruth.products.provenance import describe, digest, file_sha256
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"closure {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         pairs, inputs = [], {}
         files = zip(given.disparity, given.alignments, given.equations)

@@ -6,13 +6,13 @@ from dataclasses import replace
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import describe, digest
 
 if __name__ == "__main__":
     with (
         job(snakemake.log[0], f"compare_strips {snakemake.wildcards.scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         stores = [PointStore(path) for path in snakemake.input.points]
         found = replace(compare_strips(stores), taken_out=snakemake.params.taken_out)

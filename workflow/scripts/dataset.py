@@ -3,13 +3,13 @@
 from stereotruth.dataset.other_layouts import write_layout
 from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output
     with (
         job(snakemake.log[0], "dataset"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):

@@ -3,13 +3,13 @@
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine_figure import draw_refinement
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     given = snakemake.input
     with (
         job(snakemake.log[0], f"draw refinement {snakemake.wildcards.scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         draw_refinement(
             Alignment.load(given.alignment),

@@ -3,11 +3,11 @@
 from stereotruth.alignment.align_figure import draw_residuals
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     with (
         job(snakemake.log[0], f"draw residuals {snakemake.wildcards.scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         draw_residuals(Alignment.load(snakemake.input.alignment), snakemake.output.figure)

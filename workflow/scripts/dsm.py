@@ -2,14 +2,14 @@
 
 from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.surface_model import write_dsm
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.resources.dask
     with (
         job(snakemake.log[0], f"dsm {scene} {method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
         dask_scheduler(address) as scheduler,
     ):
         write_dsm(

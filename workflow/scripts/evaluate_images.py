@@ -2,14 +2,14 @@
 
 from stereotruth.evaluation.labels_against_images import evaluate_city
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     stores = zip(given.left, given.right, given.disparity)
     with (
         job(snakemake.log[0], f"evaluate {city}") as log,
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         table = evaluate_city(
             city,

@@ -4,13 +4,13 @@ from pathlib import Path
 
 from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"evaluate {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         evaluate_truth(
             city,

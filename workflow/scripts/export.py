@@ -8,15 +8,15 @@ from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.settings import Settings
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import atomic_file
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
     with (
         job(snakemake.log[0], f"export {city['city']}") as log,
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         scenes = map(
             SceneFiles,

@@ -2,7 +2,7 @@
 
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import describe
 from stereotruth.simulate.city_files import city_of
 
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"truth of {scene.name}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         write_grid_truth(
             city,

@@ -3,14 +3,14 @@
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.disparity.image_heights import open_inputs, write_image_heights
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe
 
 if __name__ == "__main__":
     image, view = snakemake.wildcards.image, snakemake.params.view
     with (
         job(snakemake.log[0], f"heights {image}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
         fit = getattr(alignment, f"{view}_fit")

@@ -5,7 +5,7 @@ from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.range_copies import prune
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
@@ -20,7 +20,7 @@ if __name__ == "__main__":
     }
 
     def ingest_file() -> None:
-        with atomic_outputs(snakemake.input, snakemake.output, snakemake.params):
+        with making(snakemake.input, snakemake.output):
             ingest(
                 snakemake.input.lidar,
                 snakemake.output.store,

@@ -5,14 +5,14 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.predictions import predict
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     out = Path(snakemake.output[0])
     with (
         job(snakemake.log[0], f"match {of.dataset} {of.method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         predict(
             StereoDataset.of(of.dataset, params.dataset),

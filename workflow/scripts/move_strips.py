@@ -4,14 +4,14 @@ from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_moves import move_strips
 from stereotruth.lidar.strip_offsets import RECORD, StripOffsets
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     points, strips = snakemake.input.points, snakemake.input.strips
     with (
         job(snakemake.log[0], f"move_strips {snakemake.wildcards.scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         made_of = {"points": digest(PointStore(points).attrs.get("provenance", {}))}
         made_of |= checksums([f"{strips}/{RECORD}"])

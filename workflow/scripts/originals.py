@@ -4,13 +4,13 @@ from pathlib import Path
 
 from stereotruth.dataset.originals import write_originals
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.wildcards.city
     with (
         job(snakemake.log[0], f"originals {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         names = snakemake.params.images
         images = dict(zip(names, zip(given.left, given.right)))

@@ -3,14 +3,14 @@
 from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.settings import Settings
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.resources.dask
     with (
         job(snakemake.log[0], f"predict {scene} {method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
         dask_scheduler(address) as scheduler,
     ):
         predict_scene(

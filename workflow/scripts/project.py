@@ -4,13 +4,13 @@ from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.job import dask_scheduler, job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, snakemake.resources.dask
     with (
         job(snakemake.log[0], f"project {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
         dask_scheduler(address) as scheduler,
     ):
         inputs = SceneInputs.of(

@@ -4,14 +4,14 @@ from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.grids import Strip
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
     with (
         job(snakemake.log[0], f"project {scene} {strip}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         inputs = SceneInputs.of(
             snakemake.input.left,

@@ -6,7 +6,7 @@ from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe
 
 if __name__ == "__main__":
@@ -16,7 +16,7 @@ if __name__ == "__main__":
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with (
         job(snakemake.log[0], f"rectify {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
         bands = Settings(**snakemake.params.bands)

@@ -6,8 +6,8 @@ from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.grids import Strip
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
@@ -15,7 +15,7 @@ if __name__ == "__main__":
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with (
         job(snakemake.log[0], f"rectify {scene} {strip}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
         bands = Settings(**snakemake.params.bands)

@@ -7,14 +7,14 @@ from stereotruth.alignment.tie_equations import write_equations
 from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     with (
         job(snakemake.log[0], f"refine {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         given = snakemake.input
         masks = given.left_mask, given.right_mask

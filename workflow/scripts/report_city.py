@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.html_page import INDEX
+from stereotruth.products.making import making
 from stereotruth.report.city_files import CityFiles
 from stereotruth.report.index_page import write_index
 from stereotruth.report.page import write_report
@@ -18,7 +18,7 @@ if __name__ == "__main__":
 
     with (
         job(snakemake.log[0], f"report {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         scenes = by_scene(given.alignments)
         files = CityFiles(

@@ -6,9 +6,9 @@ from stereotruth.alignment.site_images import GivenImage, open_image
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.roughness import roughness_m
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import read_json
 from stereotruth.products.html_page import INDEX
+from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 from stereotruth.report.site_page import image_of, pairs_of, write_site_page
 
@@ -16,7 +16,7 @@ if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with (
         job(snakemake.log[0], f"site {city}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         images = [
             open_image(GivenImage.of(name, Path(file), *cells))[0]

@@ -6,14 +6,14 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.score_method import ScoringPlan, score
 from stereotruth.matching.benchmark.strata import Products
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     own = (Path("tiles"), Path("results/project"), Path("results/truth"))
     with (
         job(snakemake.log[0], f"score {of.dataset} {of.method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         score(
             StereoDataset.of(of.dataset, params.dataset),

@@ -1,7 +1,7 @@
 """What stands in a synthetic city, for the jobs that look at it."""
 
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.simulate.built_city import write_surfaces
 from stereotruth.simulate.city_files import city_of
 
@@ -9,6 +9,6 @@ if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
     with (
         job(snakemake.log[0], f"simulate {city.name}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         write_surfaces(city, snakemake.output.surfaces)

@@ -1,7 +1,7 @@
 """One LiDAR file of a synthetic scene."""
 
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.simulate.city_files import city_of
 from stereotruth.simulate.lidar import simulate_lidar_tile
 
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     tile = snakemake.wildcards.tile
     with (
         job(snakemake.log[0], f"simulate {tile}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         simulate_lidar_tile(
             city,

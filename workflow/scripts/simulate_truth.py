@@ -1,7 +1,7 @@
 """The exact truth of a synthetic scene: per pixel, and as points."""
 
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.simulate.city_files import city_of
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.truth import simulate_truth
@@ -11,7 +11,7 @@ if __name__ == "__main__":
     scene = city.scene(snakemake.wildcards.scene)
     with (
         job(snakemake.log[0], f"simulate {scene.name} truth"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         simulate_points(
             city,

@@ -2,12 +2,12 @@
 
 from stereotruth.job import job
 from stereotruth.matching.benchmark.submission import pack
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     of = snakemake.wildcards
     with (
         job(snakemake.log[0], f"submission {of.dataset} {of.method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])

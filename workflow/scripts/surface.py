@@ -3,7 +3,7 @@
 from stereotruth.epipolar.shown_ground import GroundOfImages
 from stereotruth.job import job
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
@@ -12,7 +12,7 @@ if __name__ == "__main__":
     scene, images = snakemake.wildcards.scene, sorted(set(snakemake.input.images))
     with (
         job(snakemake.log[0], f"surface {scene}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         ground = GroundOfImages.open(images)
         make_surface(

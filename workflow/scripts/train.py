@@ -5,13 +5,13 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.kinds import need_pytorch
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     with (
         job(snakemake.log[0], f"train {of.dataset} {of.method}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         need_pytorch(of.method, params.kind)
         from stereotruth.matching.networks.training import train

@@ -2,13 +2,13 @@
 
 from stereotruth.evaluation.exact_tiles import make_city
 from stereotruth.job import job
-from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.making import making
 
 if __name__ == "__main__":
     number = snakemake.wildcards.number
     with (
         job(snakemake.log[0], f"training_city {number}"),
-        atomic_outputs(snakemake.input, snakemake.output, snakemake.params),
+        making(snakemake.input, snakemake.output),
     ):
         make_city(
             int(number),

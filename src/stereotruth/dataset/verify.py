@@ -10,9 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..products.files import read_json
 from ..products.folders import is_foreign
-from ..products.inputs import checksum
 from ..products.provenance import file_sha256, own_digest
-from ..products.records import DamagedRecord, read_record
 from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest
 
@@ -29,10 +27,9 @@ LOOSE = (
 def defects(folder: str | Path) -> list[str]:
     """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
 
-    ``export.json`` keeps its own digest, and those of the manifest and the footprints. What else no
-    manifest lists is held to the record of the job that made the folder, where there is one. Works
-    on ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`)
-    are no defects. Raises InputError if there is no manifest.
+    ``export.json`` keeps its own digest, and those of the manifest and the footprints. Works on
+    ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`) are no
+    defects. Raises InputError if there is no manifest.
     """
     folder = Path(folder)
     found = []
@@ -68,18 +65,7 @@ def defects(folder: str | Path) -> list[str]:
                 found.append(f"{name}: missing")
             elif file_sha256(folder / name) != said.get(key):
                 found.append(f"{name}: changed")
-    if not found and _record_of(folder) not in (None, checksum(folder)):
-        found.append("a file that the manifest does not list: not what was made")
     return found
-
-
-def _record_of(folder: Path) -> str | None:
-    """The checksum of a folder that the workflow has made here, if its record can be read."""
-    try:
-        record = read_record(folder)
-    except DamagedRecord:
-        return None
-    return record.outputs.get(str(folder)) if record else None
 
 
 def _is_loose(name: str) -> bool:

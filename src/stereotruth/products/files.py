@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
-from .atomic_outputs import atomically
-from .locks import exclusive
 from .provenance import own_digest
 
 Made = TypeVar("Made")
@@ -29,13 +27,11 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
-    with exclusive(path):
-        try:
-            yield scratch
-            with atomically(path):
-                scratch.replace(path)
-        finally:
-            scratch.unlink(missing_ok=True)
+    try:
+        yield scratch
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -47,19 +43,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch, old = path.with_name(f"{path.name}.partial"), path.with_name(f".{path.name}.old")
-    with exclusive(path):
+    for rest in (scratch, old):
+        shutil.rmtree(rest, ignore_errors=True)  # of a writer that was killed
+    scratch.mkdir()
+    try:
+        yield scratch
+        if path.exists():
+            path.rename(old)
+        scratch.rename(path)
+    finally:
         for rest in (scratch, old):
-            shutil.rmtree(rest, ignore_errors=True)  # of a writer that was killed
-        scratch.mkdir()
-        try:
-            yield scratch
-            with atomically(path):
-                if path.exists():
-                    path.rename(old)
-                scratch.rename(path)
-        finally:
-            for rest in (scratch, old):
-                shutil.rmtree(rest, ignore_errors=True)
+            shutil.rmtree(rest, ignore_errors=True)
 
 
 def link(source: Path, target: Path) -> None:

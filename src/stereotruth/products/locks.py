@@ -1,6 +1,6 @@
 """One writer at a time: locks that die with the process that holds them.
 
-Jobs of a killed run may go on for a while, and the next run would write what they write. Locks are
+Jobs of a killed run may go on for a while, and the next run would make what they make. Locks are
 `flock` on files: the kernel drops them when a process ends, however it ends. On file systems
 without locks work goes on with a warning.
 """

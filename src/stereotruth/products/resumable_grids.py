@@ -31,12 +31,12 @@ from typing import Any
 import zarr
 from numpy.typing import NDArray
 
-from .atomic_outputs import marks_of_inputs
 from .files import atomic_file, link
 from .finished_pieces import Ledger
 from .grids import Layer, atomic_store, create_grid
 from .inputs import Marks, refuse_replaced
 from .locks import FileLock
+from .making import marks_of_inputs
 from .provenance import digest
 
 log = logging.getLogger("stereotruth")

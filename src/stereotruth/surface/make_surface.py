@@ -28,11 +28,11 @@ from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from ..lidar.overlap_check import refuse_apart
 from ..lidar.point_store import PointStore
-from ..products.atomic_outputs import marks_of_inputs
 from ..products.files import atomic_file, atomic_folder, link, sealed
 from ..products.finished_pieces import Ledger
 from ..products.inputs import refuse_replaced
 from ..products.locks import FileLock
+from ..products.making import marks_of_inputs
 from ..products.provenance import describe, digest
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround
