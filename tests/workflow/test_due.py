@@ -247,7 +247,7 @@ def test_control_points_make_their_group_again_and_no_other_pair(tmp_path):
 
 
 SAID = {
-    "ingest": "of",
+    "ingest": "Reading LiDAR file 1 of",
     "align": "Aligning",
     "refine": "Refining the alignment of",
     "rectify": "Making epipolar images of",

@@ -26,7 +26,6 @@ from stereotruth.project import (
 from stereotruth.settings import epoch_year
 from stereotruth.simulate import city_files
 
-RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
 
@@ -92,4 +91,4 @@ def templates_of(*parts):
 
 def content_of(script):
     """Digest of a rule's script: the time of its file counts for nothing (profiles/default)."""
-    return script_digest(RULES / script)
+    return script_digest(workflow.source_path(script))
