@@ -1,8 +1,6 @@
 """Good files of a finished run, and its sheets, to be damaged; and how each is read.
 
-A mutant takes the place of its file in a copy of the project, and is read without a plan, as a
-program reads it that knows nothing of records: what a plan sees besides is tried by
-tests/workflow/test_reruns.py.
+A mutant takes the place of its file in a copy of the project, and is read without a plan.
 """
 
 from __future__ import annotations
@@ -29,7 +27,6 @@ from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.files import link, read_perhaps_edited
 from stereotruth.products.grids import open_grid
 from stereotruth.products.rasters import read_image
-from stereotruth.products.records import DamagedRecord, read_record
 from stereotruth.project import lidar_of, read_scenes
 
 from .damaged_cases import Case
@@ -43,7 +40,6 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "manifest": ("tiles", ("tiles/*/manifest.csv", "tiles/*/export.json")),
     "alignments": ("alignment", ("results/align/*/*/alignment.json",)),
     "epipolar models": ("model", ("results/rectify/*/*/epipolar.json",)),
-    "records": ("record", tuple(f"results/.records/made/{p}.json" for p in ("tiles/*", *GRIDS))),
     "zarr.json": ("grid", tuple(f"{place}/zarr.json" for place in GRIDS)),
     "point stores": (
         "points",
@@ -127,14 +123,6 @@ def _model(place: Path) -> Any:
     return repr(EpipolarModel.load(place).to_dict())
 
 
-def _record(place: Path) -> Any:
-    product = str(place.relative_to("results/.records/made")).removesuffix(".json")
-    try:
-        return repr(read_record(product))
-    except DamagedRecord as error:
-        raise InputError("damaged record", file=str(error), remedy="run again") from None
-
-
 def _grid(place: Path) -> Any:
     grid = open_grid(place.parent)
     layers = {name: [_digest(layer.values), layer.attrs] for name, layer in grid.items()}
@@ -161,7 +149,6 @@ READERS = {
     "tiles": _tiles,
     "alignment": _alignment,
     "model": _model,
-    "record": _record,
     "grid": _grid,
     "points": _points,
     "lines": _lines,

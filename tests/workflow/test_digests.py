@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 
 import pytest
 import yaml
@@ -79,7 +80,7 @@ REACH = {
 # there are, and a scene more is no other scene.
 ANYWHERE = {"errors", "job", "kernel_cache", "kernels", "numerics", "settings"}
 # Who reports and records does not change what is computed.
-NOT_COVERED = {"job", "products.provenance", "products.atomic_outputs", "report.index_page"}
+NOT_COVERED = {"job", "products.provenance", "products.making", "report.index_page"}
 
 
 def covered(rule) -> set[str]:
@@ -147,15 +148,18 @@ def test_every_script_has_its_rule_and_log(script):
     assert ast.unparse(work.items[0].context_expr).startswith("job(snakemake.log[0], ")
     assert not any(isinstance(node, ast.Expr) for node in main.body)
     if makes_something(rule):
-        held_by = "atomic_outputs(snakemake.input, snakemake.output, snakemake.params)"
+        held_by = "making(snakemake.input, snakemake.output)"
         held = [n for n in ast.walk(main) if isinstance(n, ast.With)]
         assert held_by in {ast.unparse(i.context_expr) for node in held for i in node.items}
 
 
 @pytest.mark.parametrize("name", [n for n, rule in WITH_SCRIPT.items() if makes_something(rule)])
-def test_every_script_counts_by_its_content(name):
-    """Snakemake would compare the time of its file: profiles/default has it leave that."""
+def test_every_rule_has_digests_of_its_script_and_sources(name):
+    """By which Snakemake finds out what is due; it compares no times of scripts."""
     rule = WITH_SCRIPT[name]
     assert f'script=content_of("../scripts/{rule.script}.py"),' in rule.directives["params"]
+    assert f'sources=upstream("{name}"),' in rule.directives["params"]
+    inputs = rule.directives.get("input", "").splitlines()  # all of them by name
+    assert all(re.match(r" {8}(\w+=| {4}|[\])}])", line) for line in inputs if line.strip())
     profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())
     assert profile["rerun-triggers"] == ["params", "software-env"]

@@ -144,6 +144,19 @@ def test_products_in_the_middle_may_be_absent(made, tmp_path):
         (made.folder / "geoid.tif").write_text("geoid\n")
 
 
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="no such file here")
+def test_an_input_that_cannot_be_read_ends_the_plan_with_one_sentence(made):
+    file = made.folder / "in/gcps.csv"
+    kept = file.rename(made.folder / "kept")
+    try:
+        file.symlink_to("/proc/self/mem")  # can be opened, and not be read
+        assert made.run("--dry-run")[0] != 0
+        said = made.said().rstrip().splitlines()
+        assert said[-2] == "Refused:" and said[-1].startswith("in/gcps.csv: cannot be read: ")
+    finally:
+        kept.rename(file)
+
+
 def test_snakemake_says_so_too(made):
     """By --summary and --list-changes; --touch takes what is there for made."""
     before = (made.folder / "geoid.tif").read_text()

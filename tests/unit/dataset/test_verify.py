@@ -13,8 +13,6 @@ from stereotruth.dataset.published_layout import assemble_dataset
 from stereotruth.dataset.scene_stores import SceneFiles
 from stereotruth.dataset.verify import defects, foreign_files, verify
 from stereotruth.errors import InputError
-from stereotruth.products.inputs import checksum
-from stereotruth.products.records import Record, write_record
 
 from ...synthetic.tiled_scene import run
 
@@ -91,16 +89,3 @@ def test_export_json_keeps_its_own_digest(
         file.read_bytes().replace(b'"size_px": ', b'"size_px": 1') if change is None else change
     )
     assert defects(folder)[0] == "export.json: changed"
-
-
-def test_what_no_manifest_lists_is_held_to_the_record(
-    exported: tuple[Path, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As in ``dataset``: the catalogs and the text for readers."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(exported[0], "tiles/Town")
-    (readme := Path("tiles/Town/README.txt")).write_text("whole")
-    write_record(Record("run", {}, {}, {"tiles/Town": checksum("tiles/Town")}))
-    assert defects("tiles/Town") == []
-    readme.write_text("Whole")
-    assert defects("tiles/Town") == ["a file that the manifest does not list: not what was made"]

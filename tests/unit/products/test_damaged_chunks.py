@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.damaged_chunks import damage_behind, damaged_chunk
 from stereotruth.products.grids import Layer, atomic_store, create_grid, require_complete
+from stereotruth.products.making import making
 
 LAYERS = {"image": Layer("uint16", 0, {"units": "DN", "long_name": "image"})}
 
@@ -49,7 +49,7 @@ def test_a_job_that_reads_it_says_so(damaged, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with (
         pytest.raises(InputError, match=r"left\.zarr/image/c/1/0: damaged"),
-        atomic_outputs([str(damaged)], ["out.txt"], {}),
+        making([str(damaged)], ["out.txt"]),
     ):
         require_complete(damaged)["image"][:]
 

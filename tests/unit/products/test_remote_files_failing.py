@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.bucket_records import BucketRecords
 from stereotruth.products.remote_files import _file_system, answering, stand_in
 
 pytest.importorskip("s3fs")
@@ -24,14 +23,14 @@ def bucket_fails(tmp_path, monkeypatch, match, **environment):
     s3fs.S3FileSystem.clear_instance_cache()
     _file_system.cache_clear()
     with pytest.raises(InputError, match=match):
-        BucketRecords("s3://bucket/x", tmp_path / "copies").pull()
+        stand_in("s3://bucket/x.tif")
 
 
 KEYS = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
 
 
 def test_without_credentials(tmp_path, monkeypatch):
-    fails = r"s3://bucket/x: no credentials for it\. Remedy: export AWS_ACCESS_KEY_ID"
+    fails = r"s3://bucket/x.tif: no credentials for it\. Remedy: export AWS_ACCESS_KEY_ID"
     bucket_fails(tmp_path, monkeypatch, fails)
 
 

@@ -70,11 +70,9 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.inputs",
         "products.locks",
         "products.provenance",
-        "products.atomic_outputs",
+        "products.making",
         "products.ranges",
-        "products.records",
         "products.remote_files",
         "products.web_requests",
-        "products.runs",
         "settings",
     }
