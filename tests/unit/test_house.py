@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -262,3 +263,85 @@ def test_tests_mirror_the_house():
 
 
 NOT_OF_A_FILE = {"bench", "doors", "house", "simulate.simulated_scene"}
+
+
+# Private parts of dependencies that are used until what stands there is replaced.
+USES_PRIVATE_PARTS = {"kernel_cache.py", "kernels.py"}
+PUBLIC_ALL_THE_SAME = {"_replace", "_asdict", "_fields", "_make"}  # of named tuples
+
+
+@cache
+def names_of_our_own() -> set[str]:
+    """What functions, arguments, variables and attributes are called in the packages."""
+    found = set(PUBLIC_ALL_THE_SAME)
+    for file in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            match node:
+                case ast.FunctionDef(name=name) | ast.arg(arg=name) | ast.Name(id=name):
+                    found.add(name)
+                case ast.Attribute(value=ast.Name(id="self"), attr=name, ctx=ast.Store()):
+                    found.add(name)
+    return found
+
+
+def private_parts(text: str) -> set[str]:
+    """Private names of dependencies in a module, and their attributes that it assigns to."""
+    own = re.compile(rf"(stereo\w+|{'|'.join(sys.stdlib_module_names)})(\.|$)")
+    foreign, found = set(), set()
+    nodes = list(ast.walk(ast.parse(text)))
+    for node in nodes:
+        match node:
+            case ast.Import(names=names):
+                others = [name for name in names if not own.match(name.name)]
+            case ast.ImportFrom(module=module, names=names, level=0) if not own.match(module):
+                others = [*names, ast.alias(module)]
+            case _:
+                continue
+        foreign |= {(name.asname or name.name).partition(".")[0] for name in others}
+        found |= {n.name for n in others if re.search(r"(^|\.)_[A-Za-z]", n.name)}
+    for node in nodes:
+        match node:
+            case ast.Attribute(value=of, attr=name, ctx=ctx):
+                root = ast.unparse(of).partition(".")[0]
+                if re.match(r"_(?!_)", name) and root not in {"self", *sys.stdlib_module_names}:
+                    found |= {ast.unparse(node)} if name not in names_of_our_own() else set()
+                if root in foreign and isinstance(ctx, ast.Store):
+                    found.add(f"{ast.unparse(node)} = …")
+            case ast.Call(func=ast.Name(id="setattr"), args=[of, *_]):
+                if ast.unparse(of).partition(".")[0] in foreign:
+                    found.add(ast.unparse(node))
+    return found
+
+
+@pytest.mark.parametrize(
+    "file",
+    [*sorted((ROOT / "src").rglob("*.py")), *sorted((ROOT / "workflow/scripts").glob("*.py"))],
+    ids=lambda file: str(file.relative_to(ROOT)),
+)
+def test_no_private_part_of_a_dependency_is_used(file):
+    if file.name in USES_PRIVATE_PARTS:
+        assert private_parts(file.read_text(encoding="utf-8")), "take it out of the list"
+    else:
+        assert private_parts(file.read_text(encoding="utf-8")) == set()
+
+
+def test_no_private_part_of_snakemake_is_used():
+    for file in (ROOT / "Snakefile", *(ROOT / "workflow/rules").glob("*.smk")):
+        text = file.read_text(encoding="utf-8")
+        private = re.findall(r"\w\._[a-z]\w*|import .*\b_[a-z]\w*|setattr\(", text)
+        assert private + re.findall(r"^(?:workflow|[A-Z]\w+)\.[\w.]+ = .*", text, re.M) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from snakemake.io import _IOFile",
+        "import numba._helpers",
+        "import numba\nnumba.core._lock",
+        "from snakemake.jobs import Job\nJob.cleanup = None",
+        "from snakemake.jobs import Job\nsetattr(Job, name, None)",
+        "def f(storage):\n    return storage._strip(1)",
+    ],
+)
+def test_private_parts_are_found(text):
+    assert private_parts(text)

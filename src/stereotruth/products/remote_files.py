@@ -108,9 +108,8 @@ def _file_system(scheme: str) -> Any:
 
 def bucket(url: str) -> tuple[Any, str]:
     """The file system (fsspec) that holds a URL, and its name there."""
-    scheme = urlsplit(url).scheme
-    storage = _file_system(scheme)
-    return storage, storage._strip_protocol(url)
+    scheme, _, name = url.partition("://")
+    return _file_system(scheme), name.rstrip("/")
 
 
 def _state(info: dict[str, Any], url: str, hosts: frozenset[str] = frozenset()) -> str:
