@@ -22,7 +22,6 @@ from stereotruth.configuration import Configuration
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
-from stereotruth.last_lines import last_lines
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.files import link, read_perhaps_edited
 from stereotruth.products.grids import open_grid
@@ -45,7 +44,6 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "points",
         tuple(f"results/ingest/*/*/*_0_0.points/{n}" for n in ("store.json", "*.npy")),
     ),
-    "last lines": ("lines", ("results/export/*/summary.json",)),
 }
 TEXT = {".tsv", ".csv", ".json"}
 TILES_TRIED = 2  # of each kind of file
@@ -137,13 +135,6 @@ def _points(place: Path) -> Any:
     return [repr(store.attrs), _digest(*values)]
 
 
-def _lines(place: Path) -> Any:
-    said = last_lines([f"tiles/{place.parts[2]}"])
-    if any("cannot be read" in line for line in said):
-        raise InputError(said[0], file=place, remedy="run again")
-    return said
-
-
 READERS = {
     "sheets": _sheets,
     "tiles": _tiles,
@@ -151,7 +142,6 @@ READERS = {
     "model": _model,
     "grid": _grid,
     "points": _points,
-    "lines": _lines,
 }
 
 

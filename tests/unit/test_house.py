@@ -303,8 +303,10 @@ def private_parts(text: str) -> set[str]:
         match node:
             case ast.Attribute(value=of, attr=name, ctx=ctx):
                 root = ast.unparse(of).partition(".")[0]
-                if re.match(r"_(?!_)", name) and root not in {"self", *sys.stdlib_module_names}:
-                    found |= {ast.unparse(node)} if name not in names_of_our_own() else set()
+                is_ours = root not in foreign and name in names_of_our_own()
+                is_private = re.match(r"_(?!_)", name) and root not in sys.stdlib_module_names
+                if is_private and not is_ours and root != "self":
+                    found.add(ast.unparse(node))
                 if root in foreign and isinstance(ctx, ast.Store):
                     found.add(f"{ast.unparse(node)} = …")
             case ast.Call(func=ast.Name(id="setattr"), args=[of, *_]):

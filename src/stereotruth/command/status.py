@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,10 @@ from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
 LONGEST = 300  # characters of a reason
+# How Snakemake says that params differ, and what stands in these; ``code``, ``script`` and
+# ``sources`` are digests (workflow/rules/sources.smk).
+PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
+DIGEST = re.compile(r"'[0-9a-f]{12,16}'")
 
 
 @dataclass(frozen=True)
@@ -123,9 +128,35 @@ class CityStatus:
 
 
 def _short(reason: str) -> str:
+    """Which params differ, where Snakemake says that some do: it gives all of their values."""
     text = " ".join(reason.split())
-    text = text.removeprefix("Params have changed since last execution: ")
+    if params := PARAMS.match(text):
+        with contextlib.suppress(ValueError, SyntaxError):  # values that cannot be read back
+            text = _changes(*(dict(_flat(ast.literal_eval(f"[{p}]"))) for p in params.groups()))
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
+
+
+def _flat(params: Iterable[object]) -> Iterator[tuple[str, str]]:
+    """Values by their names in dictionaries, at any depth; digests and others by what they are."""
+    for value in params:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                if isinstance(inner, dict):
+                    yield from _flat([inner])
+                else:
+                    yield str(name), repr(inner)
+        elif DIGEST.fullmatch(repr(value)):
+            yield "code", repr(value)
+        else:
+            yield "", repr(value)
+
+
+def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
+    said = []
+    for name in sorted(name for name in {**old, **new} if old.get(name) != new.get(name)):
+        values = f"{old.get(name, 'nothing')} -> {new.get(name, 'nothing')}"
+        said.append(name if DIGEST.search(values) else f"{name} {values}".strip())
+    return f"changed: {', '.join(said)}"
 
 
 def _made(city: str) -> str:
