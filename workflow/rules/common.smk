@@ -24,7 +24,7 @@ from stereotruth.project import (
     surfaces_of,
 )
 from stereotruth.settings import epoch_year
-from stereotruth.simulate import city_files
+from stereotruth.simulate import cities
 
 CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")

@@ -18,7 +18,7 @@ rule grid_truth:
     params:
         sources=upstream("grid_truth"),
         script=content_of("../scripts/grid_truth.py"),
-        code=source_digest("evaluation.epipolar_truth", "simulate.city_files"),
+        code=source_digest("evaluation.epipolar_truth", "simulate.cities"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
     script:
