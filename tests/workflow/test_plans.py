@@ -170,7 +170,7 @@ def test_an_edit_behind_a_module_is_seen_and_a_missing_one_refused(project):
     (project.folder / "pack.yaml").write_text(PACK)
     made = "results/match/mine/ours"
     (project.folder / made).mkdir(parents=True)
-    touched = project.snakemake("--touch", made, "--configfile", "pack.yaml")
+    touched = project.snakemake("--touch", "--force", made, "--configfile", "pack.yaml")
     assert touched.status == 0, touched.text
     assert project.plan(made, "--configfile", "pack.yaml") == {}
     later = time.time() + 5
