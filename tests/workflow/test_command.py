@@ -38,7 +38,7 @@ def own(made, tmp_path_factory) -> Path:
     """A project of the command: a city's files, and copies of what was made of them elsewhere."""
     folder = tmp_path_factory.mktemp("empty") / "own"
     assert call("init", "own", folder=folder.parent).status == 0
-    for name in ("in", "results", "tiles"):
+    for name in ("in", "results", "tiles", ".snakemake"):
         shutil.copytree(made.folder / name, folder / name)
     for name in ("scenes", "cities"):
         shutil.copy(made.folder / f"tiny_{name}.tsv", folder / f"{name}.tsv")
@@ -146,7 +146,7 @@ def test_what_is_out_of_date_is_said_with_the_cause(own):
     try:
         gcps.write_text(text.replace(text.splitlines()[3] + "\n", ""))
         status = call("status", "Tiny", folder=own)
-        assert "out of date" in status.text and "in/gcps.csv" in status.text, status.text
+        assert "out of date" in status.text and "changed: gcps" in status.text, status.text
         assert "align 1, refine 1, rectify 1, project 1, export 1" in status.text
     finally:
         gcps.write_text(text)
