@@ -8,7 +8,6 @@ import signal
 import time
 from pathlib import Path
 
-from stereotruth.products.files import atomic_file
 from stereotruth.products.locks import FileLock, exclusive
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -56,9 +55,3 @@ def test_writers_take_turns(tmp_path) -> None:
         assert process.exitcode == 0
     assert path.read_text() == "x" * 60
     assert [p.name for p in tmp_path.iterdir()] == ["product"]
-
-
-def test_a_product_leaves_no_lock(tmp_path) -> None:
-    with atomic_file(tmp_path / "a.json") as scratch:
-        scratch.write_text("1")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
