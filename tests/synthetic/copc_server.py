@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from pathlib import Path
 from threading import Lock, Thread
 
 import laspy
@@ -140,45 +142,56 @@ def _pages(entries, at, paged) -> tuple[bytes, int]:
     return first + later, len(first)
 
 
-# What a server does wrong, and whether asking again gets the points all the same.
+# What a server does wrong, at one request or from then on, and whether a client gets over it.
 SERVER_FAULTS = {
-    "short body": True,
-    "short range": True,
-    "shifted range": True,
-    "longer body": True,
-    "no Content-Range": True,
-    "garbled Content-Range": True,
     "429 with seconds": True,
     "429 with a date": True,
     "503": True,
-    "500": True,
     "reset": True,
+    "short body": True,
+    "no Content-Range": True,
+    "shifted range": True,
     "stall": True,
     "redirect to itself once": True,
     "503 for ever": False,
     "429 for an hour": False,
-    "stall for ever": False,
     "drip": False,
     "drip of the head": False,
-    "no ranges": False,
-    "replaced: ETag": False,
-    "replaced: size": False,
     "gone": False,
     "forbidden": False,
-    "unsatisfiable": False,
+    "no ranges": False,
     "encoded": False,
+    "replaced: size": False,
+    "replaced: ETag": False,
     "redirect loop": False,
     "redirect to file:": False,
     "redirect to another host": False,
     "redirect to another port": False,
 }
+STATUS = {
+    "429 with seconds": lambda s: (429, {"Retry-After": "1"}),
+    "429 with a date": lambda s: (429, {"Retry-After": formatdate(time.time() + 1, usegmt=True)}),
+    "503": lambda s: (503, {}),
+    "503 for ever": lambda s: (503, {}),
+    "429 for an hour": lambda s: (429, {"Retry-After": "3600"}),
+    "gone": lambda s: (410, {}),
+    "forbidden": lambda s: (403, {}),
+    "redirect to itself once": lambda s: (302, {"Location": s.url}),
+    "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
+    "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
+    "redirect to another host": lambda s: (302, {"Location": s.target}),
+    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
+}
 
 
 @dataclass
 class Server:
-    """What a server holds and does wrong: ``fault`` at request ``when`` (from 0), or from then."""
+    """A server of a file at ``url``, or of a folder's files; ``requests`` and bytes ``sent``.
 
-    content: bytes
+    It does wrong by ``fault`` at request ``when`` (from 0), or from then on.
+    """
+
+    content: bytes | Path
     fault: str = ""
     when: int = 0
     sent: int = 0
@@ -187,122 +200,107 @@ class Server:
     target: str = "http://other.invalid/x?sig=secret"  # of redirects to another host
     lock: Lock = field(default_factory=Lock)
 
+    def stand_in(self, name: str = "", content: str = '"one"', hosts: Sequence[str] = ()) -> Path:
+        """What a plan writes in the place of the file, or of one of the folder's."""
+        held = (
+            self.content if isinstance(self.content, bytes) else (self.content / name).read_bytes()
+        )
+        url = f"{self.url}{name}"
+        place = Path("results", "remote", *url.replace("://", "/").split("/"))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        state = {"size": len(held), "content": content, "hosts": list(hosts)}
+        place.write_text(json.dumps(state) + "\n")
+        return place
+
+
+class Answer(BaseHTTPRequestHandler):
+    """Answers of a :class:`Server`, the ``state`` of the class."""
+
+    protocol_version = "HTTP/1.1"
+    state: Server
+
+    def do_GET(self) -> None:
+        state = self.state
+        with state.lock:
+            number = len(state.requests)
+            state.requests.append(f"{self.path} {self.headers.get('Range')}")
+        lasting = not SERVER_FAULTS.get(state.fault, True)
+        faulty = number >= state.when if lasting else number == state.when
+        with suppress(OSError):  # a client that has lost its patience
+            self.answer(state.fault if faulty else "")
+
+    do_HEAD = do_GET
+
+    def answer(self, fault: str) -> None:
+        content, span, wanted = self.state.content, {}, self.headers.get("Range")
+        if isinstance(content, Path):
+            file = content / self.path.strip("/")
+            if not file.is_file():
+                return self.send(404, {})
+            content = file.read_bytes()
+        if fault in STATUS:
+            return self.send(*STATUS[fault](self.state))
+        if fault in ("reset", "drip of the head"):
+            self.close_connection = True
+            return (
+                self.drip(b"HTTP/1.1 206 Partial Content\r\nX-Long: ") if "drip" in fault else None
+            )
+        if fault == "stall":
+            time.sleep(1.0)
+        tag = '"two"' if fault == "replaced: ETag" else '"one"'
+        if wanted is None or fault == "no ranges":
+            return self.send(200, {"ETag": tag}, content)
+        first, last = map(int, wanted.removeprefix("bytes=").split("-"))
+        last = min(last, len(content) - 1)
+        shift = int(fault == "shifted range" and first > 0)
+        if fault != "no Content-Range":
+            size = len(content) + (fault == "replaced: size")
+            span = {"Content-Range": f"bytes {first - shift}-{last - shift}/{size}"}
+        if fault == "encoded":
+            span["Content-Encoding"] = "gzip"
+        body = content[first - shift : last + 1 - shift]
+        self.send(206, span | {"ETag": tag}, body, fault)
+
+    def send(self, status: int, headers: dict, body: bytes = b"", fault: str = "") -> None:
+        self.send_response(status)
+        for name, value in (headers | {"Content-Length": str(len(body))}).items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        if fault == "drip":
+            return self.drip(body[:1])
+        body = body[: len(body) // 2] if fault == "short body" else body
+        self.close_connection = self.close_connection or fault == "short body"
+        self.wfile.write(body)
+        with self.state.lock:
+            self.state.sent += len(body)
+
+    def drip(self, first: bytes) -> None:
+        """A byte each tenth of a second, a minute at most."""
+        self.wfile.write(first)
+        for _ in range(600):
+            self.wfile.write(b"x")
+            time.sleep(0.1)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
 
 @contextmanager
-def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
+def serving(content: bytes | Path, fault: str = "", when: int = 0) -> Iterator[Server]:
     """A server on the loopback."""
     state = Server(content, fault, when)
-
-    class Answer(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self):
-            with state.lock:
-                number = len(state.requests)
-                state.requests.append(f"{self.path} {self.headers.get('Range')}")
-            lasting = not SERVER_FAULTS.get(state.fault, True)
-            faulty = number >= state.when if lasting else number == state.when
-            try:
-                self.answer(state.fault if faulty else "")
-            except OSError:
-                self.close_connection = True
-
-        def answer(self, fault):
-            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
-            size = len(state.content)
-            last = min(last, size - 1)
-            if fault in STATUS:
-                return self.plain(*STATUS[fault](state))
-            if fault == "reset":
-                self.close_connection = True
-                return None
-            if fault == "drip of the head":
-                return self.drip_head()
-            if fault.startswith("stall"):
-                time.sleep(0.6)
-            if fault == "no ranges":
-                return self.plain(200, {}, state.content)
-            shift = 1 if fault == "shifted range" and first > 0 else 0
-            if fault == "short range":
-                last = (first + last) // 2
-            body = state.content[first - shift : last + 1 - shift]
-            length = len(body)
-            if fault == "longer body":
-                body += b"more"
-                length += 4
-            if fault == "short body":
-                body = body[: length // 2]
-            told = size + 1 if fault == "replaced: size" else size
-            span = f"bytes {first - shift}-{last - shift}/{told}"
-            headers = {
-                "ETag": '"two"' if fault == "replaced: ETag" and state.when else '"one"',
-                "Content-Range": "bytes x-y/z" if fault == "garbled Content-Range" else span,
-                "Content-Length": str(length),
-            }
-            if fault == "no Content-Range":
-                del headers["Content-Range"]
-            if fault == "encoded":
-                headers["Content-Encoding"] = "gzip"
-            return self.plain(206, headers, body, drip=fault == "drip")
-
-        def drip_head(self):
-            """A line that goes on for as long as anybody listens, a minute at most."""
-            self.close_connection = True
-            self.wfile.write(b"HTTP/1.1 206 Partial Content\r\nX-Long: ")
-            for _ in range(600):
-                self.wfile.write(b"x")
-                time.sleep(0.1)
-
-        def plain(self, status, headers, body=b"", drip=False):
-            self.send_response(status)
-            for name, value in ({"Content-Length": str(len(body))} | headers).items():
-                self.send_header(name, value)
-            self.end_headers()
-            step = 1 if drip else 1 << 16
-            for at in range(0, len(body), step):
-                self.wfile.write(body[at : at + step])
-                with state.lock:
-                    state.sent += len(body[at : at + step])
-                if drip:
-                    time.sleep(0.05)
-            if int(headers.get("Content-Length", len(body))) != len(body):
-                self.close_connection = True
-
-        def log_message(self, *_):
-            pass
-
-    class Quiet(ThreadingHTTPServer):
-        daemon_threads = True
-
-        def handle_error(self, *_):
-            pass  # a client that has lost its patience
-
-    server = Quiet(("127.0.0.1", 0), Answer)
-    state.url = f"http://127.0.0.1:{server.server_port}/tile.copc.laz"
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Answers", (Answer,), {"state": state}))
+    server.daemon_threads, server.block_on_close = True, False
+    name = "tile.copc.laz" if isinstance(content, bytes) else ""
+    state.url = f"http://127.0.0.1:{server.server_port}/{name}"
     Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     try:
         yield state
     finally:
         server.shutdown()
         server.server_close()
-
-
-STATUS = {
-    "429 with seconds": lambda s: (429, {"Retry-After": "1"}),
-    "429 with a date": lambda s: (429, {"Retry-After": formatdate(time.time() + 1, usegmt=True)}),
-    "503": lambda s: (503, {}),
-    "500": lambda s: (500, {}),
-    "503 for ever": lambda s: (503, {}),
-    "429 for an hour": lambda s: (429, {"Retry-After": "3600"}),
-    "gone": lambda s: (404, {}),
-    "forbidden": lambda s: (403, {}),
-    "unsatisfiable": lambda s: (416, {}),
-    "redirect to itself once": lambda s: (302, {"Location": s.url}),
-    "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
-    "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
-    "redirect to another host": lambda s: (302, {"Location": s.target}),
-    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
-}
 
 
 def _entry(made: MadeCopc, content: bytearray, rng: np.random.Generator) -> tuple[int, list]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import laspy
 import lazrs
@@ -40,14 +41,14 @@ class Copc(Octree):
         self.name = self._parts.name
         layout = check_layout(path, layers=False)
         with _decoding(lambda error: self._refusal(str(error))):
-            _require(layout.minor == 4 and layout.format in (6, 7, 8), "COPC is LAS 1.4, format 6-8")
+            _require(layout.minor == 4 and layout.format in (6, 7, 8), "COPC is LAS 1.4, 6 to 8")
             packing, chunks = layout.packing, layout.chunks
             _require(packing is not None and chunks is not None, "it has no compressed points")
             assert packing is not None and chunks is not None
             _require(packing.kind == LAYERED, "its points are not compressed in layers")
             _require(
                 layout.first_point <= MOST_HEAD_BYTES and layout.evlrs <= MOST_EVLRS,
-                f"points begin at byte {layout.first_point}, {layout.evlrs} records are behind them",
+                f"points from byte {layout.first_point} on, {layout.evlrs} records behind them",
             )
             self._packing: Packing = packing
             with open_stream(path, GLANCE_BYTES) as stream:
@@ -83,7 +84,7 @@ class Copc(Octree):
             if isinstance(self._parts, LocalParts):  # a server would be asked for each of them
                 self._refuse_first_points_outside()
 
-    def _systems_behind(self, stream, layout: Layout) -> list[laspy.VLR]:
+    def _systems_behind(self, stream: BinaryIO, layout: Layout) -> list[laspy.VLR]:
         """The records behind the points that declare a coordinate system."""
         records = _records(stream, layout.first_evlr, layout.size, layout.evlrs, extended=True)
         systems = [record for record in records if record[0] == b"LASF_Projection"]
@@ -121,7 +122,7 @@ class Copc(Octree):
         every = np.concatenate(found)
         _require(len(np.unique(every["key"], axis=0)) == len(every), "a node stands in it twice")
         _require(not every["key"][:, 0].min(), "its hierarchy has no root")
-        _require(bool((every["points"] >= 0).all()), "a node of its hierarchy has less than no points")
+        _require(bool((every["points"] >= 0).all()), "a node has less than no points")
         nodes = every[every["points"] > 0].astype(NODE)
         return nodes[np.argsort(nodes["start"], kind="stable")]
 
@@ -149,7 +150,7 @@ class Copc(Octree):
                 yield points
 
     def _points(self, count: int, content: bytes) -> ScaleAwarePointRecord:
-        """The points of a chunk, whose layers are held against its bytes before they are decoded."""
+        """The points of a chunk, whose layers are held against its bytes first."""
         form = self.header.point_format
         layers = np.frombuffer(content, "<u4", 1 + self._packing.layers, form.size).astype(np.int64)
         head = form.size + 4 * layers.size

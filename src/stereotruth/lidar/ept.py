@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,26 +90,23 @@ class Ept(Octree):
                 names = [f"ept-hierarchy/{key}.json" for key in waiting]
                 pages, tops, waiting = pool.map(self._json, names), waiting, []
                 for top, page in zip(tops, pages):
-                    _require(top in page, f"its hierarchy lacks node {top}")
                     inner = {key for key, n in page.items() if n == -1 and key != top}
                     held = {key: n for key, n in page.items() if key not in inner}
-                    _require(all(map(KEY.fullmatch, page)), f"page {top} has other keys than nodes")
-                    _require(inner.isdisjoint(asked), f"two places name a page that {top} names")
-                    good = all(type(n) is int and n >= 0 for n in held.values())
-                    _require(good and counts.keys().isdisjoint(held), f"page {top} counts wrongly")
+                    good = top in held and all(map(KEY.fullmatch, page))
+                    good &= all(type(n) is int and n >= 0 for n in held.values())
+                    good &= inner.isdisjoint(asked) and counts.keys().isdisjoint(held)
+                    _require(good, f"part {top} of its hierarchy is none, or names a node again")
                     counts |= held
                     asked |= inner
                     waiting += inner
                     _require(len(counts) + len(asked) <= MOST_NODES, "its hierarchy is too large")
-        _require(any(counts.values()), "no node of its hierarchy has points")
         return counts
 
     def _header_of_all(self, about: dict[str, Any], content: bytes) -> laspy.LasHeader:
         """The header of a node, made that of the whole."""
         header = laspy.LasHeader.read_from(io.BytesIO(content))
         bounds = np.array(about.get("boundsConforming", about["bounds"]), np.float64)
-        _require(bounds.shape == (6,), "its boundsConforming are no box")
-        header.mins, header.maxs = bounds[:3], bounds[3:]
+        header.mins, header.maxs = bounds.reshape(2, 3)
         header.point_count = about["points"]
         header.number_of_points_by_return = np.zeros(15, np.uint32)  # of one node
         if system := _system(about.get("srs")):
@@ -142,15 +140,12 @@ class Ept(Octree):
 
 
 def _system(srs: Any) -> CRS | None:
-    """The coordinate system that ept.json states; None where it states none."""
+    """The coordinate system that ept.json states; None where it states none that can be read."""
     srs = srs if isinstance(srs, dict) else {}
-    texts = [srs.get("wkt")]
-    if srs.get("authority") and srs.get("horizontal"):
-        codes = [str(srs[part]) for part in ("horizontal", "vertical") if srs.get(part)]
-        texts.insert(0 if len(codes) == 2 else 1, f"{srs['authority']}:{'+'.join(codes)}")
+    codes = [str(srs[part]) for part in ("horizontal", "vertical") if srs.get(part)]
+    code = f"{srs.get('authority')}:{'+'.join(codes)}" if srs.get("horizontal") else None
+    texts = [code, srs.get("wkt")] if len(codes) == 2 else [srs.get("wkt"), code]
     for text in filter(None, texts):
-        try:
+        with suppress(CRSError):
             return CRS.from_user_input(text)
-        except CRSError:
-            continue
     return None

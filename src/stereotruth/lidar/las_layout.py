@@ -151,6 +151,7 @@ class Packing:
 
     @classmethod
     def of(cls, record: bytes, record_bytes: int) -> Packing:
+        """Of the bytes of a LASzip record. Raises ValueError if they cannot be."""
         _require(len(record) >= 34, "its LASzip record is cut short")
         (kind,) = struct.unpack_from("<H", record)
         (chunk_points,) = struct.unpack_from("<I", record, 12)

@@ -156,8 +156,8 @@ class Octree(ABC):
         good &= (np.array(at) < 2 ** np.clip(level, 0, MOST_LEVELS)).all(axis=0)
         if not good.all():
             raise self._refusal(f"its hierarchy has a node {shown(self.nodes[np.argmin(good)])}")
-        if not len(self.nodes) or len(self._number_of) < len(self.nodes):
-            raise self._refusal("its hierarchy has no node with points, or one of them twice")
+        if len(self._number_of) < len(self.nodes):
+            raise self._refusal("a node stands twice in its hierarchy")
         held, wanted = int(self.nodes["points"].sum()), int(self.header.point_count)
         if held != wanted:
             raise self._refusal(

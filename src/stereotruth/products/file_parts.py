@@ -17,15 +17,13 @@ import os
 import zlib
 from abc import ABC, abstractmethod
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, cast
 
 from ..errors import InputError, without_secrets
-from .remote_files import RangeReader, state_held, url_of
-
-Range = tuple[int, int]  # first byte, and the one behind the last
+from .remote_files import Ranges, ranges_reader, state_held, url_of
 
 FOLDER = Path("results", "copies")
 STREAM_BYTES = 4 << 20  # of a file that is read as a whole, at once
@@ -43,7 +41,7 @@ class FileParts(ABC):
     name: str
     size: int
 
-    def get(self, ranges: Sequence[Range]) -> list[bytes]:
+    def get(self, ranges: Ranges) -> list[bytes]:
         """The bytes of each range; in memory all at once. Raises InputError if there are less."""
         for start, end in ranges:
             if not 0 <= start <= end <= self.size or end - start > MOST_BYTES:
@@ -55,7 +53,7 @@ class FileParts(ABC):
         return self._get(ranges)
 
     @abstractmethod
-    def _get(self, ranges: Sequence[Range]) -> list[bytes]: ...
+    def _get(self, ranges: Ranges) -> list[bytes]: ...
 
 
 class LocalParts(FileParts):
@@ -70,7 +68,7 @@ class LocalParts(FileParts):
         self.name, self.size, self._path = str(path), state.st_size, path
         self._state = _identity(state)
 
-    def _get(self, ranges: Sequence[Range]) -> list[bytes]:
+    def _get(self, ranges: Ranges) -> list[bytes]:
         with self._path.open("rb") as stream:
             contents = [os.pread(stream.fileno(), end - start, start) for start, end in ranges]
             same = _identity(os.fstat(stream.fileno())) == self._state
@@ -97,9 +95,9 @@ class RemoteParts(FileParts):
         self.name, self._place = without_secrets(url), place
         self.size, _ = state_held(place)
         self._copies = copies_of(place, url) if keep else None
-        self._reader: RangeReader | None = None  # asked for the first part that is not held
+        self._read: Callable[[Ranges], list[bytes]] | None = None  # for what is not held
 
-    def _get(self, ranges: Sequence[Range]) -> list[bytes]:
+    def _get(self, ranges: Ranges) -> list[bytes]:
         from fsspec.utils import merge_offset_ranges
 
         paths = [self.name] * len(ranges)
@@ -110,8 +108,8 @@ class RemoteParts(FileParts):
         held = {part: read_copy(self._copies, _name(part), part[1] - part[0]) for part in merged}
         missing = [part for part, content in held.items() if content is None]
         if missing:
-            self._reader = self._reader or RangeReader(self._place)
-            for part, content in zip(missing, self._reader.read(missing)):
+            self._read = self._read or ranges_reader(self._place)
+            for part, content in zip(missing, self._read(missing)):
                 keep_copy(self._copies, _name(part), content)
                 held[part] = content
         contents = []
@@ -121,7 +119,7 @@ class RemoteParts(FileParts):
         return contents
 
 
-def _name(part: Range) -> str:
+def _name(part: tuple[int, int]) -> str:
     return f"{part[0]}-{part[1]}"
 
 

@@ -38,6 +38,7 @@ from .web_files import (
 )
 
 Answer = TypeVar("Answer")
+Ranges = Sequence[tuple[int, int]]  # first byte, and the one behind the last
 
 FOLDER = Path("results", "remote")
 SCHEMES = ("s3", *WEB)
@@ -333,39 +334,22 @@ def _read(url: str, most_bytes: int, hosts: frozenset[str]) -> bytes:
     return ask_patiently(url, lambda: storage.cat_file(name))
 
 
-class RangeReader:
-    """Ranges of bytes of what a path stands for, from its server or bucket.
+def ranges_reader(path: str | Path) -> Callable[[Ranges], list[bytes]]:
+    """What reads ranges of bytes of what a path stands for, :data:`AT_ONCE` requests at a time.
 
-    Raises InputError if the file is another one by now than the stand-in says.
+    It raises InputError if the file is another one by now than the stand-in says.
     """
+    url = url_of(path) or ""
+    known = state_held(path)
+    storage, name = (web_files(url, hosts_of(path), *known), url) if _is_web(url) else bucket(url)
 
-    def __init__(self, path: str | Path) -> None:
-        self._path, self._url = path, url_of(path) or ""
-        if _is_web(self._url):
-            known = state_held(path)
-            self._storage, self._name = web_files(self._url, hosts_of(path), *known), self._url
-        else:
-            self._storage, self._name = bucket(self._url)
-
-    def read(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """The bytes (first, behind the last) of each range; :data:`AT_ONCE` requests at a time."""
-        if not _is_web(self._url):  # where each answer is compared
-            refuse_changed(self._path)
-        held: dict[tuple[int, int], bytes] = {}
-        try:
-            ask_patiently(self._url, lambda: self._ask(ranges, held))
-        except FileNotFoundError:
-            raise _missing(self._url) from None
-        return [held[part] for part in ranges]
-
-    def _ask(self, ranges: Sequence[tuple[int, int]], held: dict[tuple[int, int], bytes]) -> None:
+    def ask(ranges: Ranges, held: dict[tuple[int, int], bytes]) -> None:
         """Add to ``held`` the ranges that it lacks. Raises the failure of one of them."""
         wanted = [part for part in ranges if part not in held]
-        names, starts, ends = [self._name] * len(wanted), *map(list, zip(*wanted))
+        names, starts, ends = [name] * len(wanted), *map(list, zip(*wanted))
         failure = None
-        for part, content in zip(
-            wanted, self._storage.cat_ranges(names, starts, ends, batch_size=AT_ONCE)
-        ):
+        answers = storage.cat_ranges(names, starts, ends, batch_size=AT_ONCE)
+        for part, content in zip(wanted, answers):
             if isinstance(content, BaseException):
                 failure = content
             elif len(content) != part[1] - part[0]:
@@ -374,6 +358,18 @@ class RangeReader:
                 held[part] = content
         if failure is not None:
             raise failure
+
+    def read(ranges: Ranges) -> list[bytes]:
+        if not _is_web(url):  # where each answer is compared
+            refuse_changed(path)
+        held: dict[tuple[int, int], bytes] = {}
+        try:
+            ask_patiently(url, lambda: ask(ranges, held))
+        except FileNotFoundError:
+            raise _missing(url) from None
+        return [held[part] for part in ranges]
+
+    return read
 
 
 def bring_image(url: str) -> Path:
