@@ -40,8 +40,8 @@ from tests.synthetic.ept import FAULTS, make_ept
 from stereotruth.errors import InputError, in_number
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.octree import open_octree
 from stereotruth.lidar.octree_nodes import Octree
+from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 
 DENSITY = 10.0  # points/m²

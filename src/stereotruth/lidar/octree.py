@@ -15,7 +15,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -48,7 +47,7 @@ STEPS_OUTSIDE = 2  # of the stored coordinates, that a point may lie outside of 
 
 
 class Octree(ABC):
-    """An octree of points; made by :func:`open_octree`.
+    """An octree of points; made by :func:`.point_files.open_octree`.
 
     ``name``: path or URL; ``header``: coordinate system, scales and offsets, point format, count
     and stated bounds of the whole; ``nodes``: all that have points [n] (:data:`NODE`), in the order
@@ -187,18 +186,3 @@ class Octree(ABC):
 def shown(node: np.void) -> str:
     """The key of a node, as EPT names its file."""
     return "-".join(map(str, node["key"]))
-
-
-def open_octree(path: str | Path) -> Octree:
-    """A COPC file (``.copc.laz``) or EPT (``ept.json``), by path or stand-in.
-
-    Raises InputError: missing, neither of both, damaged, or of a hierarchy that is not complete;
-    what a server fails with.
-    """
-    if Path(path).name.lower() == "ept.json":
-        from .ept import Ept  # which few scenes have
-
-        return Ept(Path(path))
-    from .copc import Copc
-
-    return Copc(Path(path))

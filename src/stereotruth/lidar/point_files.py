@@ -19,7 +19,8 @@ import numpy as np
 from ..products.file_parts import open_stream
 from ..products.remote_files import size_of
 from . import las_files
-from .octree import Touches, open_octree
+from .copc import Copc
+from .octree import Octree, Touches
 
 OCTREE, EPT = ".copc.laz", "ept.json"
 FIRST_BYTES = 1 << 14  # that servers are asked for at once
@@ -131,6 +132,19 @@ class OctreeFile(PointFile):
         points, size = int(nodes["points"].sum()), int(nodes["bytes"].sum())
         counts = len(plan), len(self.octree.nodes)
         return Part(points, size, lambda _: self.octree.read(plan), counts)
+
+
+def open_octree(path: str | Path) -> Octree:
+    """A COPC file (``.copc.laz``) or EPT (``ept.json``), by path or stand-in.
+
+    Raises InputError: missing, neither of both, damaged, or of a hierarchy that is not complete;
+    what a server fails with.
+    """
+    if Path(path).name.lower() == EPT:
+        from .ept import Ept  # which few scenes have
+
+        return Ept(Path(path))
+    return Copc(Path(path))
 
 
 class RasterFile(PointFile):

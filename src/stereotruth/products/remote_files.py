@@ -45,7 +45,7 @@ SCHEMES = ("s3", *WEB)
 MAX_COPY_BYTES = 10_000_000  # of a file that is fetched; RPCs and control points have some kB
 LONGEST_PART = 200  # bytes between slashes, of which stand-ins have their names
 PATIENCE_S = 300.0  # with one question, or a batch of parts, all tries together
-WAIT_S, MOST_WAIT_S = 0.5, 30.0  # before the second try; doubled for each other
+TRIES, WAIT_S = 6, 0.5  # of a question, and before the second of them; doubled for each other
 AT_ONCE = 4  # requests
 _WAYS = "s3://bucket/path and https://host/path can be read"
 
@@ -242,17 +242,17 @@ def ask_patiently(url: str, ask: Callable[[], Answer]) -> Answer:
     Raises FileNotFoundError if there is no such file; InputError for all else, and no later than
     one request after :data:`PATIENCE_S`.
     """
-    until, wait_s = time.monotonic() + PATIENCE_S, WAIT_S
-    while True:
+    until = time.monotonic() + PATIENCE_S
+    for number in range(TRIES):
         try:
             return ask()
         except Exception as error:  # clients raise what they like
             failure, again, asked_s = _failure(error, url)
-        pause_s = wait_s if asked_s is None else asked_s
+        pause_s = WAIT_S * 2**number if asked_s is None else asked_s
         if not again or time.monotonic() + pause_s > until:
-            raise failure
+            break
         time.sleep(pause_s)
-        wait_s = min(2 * wait_s, MOST_WAIT_S)
+    raise failure
 
 
 def _put(place: Path, content: bytes) -> None:

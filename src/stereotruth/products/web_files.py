@@ -124,6 +124,7 @@ def web_files(asked: str, hosts: frozenset[str], size: int | None = None, conten
     """fsspec's file system of web servers, for the file ``asked`` and those beside it.
 
     ``size`` and ``content`` (ETag, else time of the last change) are what is known of the file.
+    Answers that announce more than ``most_bytes`` are refused.
     Its calls raise InputError, Again or Absent, if as the cause of what fsspec raises.
     """
     import aiohttp
@@ -139,6 +140,8 @@ def web_files(asked: str, hosts: frozenset[str], size: int | None = None, conten
             else:
                 _refuse(answer, request.headers.get("Range"), asked)
                 _refuse_other_file(answer.headers, asked, size, content)
+                if most_bytes is not None and (answer.content_length or 0) > most_bytes:
+                    raise too_large(asked, most_bytes)
         except BaseException:
             answer.close()
             raise
@@ -216,7 +219,8 @@ def _asked_wait(text: str | None) -> float | None:
 def read_whole(asked: str, most_bytes: int, hosts: frozenset[str]) -> bytes:
     """A file by one request. Raises InputError if it has more than so many bytes, and likewise."""
     content = bytearray()
-    with web_files(asked, hosts).open(asked, block_size=0, size=1) as stream:  # 0: as it comes
+    files = web_files(asked, hosts, most_bytes=most_bytes)
+    with files.open(asked, block_size=0, size=1) as stream:  # 0: as it comes
         while piece := stream.read(PIECE_BYTES):
             content += piece
             if len(content) > most_bytes:

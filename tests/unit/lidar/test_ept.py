@@ -16,7 +16,7 @@ from stereotruth.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs, interpret
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
 

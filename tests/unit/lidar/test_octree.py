@@ -17,7 +17,7 @@ import pytest
 from stereotruth.errors import InputError
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
 from stereotruth.products.file_parts import FOLDER
@@ -180,6 +180,7 @@ def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return low, low + side
 
 
+@pytest.mark.slow
 def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made):
     """Two nodes of one line of descent, on a server: refused, or nothing is lost."""
     entries = [e for e in made.entries if GROUND.touches(*boxes_of(e[:4])).any()]
