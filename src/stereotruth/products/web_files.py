@@ -120,7 +120,13 @@ def too_large(asked: str, most_bytes: int) -> InputError:
     )
 
 
-def web_files(asked: str, hosts: frozenset[str], size: int | None = None, content: str = "") -> Any:
+def web_files(
+    asked: str,
+    hosts: frozenset[str],
+    size: int | None = None,
+    content: str = "",
+    most_bytes: int | None = None,
+) -> Any:
     """fsspec's file system of web servers, for the file ``asked`` and those beside it.
 
     ``size`` and ``content`` (ETag, else time of the last change) are what is known of the file.
