@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from .web_files import (
     AGAIN,
     MOST_REDIRECTS,
@@ -114,7 +114,7 @@ def bucket(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise InputError(
             f"{scheme}:// cannot be read here ({error})",
-            remedy="pip install 'stereotruth[storage]'",
+            remedy=install_extra("storage"),
         ) from error
     return storage, storage._strip_protocol(url)
 
