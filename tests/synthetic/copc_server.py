@@ -6,7 +6,7 @@ import io
 import json
 import struct
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.utils import formatdate
@@ -34,7 +34,6 @@ class MadeCopc:
     content: bytes
     entries: list[tuple[int, ...]]
     hierarchy_at: int
-    header_count_at: int = 247  # LAS 1.4: number of point records
 
 
 def thinned_surface(
@@ -303,130 +302,94 @@ def serving(content: bytes | Path, fault: str = "", when: int = 0) -> Iterator[S
         server.server_close()
 
 
-def _entry(made: MadeCopc, content: bytearray, rng: np.random.Generator) -> tuple[int, list]:
-    """A random entry of a node in the hierarchy: its place, its values."""
-    while True:
-        span = (len(content) - made.hierarchy_at) // ENTRY.size
-        at = made.hierarchy_at + ENTRY.size * int(rng.integers(span))
-        values = list(ENTRY.unpack_from(content, at))
-        if values[6] > 0:
-            return at, values
+@dataclass
+class Damaged:
+    """A copy of a made file to be damaged; ``info``: cube's centre and half side, spacing, place
+    and bytes of the first page."""
+
+    made: MadeCopc
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        self.content = bytearray(self.made.content)
+        self.info = list(struct.unpack_from("<5d2Q", self.content, INFO_AT))
+
+    def entry(self, but: Sequence[int] = ()) -> tuple[int, list]:
+        """Place and values of a random node's entry in the hierarchy, of another one than ``but``."""
+        at, values = 0, list(but)
+        while values == list(but) or values[6] <= 0:
+            span = (len(self.made.content) - self.made.hierarchy_at) // ENTRY.size
+            at = self.made.hierarchy_at + ENTRY.size * int(self.rng.integers(span))
+            values = list(ENTRY.unpack_from(self.content, at))
+        return at, values
+
+    def change_entry(self, change: Callable[[list], list]) -> None:
+        at, values = self.entry()
+        ENTRY.pack_into(self.content, at, *change(values))
+
+    def set_info(self, which: int, value: float) -> None:
+        self.info[which] = value
+
+    def pack(self, form: str, at: int, *values: float) -> None:
+        struct.pack_into(form, self.content, at, *values)
+
+    def copy_entry(self, swap: bool) -> None:
+        """One node in the place of another one, or two nodes swapped."""
+        at, one = self.entry()
+        other_at, other = self.entry(but=one)
+        ENTRY.pack_into(self.content, at, *(one[:4] + other[4:] if swap else other))
+        if swap:
+            ENTRY.pack_into(self.content, other_at, *other[:4], *one[4:])
+
+    def add_pages(self, overlapping: bool) -> None:
+        """A root of many pages, each most of the file; or pages of which each names the next."""
+        start, size = len(self.content), ENTRY.size
+        for k in range(5000):
+            to = (start, size * (5000 - k)) if overlapping else (start + size * (k + 1), size)
+            self.content += ENTRY.pack(1, 0, 0, 0, *to, -1)
+        self.content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
+        self.info[5:] = start, size * 5000 if overlapping else size
 
 
-# What is wrong with a file, and whether all points come all the same; None: they do, or it is
-# refused.
-FILE_FAULTS = {
-    "header bounds": True,
-    "header bounds in z": True,
-    "header bounds not filled in": True,
-    "header count": False,
-    "count of a node": False,
-    "place of a node": False,
-    "key of a node": False,
-    "node left out": False,
-    "node made empty": False,
-    "node doubled": False,
-    "page loop": False,
-    "pages that overlap": False,
-    "pages nested without end": False,
-    "records without end": False,
-    "root page cut": False,
-    "hierarchy out of the file": False,
-    "cube too small": False,
-    "cube too large": False,
-    "cube shifted": False,
-    "cube not a number": False,
-    "file cut": False,
-    "chunk table": False,
-    "points of a chunk": False,
-    "layers of a chunk": False,
-    "two nodes swapped": None,
-    "no info record": False,
+# What is wrong with a file, whether all points come all the same (None: they do, or it is refused),
+# and how it is planted.
+FILE_FAULTS: dict[str, tuple[bool | None, Callable[[Damaged], object]]] = {
+    "header bounds": (True, lambda f: f.pack("<4d", 179, *f.rng.uniform(4e5, 5e5, 4))),
+    "header bounds in z": (True, lambda f: f.pack("<2d", 211, 9e3, 8e3)),
+    "header bounds not filled in": (True, lambda f: f.pack("<6d", 179, *[0.0] * 6)),
+    "header count": (False, lambda f: f.pack("<Q", 247, int(f.rng.integers(1, 10**6)))),
+    "count of a node": (False, lambda f: f.change_entry(lambda e: [*e[:6], e[6] + 3])),
+    "place of a node": (False, lambda f: f.change_entry(lambda e: [*e[:4], e[4] + 7, *e[5:]])),
+    "key of a node": (False, lambda f: f.change_entry(lambda e: [e[0], 2 ** e[0] + 1, *e[2:]])),
+    "node left out": (False, lambda f: f.change_entry(lambda e: [3, 0, 0, 7, 0, 0, 0])),
+    "node made empty": (False, lambda f: f.change_entry(lambda e: [*e[:4], 0, 0, 0])),
+    "node doubled": (False, lambda f: f.copy_entry(swap=False)),
+    "two nodes swapped": (None, lambda f: f.copy_entry(swap=True)),
+    "page loop": (False, lambda f: f.change_entry(lambda e: [*e[:4], *f.info[5:], -1])),
+    "pages that overlap": (False, lambda f: f.add_pages(overlapping=True)),
+    "pages nested without end": (False, lambda f: f.add_pages(overlapping=False)),
+    "records without end": (False, lambda f: f.pack("<I", 243, 4_000_000_000)),
+    "root page cut": (False, lambda f: f.set_info(6, f.info[6] - 9)),
+    "hierarchy out of the file": (False, lambda f: f.set_info(5, len(f.content) - 20)),
+    "cube too small": (False, lambda f: f.set_info(3, f.info[3] * f.rng.uniform(0.3, 0.9))),
+    "cube too large": (False, lambda f: f.set_info(3, f.info[3] * f.rng.uniform(1.1, 3))),
+    "cube shifted": (False, lambda f: f.set_info(0, f.info[0] + f.rng.uniform(50, 900))),
+    "cube not a number": (
+        False,
+        lambda f: f.set_info(3, np.nan),
+    ),
+    "file cut": (False, lambda f: f.content.__delitem__(slice(len(f.content) // 2, None))),
+    "chunk table": (False, lambda f: f.content.__setitem__(f.made.hierarchy_at - 70, 0xA5)),
+    "points of a chunk": (False, lambda f: f.pack("<I", f.made.entries[0][4] + 30, 2**30)),
+    "layers of a chunk": (False, lambda f: f.pack("<I", f.made.entries[0][4] + 34, 2**30)),
+    "no info record": (False, lambda f: f.pack("<4s", INFO_AT - 52, b"none")),
 }
-
-
-def _overlap(made: MadeCopc, content: bytearray, info: list) -> None:
-    """A root of many pages, each of them most of the file."""
-    start, size = len(content), ENTRY.size
-    pages = [ENTRY.pack(1, 0, 0, 0, start, size * (5000 - k), -1) for k in range(5000)]
-    content += b"".join(pages)
-    info[5], info[6] = start, size * 5000
-
-
-def _nest(content: bytearray, info: list) -> None:
-    """Pages of which each names the next alone."""
-    start, size, n = len(content), ENTRY.size, 20_000
-    for k in range(n):
-        content += ENTRY.pack(1, 0, 0, 0, start + size * (k + 1), size, -1)
-    content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
-    info[5], info[6] = start, size
 
 
 def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
     """The content of a file with a fault."""
-    content = bytearray(made.content)
-    at, entry = _entry(made, content, rng)
-    info = list(struct.unpack_from("<5d2Q", content, INFO_AT))
-    if fault == "header bounds":
-        struct.pack_into("<4d", content, 179, *rng.uniform(4e5, 5e5, 4))
-    elif fault == "header bounds in z":
-        struct.pack_into("<2d", content, 211, 9e3, 8e3)
-    elif fault == "header bounds not filled in":
-        struct.pack_into("<6d", content, 179, *[0.0] * 6)
-    elif fault == "header count":
-        struct.pack_into("<Q", content, made.header_count_at, int(rng.integers(1, 10**6)))
-    elif fault in ("count of a node", "place of a node", "key of a node", "node made empty"):
-        if fault == "count of a node":
-            entry[6] += int(rng.integers(1, 9))
-        elif fault == "place of a node":
-            entry[4] += int(rng.integers(1, 99))
-        elif fault == "node made empty":
-            entry[4:] = 0, 0, 0
-        else:
-            entry[1] = 2 ** entry[0] + int(rng.integers(0, 9))
-        ENTRY.pack_into(content, at, *entry)
-    elif fault in ("node left out", "node doubled"):
-        other = _entry(made, content, rng)[1]
-        while other == entry:
-            other = _entry(made, content, rng)[1]
-        ENTRY.pack_into(content, at, *(other if fault == "node doubled" else [3, 0, 0, 7, 0, 0, 0]))
-    elif fault == "page loop":
-        ENTRY.pack_into(content, at, *entry[:4], info[5], info[6], -1)
-    elif fault == "pages that overlap":
-        _overlap(made, content, info)
-    elif fault == "pages nested without end":
-        _nest(content, info)
-    elif fault == "records without end":
-        struct.pack_into("<I", content, 243, 4_000_000_000)
-        content += bytes(10**6)
-    elif fault == "root page cut":
-        info[6] -= int(rng.integers(1, info[6]))
-    elif fault == "hierarchy out of the file":
-        info[5] = len(content) - int(rng.integers(0, 30))
-    elif fault == "cube too small":
-        info[3] *= rng.uniform(0.3, 0.9)
-    elif fault == "cube too large":
-        info[3] *= rng.uniform(1.1, 3)
-    elif fault == "cube shifted":
-        info[int(rng.integers(2))] += float(rng.choice([-1, 1]) * rng.uniform(50, 900))
-    elif fault == "cube not a number":
-        info[3] = float(rng.choice([np.nan, np.inf, -1, 0]))
-    elif fault == "file cut":
-        del content[int(rng.integers(600, len(content))) :]
-    elif fault == "chunk table":
-        content[made.hierarchy_at - 60 - int(rng.integers(1, 20))] ^= 1 << int(rng.integers(8))
-    elif fault == "points of a chunk":
-        struct.pack_into("<I", content, made.entries[0][4] + 30, int(rng.integers(1, 2**31)))
-    elif fault == "layers of a chunk":
-        struct.pack_into("<I", content, made.entries[0][4] + 34, int(rng.integers(1, 2**31)))
-    elif fault == "two nodes swapped":
-        other_at, other = _entry(made, content, rng)
-        while other == entry:
-            other_at, other = _entry(made, content, rng)
-        ENTRY.pack_into(content, at, *entry[:4], *other[4:])
-        ENTRY.pack_into(content, other_at, *other[:4], *entry[4:])
-    elif fault == "no info record":
-        content[INFO_AT - 52 : INFO_AT - 48] = b"none"
-    if not fault.startswith("file cut"):
-        struct.pack_into("<5d2Q", content, INFO_AT, *info)
-    return bytes(content)
+    file = Damaged(made, rng)
+    FILE_FAULTS[fault][1](file)
+    if fault != "file cut":
+        file.pack("<5d2Q", INFO_AT, *file.info)
+    return bytes(file.content)

@@ -160,16 +160,16 @@ def test_few_bytes_of_a_server_are_read_and_a_second_run_asks_for_nothing():
 
 @pytest.mark.parametrize("fault", FILE_FAULTS)
 def test_a_damaged_file_loses_nothing_silently(made, fault):
-    file = Path("tile.copc.laz")
-    for seed in range(3):
+    file, (comes, _) = Path("tile.copc.laz"), FILE_FAULTS[fault]
+    for seed in range(2):
         rng = np.random.default_rng([zlib.crc32(fault.encode()), seed])
         file.write_bytes(damaged(made, fault, rng))
         try:
             got = read(file, GROUND)
         except InputError as error:
-            assert not FILE_FAULTS[fault] and "tile.copc.laz: " in str(error)
+            assert not comes and "tile.copc.laz: " in str(error)
             continue
-        assert FILE_FAULTS[fault] is not False
+        assert comes is not False
         assert np.array_equal(got, cropped(made.content, GROUND))
 
 
