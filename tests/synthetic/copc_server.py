@@ -59,18 +59,21 @@ def thinned_surface(
 
 
 def make_copc(
-    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, paged: bool = True
+    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, form: int = 6
 ) -> MadeCopc:
-    """A :func:`thinned_surface` in an octree of so many levels, with pages below level 1."""
+    """A :func:`thinned_surface` in an octree of so many levels, with pages below level 1.
+
+    ``form``: of its points, 6 to 8. A node without points is in the hierarchy, too.
+    """
     rng = np.random.default_rng(seed)
     key, xyz = thinned_surface(rng, points, side, levels)
-    header = laspy.LasHeader(point_format=6, version="1.4")
+    header = laspy.LasHeader(point_format=form, version="1.4")
     header.scales, header.offsets = [0.01] * 3, CORNER
     header.are_points_compressed, header.point_count = True, points
     header.mins, header.maxs = CORNER + xyz.min(axis=0), CORNER + xyz.max(axis=0)
     header.global_encoding.wkt = True
     header.number_of_points_by_return = np.array([points, *[0] * 14], np.uint32)
-    packing = lazrs.LazVlr.new_for_compression(6, 0, True)
+    packing = lazrs.LazVlr.new_for_compression(form, 0, True)
     wkt = UTM.to_wkt().encode() + b"\0"
     header.vlrs = [
         laspy.VLR("copc", 1, "", bytes(160)),
@@ -87,7 +90,7 @@ def make_copc(
     header.write_to(stream)
     entries = _compressed(stream, packing, record.array, key)
     hierarchy_at = stream.seek(0, 2) + 60
-    pages = _pages(entries, hierarchy_at, paged)
+    pages = _pages(entries, hierarchy_at)
     stream.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(pages[0]), b"") + pages[0])
     content = bytearray(stream.getvalue())
     struct.pack_into("<QI", content, 235, hierarchy_at - 60, 1)
@@ -122,11 +125,10 @@ def _compressed(stream, packing, array, key) -> list[tuple[int, ...]]:
     return entries
 
 
-def _pages(entries, at, paged) -> tuple[bytes, int]:
+def _pages(entries, at) -> tuple[bytes, int]:
     """The hierarchy, and the bytes of its first page."""
-    root = [e for e in entries if e[0] < 2 or not paged]
-    if not paged:
-        return b"".join(ENTRY.pack(*e) for e in root), ENTRY.size * len(root)
+    root = [e for e in entries if e[0] < 2]
+    root.append((9, 0, 0, 0, 0, 0, 0))
     below: dict[tuple, list] = {}
     for e in entries:
         if e[0] >= 2:
@@ -141,45 +143,36 @@ def _pages(entries, at, paged) -> tuple[bytes, int]:
     return first + later, len(first)
 
 
-# What a server does wrong, at one request or from then on, and whether a client gets over it.
-SERVER_FAULTS = {
-    "429 with seconds": True,
-    "429 with a date": True,
-    "503": True,
-    "reset": True,
-    "short body": True,
-    "no Content-Range": True,
-    "shifted range": True,
-    "stall": True,
-    "redirect to itself once": True,
-    "503 for ever": False,
-    "429 for an hour": False,
-    "drip": False,
-    "drip of the head": False,
-    "gone": False,
-    "forbidden": False,
-    "no ranges": False,
-    "encoded": False,
-    "replaced: size": False,
-    "replaced: ETag": False,
-    "redirect loop": False,
-    "redirect to file:": False,
-    "redirect to another host": False,
-    "redirect to another port": False,
-}
-STATUS = {
-    "429 with seconds": lambda s: (429, {"Retry-After": "1"}),
-    "429 with a date": lambda s: (429, {"Retry-After": formatdate(time.time() + 1, usegmt=True)}),
-    "503": lambda s: (503, {}),
-    "503 for ever": lambda s: (503, {}),
-    "429 for an hour": lambda s: (429, {"Retry-After": "3600"}),
-    "gone": lambda s: (410, {}),
-    "forbidden": lambda s: (403, {}),
-    "redirect to itself once": lambda s: (302, {"Location": s.url}),
-    "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
-    "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
-    "redirect to another host": lambda s: (302, {"Location": s.target}),
-    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
+def _status(status: int, **headers: str) -> Callable[[Server], tuple[int, dict[str, str]]]:
+    return lambda server: (status, {n.replace("_", "-"): v for n, v in headers.items()})
+
+
+# What a server does wrong, at one request or from then on: whether a client gets over it, and the
+# status and headers of the answer. Those without are parts of a file that Answer spoils.
+SERVER_FAULTS: dict[str, tuple[bool, Callable[[Server], tuple[int, dict[str, str]]] | None]] = {
+    "429 with seconds": (True, _status(429, Retry_After="1")),
+    "429 with a date": (True, lambda s: (429, {"Retry-After": formatdate(time.time() + 1)})),
+    "503": (True, _status(503)),
+    "redirect to itself once": (True, lambda s: (302, {"Location": s.url})),
+    "reset": (True, None),
+    "short body": (True, None),
+    "no Content-Range": (True, None),
+    "shifted range": (True, None),
+    "stall": (True, None),
+    "503 for ever": (False, _status(503)),
+    "429 for an hour": (False, _status(429, Retry_After="3600")),
+    "gone": (False, _status(410)),
+    "forbidden": (False, _status(403)),
+    "redirect loop": (False, lambda s: (302, {"Location": s.url + "?signature=verysecret"})),
+    "redirect to file:": (False, _status(302, Location="file:///etc/passwd")),
+    "redirect to another host": (False, lambda s: (302, {"Location": s.target})),
+    "redirect to another port": (False, _status(302, Location="http://127.0.0.1:9/x?sig=secret")),
+    "drip": (False, None),
+    "drip of the head": (False, None),
+    "no ranges": (False, None),
+    "encoded": (False, None),
+    "replaced: size": (False, None),
+    "replaced: ETag": (False, None),
 }
 
 
@@ -223,7 +216,7 @@ class Answer(BaseHTTPRequestHandler):
         with state.lock:
             number = len(state.requests)
             state.requests.append(f"{self.path} {self.headers.get('Range')}")
-        lasting = not SERVER_FAULTS.get(state.fault, True)
+        lasting = not SERVER_FAULTS.get(state.fault, (True, None))[0]
         faulty = number >= state.when if lasting else number == state.when
         with suppress(OSError):  # a client that has lost its patience
             self.answer(state.fault if faulty else "")
@@ -237,8 +230,8 @@ class Answer(BaseHTTPRequestHandler):
             if not file.is_file():
                 return self.send(404, {})
             content = file.read_bytes()
-        if fault in STATUS:
-            return self.send(*STATUS[fault](self.state))
+        if fault and (status := SERVER_FAULTS[fault][1]):
+            return self.send(*status(self.state))
         if fault in ("reset", "drip of the head"):
             self.close_connection = True
             return (
@@ -315,7 +308,7 @@ class Damaged:
         self.info = list(struct.unpack_from("<5d2Q", self.content, INFO_AT))
 
     def entry(self, but: Sequence[int] = ()) -> tuple[int, list]:
-        """Place and values of a random node's entry in the hierarchy, of another one than ``but``."""
+        """Place and values of a random node's entry, of another one than ``but``."""
         at, values = 0, list(but)
         while values == list(but) or values[6] <= 0:
             span = (len(self.made.content) - self.made.hierarchy_at) // ENTRY.size
