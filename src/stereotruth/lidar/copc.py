@@ -43,9 +43,8 @@ class Copc(Octree):
         with _decoding(lambda error: self._refusal(str(error))):
             _require(layout.minor == 4 and layout.format in (6, 7, 8), "COPC is LAS 1.4, 6 to 8")
             packing, chunks = layout.packing, layout.chunks
-            _require(packing is not None and chunks is not None, "it has no compressed points")
-            assert packing is not None and chunks is not None
-            _require(packing.kind == LAYERED, "its points are not compressed in layers")
+            if packing is None or chunks is None or packing.kind != LAYERED:
+                raise self._refusal("its points are not compressed in layers")
             _require(
                 layout.first_point <= MOST_HEAD_BYTES and layout.evlrs <= MOST_EVLRS,
                 f"points from byte {layout.first_point} on, {layout.evlrs} records behind them",

@@ -226,7 +226,8 @@ def read_whole(asked: str, most_bytes: int, hosts: frozenset[str]) -> bytes:
     """A file by one request. Raises InputError if it has more than so many bytes, and likewise."""
     content = bytearray()
     files = web_files(asked, hosts, most_bytes=most_bytes)
-    with files.open(asked, block_size=0, size=1) as stream:  # 0: as it comes
+    # without blocks, as it comes; fsspec would ask for the size, were it not given any
+    with files.open(asked, block_size=0, size=1) as stream:
         while piece := stream.read(PIECE_BYTES):
             content += piece
             if len(content) > most_bytes:
