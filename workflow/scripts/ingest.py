@@ -4,7 +4,7 @@ from stereotruth.job import in_own_process, job
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.range_copies import prune
+from stereotruth.products.file_parts import prune
 from stereotruth.products.making import making
 from stereotruth.products.provenance import describe
 

@@ -71,8 +71,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.locks",
         "products.provenance",
         "products.making",
-        "products.ranges",
         "products.remote_files",
-        "products.web_requests",
+        "products.web_files",
         "settings",
     }
