@@ -99,7 +99,7 @@ BOUNDS = {  # part of a profile: what its time goes into
     "facets": "passes over all triangles: memory",
     "step_points": "points on both sides of each edge",
     "breaklines": "half-planes of the points on both sides of each edge",
-    "facet_raster": "triangles drawn into both views",
+    "raster": "triangles drawn into both views",
     "pixel_labels": "exact sums by pixel: one pass over the points",
     "change_evidence": "windows of pixels, not of points",
     "paper_correlation": "200 samples a point in vectors: arithmetic",

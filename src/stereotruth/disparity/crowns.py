@@ -24,23 +24,23 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
-from ..surface.rough_tops import RoughTops
-from ..surface.scale import FACET_RESIDUAL_PX
-from ..surface.vertices import Vertices
-from .facet_raster import (
+from ..numerics.box_max import box_max
+from ..surface.facet_values import Facets, PixelValues
+from ..surface.raster import (
+    FACET_IN_RIGHT,
     OCCLUSION_TOLERANCE_PX,
-    FacetValues,
-    PixelValues,
-    interpolate,
-    raster_facets,
+    PRISM_IN_LEFT,
+    PRISM_IN_RIGHT,
+    ProjectedSurface,
+    SeenSurface,
     right_pixels,
 )
+from ..surface.rough_tops import RoughTops
+from ..surface.scale import FACET_RESIDUAL_PX
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .pixel_scale import PixelScale
-from .seen_surface import box_max
 from .status import WATER_CLASS, Status, is_labelled
-from .visibility import FACET_IN_RIGHT, PRISM_IN_LEFT, PRISM_IN_RIGHT, VisibleSurface, hidden_by
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -141,23 +141,15 @@ class NearestTops:
     tops: Floats
 
     @classmethod
-    def of(
-        cls, rough: RoughTops, xy: Floats, first: tuple[int, int], facets: Floats, strips: Floats
-    ) -> NearestTops:
-        """From the positions ``xy`` [4, vertices] of the surface, and the disparity of ``facets``
-        (NaN for none) and ``strips`` (−∞) at pixels from ``first`` on."""
-        shape = facets.shape
-        z_buffer, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-        raster_facets(xy, rough.corner[rough.is_gentle], first, z_buffer, index)
-        disparity = np.where(index >= 0, z_buffer, np.nan)
-        before = np.where(np.isnan(facets), -np.inf, facets)
-        steep, unused = rough.corner[~rough.is_gentle], np.empty(shape, np.int32)
-        raster_facets(xy, steep, first, before, unused)
-        tops = z_buffer.copy()
-        raster_facets(xy, steep, first, tops, unused)
-        before = np.maximum(before, strips)
+    def of(cls, seen: SeenSurface) -> NearestTops:
+        """In the image in which a surface is ``seen``."""
+        shape, projected, rough = seen.disparity.shape, seen.projected, seen.projected.surface.tops
+        gentle, index = projected.raster(rough.corner[rough.is_gentle], shape)
+        steep, _ = projected.raster(rough.corner[~rough.is_gentle], shape)
+        disparity = np.where(index >= 0, gentle, np.nan)
+        before = np.fmax(np.maximum(steep, seen.strips), seen.disparity)
         highest = np.fmax(disparity, np.where(np.isneginf(before), np.nan, before))
-        return cls(index, disparity, before, highest, tops)
+        return cls(index, disparity, before, highest, np.maximum(gentle, steep))
 
     def in_front(self) -> Bools:
         """Where a gentle triangle is nearest, and nothing near it is much higher."""
@@ -165,11 +157,14 @@ class NearestTops:
             out = self.disparity > self.before - OCCLUSION_TOLERANCE_PX
             return out & (_higher(self.highest, HIGHER_REACH) <= HIGHER_PX)
 
-    def values(self, chosen: Bools, facets: FacetValues, first: tuple[int, int]) -> PixelValues:
-        """What the triangles of the ``chosen`` pixels have there; ``facets``: their vertices."""
-        out = PixelValues.none(chosen.shape)
-        interpolate(facets, np.where(chosen, self.index, np.int32(-1)), first, out)
-        return out
+    def values(self, chosen: Bools, projected: ProjectedSurface) -> PixelValues:
+        """What the triangles of the ``chosen`` pixels have there; the variance is none of
+        theirs."""
+        rough = projected.surface.tops
+        corner = rough.corner[rough.is_gentle]
+        none = np.zeros(len(corner), np.float32)
+        index = np.where(chosen, self.index, np.int32(-1))
+        return projected.values(Facets(corner, none, none), index)
 
     def variance(self, chosen: Bools, rough: RoughTops, scale: PixelScale) -> Floats:
         """Variance px² [h, w] of what the ``chosen`` pixels show, NaN elsewhere."""
@@ -179,32 +174,20 @@ class NearestTops:
         return out
 
 
-def vertices_of_tops(vertices: Vertices, rough: RoughTops, xy: Floats) -> FacetValues:
-    """The gentle triangles of tops with what their vertices are; the variance is none of theirs."""
-    corner = rough.corner[rough.is_gentle]
-    none = np.zeros(len(corner), np.float32)
-    of_vertices = vertices.h_q, vertices.surface_class, vertices.day, vertices.count
-    return FacetValues(xy, corner, *of_vertices, none, none)
-
-
-def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
+def crowns(seen: SeenSurface, scale: PixelScale) -> Crowns:
     """The rough surfaces of a window, at pixels of which the facets leave open what they show."""
-    surface, first = visible.projected.surface, visible.projected.first
-    rough, xy = surface.tops, visible.projected.xy
-    nearest = NearestTops.of(rough, xy, first, visible.disparity, visible.strips)
+    nearest = NearestTops.of(seen)
     disparity = nearest.disparity
-    is_open = np.isin(visible.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
+    is_open = np.isin(seen.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
     # what facets show has labels already, as far as it is certain
     with np.errstate(invalid="ignore"):
         labelled = is_open & nearest.in_front()
-        labelled &= ~(np.abs(disparity - visible.disparity) <= FACET_RESIDUAL_PX)
+        labelled &= ~(np.abs(disparity - seen.disparity) <= FACET_RESIDUAL_PX)
     spacing_rows = int(np.ceil(scale.spacing_px))
     labelled &= _clearance(disparity, nearest.highest, spacing_rows) >= CLEARANCE_PX
-    labelled &= ~_hidden_in_right(visible, rough, xy, labelled, disparity)
-
-    facets = vertices_of_tops(surface.vertices, rough, xy)
-    values = nearest.values(labelled, facets, first)
-    variance = nearest.variance(labelled, rough, scale)
+    labelled &= ~_hidden_in_right(seen.projected, labelled, disparity)
+    values = nearest.values(labelled, seen.projected)
+    variance = nearest.variance(labelled, seen.projected.surface.tops, scale)
     labelled &= values.surface_class != WATER_CLASS
     labels = Labels(disparity, values.slope, variance)
     of_pixels = values.height * LATTICE_M, values.surface_class, values.day
@@ -212,7 +195,7 @@ def crowns(visible: VisibleSurface, scale: PixelScale) -> Crowns:
 
 
 def without_contours(
-    labels: WindowLabels, crowns: Crowns, visible: VisibleSurface, scale: PixelScale
+    labels: WindowLabels, crowns: Crowns, seen: SeenSurface, scale: PixelScale
 ) -> WindowLabels:
     """Labels of facets, without those that the contour of a crown may hide from the right camera.
 
@@ -220,7 +203,7 @@ def without_contours(
     hidden, or may be, is uncertain itself where a crown comes nearer than the diagonal of a
     spacing in the right image.
     """
-    hidden = np.isin(visible.visibility, (PRISM_IN_RIGHT, FACET_IN_RIGHT))
+    hidden = np.isin(seen.visibility, (PRISM_IN_RIGHT, FACET_IN_RIGHT))
     beside = np.zeros_like(hidden)
     beside[:, :-1] = hidden[:, 1:]
     reach = int(scale.spacing_px)
@@ -232,21 +215,17 @@ def without_contours(
     return replace(labels, status=status)
 
 
-def _hidden_in_right(
-    visible: VisibleSurface, rough: RoughTops, xy: Floats, labelled: Bools, disparity: Floats
-) -> Bools:
-    """Which pixels ``labelled`` [h, w] a facet, a triangle of the tops at ``xy``, or a strip
-    between known surfaces hides from the right camera."""
+def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Floats) -> Bools:
+    """Which pixels ``labelled`` [h, w] a facet, a triangle of the tops, or a strip between known
+    surfaces hides from the right camera."""
     out = np.zeros(labelled.shape, np.bool_)
     row, col = np.nonzero(labelled)
-    if row.size == 0:
-        return out
-    projected = visible.projected
-    order, pixels = right_pixels(row, col, disparity[row, col], projected.first)
-    hidden = projected.hidden_by_facets(pixels)
-    hidden |= projected.hidden_by_prisms(projected.surface.strips, pixels)
-    hidden |= hidden_by(xy, rough.corner, pixels)
-    out[row[order], col[order]] = hidden
+    if row.size:
+        surface = projected.surface
+        pixels = right_pixels(row, col, disparity[row, col], projected.first)
+        corner = np.concatenate([surface.facet, surface.tops.corner])
+        hidden = projected.hidden_by_facets(corner, pixels)
+        out[row, col] = hidden | projected.hidden_by_prisms(surface.strips, pixels)
     return out
 
 

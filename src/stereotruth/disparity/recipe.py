@@ -8,7 +8,8 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
    triangles that are undecided (:mod:`stereotruth.surface.surface`). Those are taken that the
    window may see (:mod:`.ground_in_view`).
 3. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
-   and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
+   and each pixel's position in the right image is tested against them
+   (:mod:`stereotruth.surface.raster`). A pixel
    has the label of its nearest facet if nothing may hide it in either view; if its own points are
    the surer ones, theirs (:mod:`.facet_labels`). Rough surfaces, of which no triangle is a facet,
    get labels of their own (:mod:`.crowns`).
@@ -30,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_noise import EQUAL
+from ..surface.raster import ProjectedSurface
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
@@ -43,7 +45,6 @@ from .pixel_labels import OwnPoints, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
 from .status import Status
-from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
 
 
@@ -99,13 +100,13 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     # visibility in both views; less than two spacings around a hidden point are searched for what
     # covers it, so that sparse points are seen through
     projected = ProjectedSurface.of(surface, projection, first)
-    visible = visible_surface(projected, shape, scale.px_per_m)
+    seen = projected.seen(shape, scale.px_per_m).from_both_cameras()
     see_through = scale.spacing_px > MAX_COVER_PX / 2.0
-    labels = facet_labels(visible, own, window, see_through)
+    labels = facet_labels(seen, own, window, see_through)
 
     # rough surfaces
-    rough = crowns(visible, scale)
-    labels = without_contours(labels, rough, visible, scale)
+    rough = crowns(seen, scale)
+    labels = without_contours(labels, rough, seen, scale)
     rough = replace(rough, visible=rough.visible & ~own.on_edge)
     return LidarLabels(labels, rough, own.points, window)
 

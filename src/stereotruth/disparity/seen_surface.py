@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.one_surface import SURFACE_PX
 from ..kernels import inlined, inner, kernel
+from ..numerics.box_max import box_max
 from .pixel_points import PX, PixelPoints
 
 Ints = NDArray[np.int64]
@@ -342,22 +343,6 @@ def box_sum(values: NDArray) -> NDArray:
     padded = np.pad(values, 1)
     rows, cols = values.shape
     return sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
-
-
-def box_max(values: NDArray, reach: int) -> NDArray:
-    """Maximum over squares of 2 * reach + 1 px, cut off at the edges."""
-    size = 2 * reach + 1
-    for axis in (0, 1):
-        # what is repeated beyond an edge lies in the same squares as the edge
-        pad = [(reach, reach) if a == axis else (0, 0) for a in (0, 1)]
-        out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)
-        width = 1
-        while width < size:
-            step = min(width, size - width)
-            out = np.maximum(out[:-step], out[step:])
-            width += step
-        values = np.moveaxis(out, 0, axis)
-    return np.ascontiguousarray(values)
 
 
 def seen_surface(

@@ -10,7 +10,7 @@ from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels, OwnLabels, OwnPoints
 from stereotruth.disparity.status import Status
-from stereotruth.disparity.visibility import VISIBLE, VisibleSurface
+from stereotruth.surface.raster import VISIBLE, SeenSurface
 
 
 @pytest.mark.parametrize("see_through", [True, False])
@@ -18,8 +18,9 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
     """A roof over sparse ground points: these are hidden by it, those before it are not."""
     shape = (8, 8)
     level, zeros = np.full(shape, 10.0), np.zeros(shape)
-    visible = VisibleSurface(
+    visible = SeenSurface(
         visibility=np.full(shape, VISIBLE, np.uint8),
+        plane=level,
         disparity=level,
         slope=np.zeros((2, *shape)),
         variance=zeros,
