@@ -93,7 +93,6 @@ BOUNDS = {  # part of a profile: what its time goes into
     "zarr": "LZ4 and three copies in Zarr",
     "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
-    "seen_surface": "scattered updates of the surface",
     "vertices": "scattered updates of the cells",
     "delaunay": "exact tests and cache misses, a vertex at a time",
     "facets": "passes over all triangles: memory",

@@ -24,6 +24,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..epipolar.one_surface import SURFACE_PX
 from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
 from ..numerics.triangles import plane_slopes, row_span
@@ -470,3 +471,19 @@ class SeenSurface:
         turned = (visibility == VISIBLE) & (1.0 - self.slope[0] < LEAST_FACET_WIDTH)
         visibility[turned] = FACET_IN_RIGHT
         return replace(self, visibility=visibility)
+
+    def near_edge(self, reach_px: float) -> Bools:
+        """Whether something else than a pixel's surface shows, or may, ``reach_px`` off its centre
+        in one of eight directions; False where no facet is seen."""
+        out = np.zeros(self.plane.shape, np.bool_)
+        projected, surface = self.projected, self.projected.surface
+        for angle in np.arange(8) * np.pi / 4:
+            x, y = reach_px * np.cos(angle), reach_px * np.sin(angle)
+            moved = replace(projected, xy=projected.xy - np.array([[x], [y]] * 2))
+            there, _ = moved.raster(surface.facet, out.shape)
+            moved.raise_to_prisms(slice(None), there)
+            with np.errstate(invalid="ignore"):
+                out |= (
+                    np.abs(there - self.plane - self.slope[0] * x - self.slope[1] * y) > SURFACE_PX
+                )
+        return out & (self.visibility != NO_FACET)
