@@ -57,7 +57,7 @@ CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
 # Nor if fewer of the 3 x 3 pixels around it have labels: what stands alone lies beside a contour.
 # (Steep forest, 4 and 1 points/m²: 0.2 and 0.5 % fewer visible pixels, hidden ones 0.90 for 1.09 %
 # and 1.32 for 1.88 %, and of the labels 0.19 for 0.22 % and 0.64 for 0.83 % off by more than 1 px.)
-FEWEST_AROUND = 5
+LABELS_AROUND = 5
 CROWN_REACH_PX = BESIDE_PX + 2  # pixels around one that its label follows from
 # Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
 # the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
@@ -179,8 +179,9 @@ class NearestTops:
         return out
 
 
-def crowns(seen: SeenSurface, scale: PixelScale) -> Crowns:
-    """The rough surfaces of a window, at pixels of which the facets leave open what they show."""
+def crowns(seen: SeenSurface, scale: PixelScale, edge_margin_px: float) -> Crowns:
+    """The rough surfaces of a window, at pixels of which the facets leave open what they show;
+    none whose centre lies nearer than ``edge_margin_px`` to another surface."""
     nearest = NearestTops.of(seen)
     disparity = nearest.disparity
     is_open = np.isin(seen.visibility, (PRISM_IN_LEFT, PRISM_IN_RIGHT))
@@ -194,6 +195,11 @@ def crowns(seen: SeenSurface, scale: PixelScale) -> Crowns:
     values = nearest.values(labelled, seen.projected)
     variance = nearest.variance(labelled, seen.projected.surface.tops, scale)
     labelled &= values.surface_class != WATER_CLASS
+    if edge_margin_px > 0.0:
+        surface = seen.projected.surface
+        corner = np.concatenate([surface.facet, surface.tops.corner])
+        known = np.where(labelled, disparity, np.nan), values.slope
+        labelled &= ~seen.projected.near_edge(*known, edge_margin_px, corner, surface.strips)
     labels = Labels(disparity, values.slope, variance)
     of_pixels = values.height * LATTICE_M, values.surface_class, values.day
     return Crowns(labelled, labels, *of_pixels, nearest.tops)
@@ -259,7 +265,7 @@ def with_crowns(labels: WindowLabels, crowns: Crowns, window: PairWindow) -> Win
     new = np.zeros(labels.status.shape, np.bool_)
     new[row[inside], col[inside]] = True
     around = window_sums(np.pad(new | is_labelled(labels.status), 1), 3)
-    new &= around >= FEWEST_AROUND
+    new &= around >= LABELS_AROUND
     of_crowns, others = crowns.labels, labels.labels
     return replace(
         labels,

@@ -51,7 +51,9 @@ def facet_labels(
         edge |= is_dense & (own.passed | (lift < -FACET_RESIDUAL_PX))
         surer = measured & (own.labels.variance <= seen.variance) & ~seen.bulging
     if edge_margin_px > 0.0:
-        edge |= seen.near_edge(edge_margin_px)
+        projected = seen.projected
+        all_of_it = projected.surface.facet, slice(None)
+        edge |= projected.near_edge(seen.disparity, seen.slope, edge_margin_px, *all_of_it)
     between = status == Status.LABELLED_BETWEEN
     status[between & edge] = Status.EDGE_IN_PIXEL
     measured &= between & ~edge

@@ -93,7 +93,7 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     labels = facet_labels(seen, own, window, scale, scene.edge_margin_px)
 
     # rough surfaces
-    rough = crowns(seen, scale)
+    rough = crowns(seen, scale, scene.edge_margin_px)
     labels = without_contours(labels, rough, seen, scale)
     return LidarLabels(labels, rough, own.points, window)
 

@@ -404,6 +404,21 @@ class ProjectedSurface:
         corner, heights = surface.undecided[undecided], surface.height_range[undecided]
         return _Prisms(corner, heights, self.xy, self.rise, surface.vertices.h_q)
 
+    def near_edge(
+        self, disparity: Floats, slope: Floats, reach_px: float, corner: Steps, undecided: slice
+    ) -> Bools:
+        """Whether triangles ``corner`` or prisms show another surface than one of a ``disparity``
+        [h, w] and ``slope`` [2, h, w] at a pixel's centre, or none, ``reach_px`` off in one of
+        eight directions; False where the disparity is NaN."""
+        out = np.zeros(disparity.shape, np.bool_)
+        for angle in np.arange(8) * np.pi / 4:
+            x, y = reach_px * np.cos(angle), reach_px * np.sin(angle)
+            moved = replace(self, xy=self.xy - np.array([[x], [y]] * 2))
+            there, _ = moved.raster(corner, disparity.shape)
+            moved.raise_to_prisms(undecided, there)
+            out |= np.abs(there - disparity - slope[0] * x - slope[1] * y) > SURFACE_PX
+        return out
+
     def seen(self, shape: tuple[int, int], px_per_m: float) -> SeenSurface:
         """What the pixels of a window of ``shape`` (rows, cols) see in the left image;
         ``px_per_m``: disparity of a metre of height."""
@@ -471,19 +486,3 @@ class SeenSurface:
         turned = (visibility == VISIBLE) & (1.0 - self.slope[0] < LEAST_FACET_WIDTH)
         visibility[turned] = FACET_IN_RIGHT
         return replace(self, visibility=visibility)
-
-    def near_edge(self, reach_px: float) -> Bools:
-        """Whether something else than a pixel's surface shows, or may, ``reach_px`` off its centre
-        in one of eight directions; False where no facet is seen."""
-        out = np.zeros(self.plane.shape, np.bool_)
-        projected, surface = self.projected, self.projected.surface
-        for angle in np.arange(8) * np.pi / 4:
-            x, y = reach_px * np.cos(angle), reach_px * np.sin(angle)
-            moved = replace(projected, xy=projected.xy - np.array([[x], [y]] * 2))
-            there, _ = moved.raster(surface.facet, out.shape)
-            moved.raise_to_prisms(slice(None), there)
-            with np.errstate(invalid="ignore"):
-                out |= (
-                    np.abs(there - self.plane - self.slope[0] * x - self.slope[1] * y) > SURFACE_PX
-                )
-        return out & (self.visibility != NO_FACET)

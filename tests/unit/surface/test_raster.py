@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from stereotruth.lidar.lattice import LATTICE_M
 from stereotruth.surface.raster import (
     FACET_IN_RIGHT,
-    NO_FACET,
     OCCLUSION_TOLERANCE_PX,
     PRISM_IN_LEFT,
     PRISM_IN_RIGHT,
@@ -124,8 +121,5 @@ def test_an_edge_is_near_as_far_as_asked() -> None:
     corners = (np.minimum(np.abs(x - 4), np.abs(x - 14)) < 1) & (
         np.minimum(np.abs(y - 8), np.abs(y - 18)) < 1
     )
-    near = seen.near_edge(0.5)
+    near = seen.projected.near_edge(seen.disparity, seen.slope, 0.5, surface.facet, slice(None))
     assert near.any() and np.array_equal(near[~corners], (expected & (y < 25))[~corners])
-    assert (
-        not replace(seen, visibility=np.full_like(seen.visibility, NO_FACET)).near_edge(0.5).any()
-    )
