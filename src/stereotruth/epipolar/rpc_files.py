@@ -11,7 +11,7 @@ from rasterio.errors import RasterioError
 
 from ..errors import InputError
 from ..products.ungeoreferenced import open_raster
-from .decimal_numbers import decimal_number
+from ..tables import decimal_number
 from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")

@@ -221,13 +221,13 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
     key is honoured here.
     """
-    from .geokeys import epoch_in, wkt_of_geokeys  # GDAL, which few files need
+    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
 
     keys = shorts[4:].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
     keys = keys[np.argsort(keys[:, 0], kind="stable")]
     shorts = np.concatenate([[1, 1, 0, len(keys)], keys.ravel()])
-    wkt = wkt_of_geokeys(shorts, doubles, text)
+    wkt, epoch = wkt_of_geokeys(shorts, doubles, text)
     if not wkt:
         return None
     meaning = interpret(CRS.from_wkt(wkt))
@@ -241,7 +241,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
-    return replace(meaning, epoch=epoch_in(shorts, doubles))
+    return replace(meaning, epoch=epoch)
 
 
 def _wkt_text(data: bytes) -> str:

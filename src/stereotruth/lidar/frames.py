@@ -38,6 +38,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
+from ..numerics.degrees import turn
 from .plate_motion import moved, plate_at, speed
 
 Floats = NDArray[np.float64]
@@ -71,6 +72,9 @@ class Epochs(NamedTuple):
 
     images: Epoch
     own: float | None = None
+
+
+DEFAULT_EPOCHS = Epochs(DEFAULT_EPOCH)
 
 
 class Realisation(NamedTuple):
@@ -161,6 +165,18 @@ class FrameChange:
         for step in self._steps:
             lon, lat, height = step(lon, lat, height)
         return lon, lat, height
+
+    def inverse(self, lon: Floats, lat: Floats, height: Floats) -> Place:
+        """Of places in ITRF2020, those in the frame; to a micrometre.
+
+        A change moves places of a region by metres that are the same to 1e-6, so that what it does
+        to a place that is nearly right is known.
+        """
+        place = lon, lat, height
+        for _ in range(3):
+            off = [b - a for a, b in zip(self(*place), (lon, lat, height))]
+            place = place[0] + turn(off[0]), place[1] + off[1], place[2] + off[2]
+        return place
 
     def describe(self) -> dict[str, Any]:
         """Record for the attributes of a product."""
@@ -287,20 +303,6 @@ def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
     return _Way((*before, best), known.epoch, dynamic, known.spread_m, notes)
 
 
-def is_known(system: CRS) -> bool:
-    """Whether coordinates of a system get to ITRF2020 otherwise than by WGS 84."""
-    geodetic = system.geodetic_crs
-    datum = None if geodetic is None else datum_code(geodetic)
-    if datum is None or datum == WGS84_ENSEMBLE:
-        return False
-    if datum in REALISATIONS:
-        return True
-    area = system.area_of_use or geodetic.area_of_use
-    east = area.east + 360 * (area.east < area.west) if area else 0.0
-    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else None
-    return _way(datum, middle) is not None
-
-
 def _words(operation: pyproj.Transformer) -> str:
     """What an operation does, without what is no more than another form of coordinates."""
     parts = operation.description.split(" + ")
@@ -325,8 +327,8 @@ def _refuse_without_epoch(
         raise InputError(
             f"coordinates in {name} move by {1000 * m_a:.0f} mm a year here, and nothing states "
             "their epoch",
-            remedy="set lidar_epoch of the scene to the epoch of the coordinates, as 2016.4 or "
-            "2016-05-27",
+            remedy="state it, as 2016.4 or 2016-05-27: lidar_epoch of the scene, '# epoch:' above "
+            "control points (gcps import: --epoch), gdal_edit.py -a_coord_epoch of a raster",
         )
 
 
@@ -370,7 +372,7 @@ def frame_change(
             f"coordinates in {name} at {own:g}, where no plate's motion is known that would bring "
             f"them to {goal:.2f}, the date of the images",
             remedy="transform the points to ITRF2020 at that date by the country's own service, "
-            "and set lidar_epoch to it",
+            "and state that date as their epoch",
         )
     steps: list[Callable[[Floats, Floats, Floats], Place]] = []
     legs = []

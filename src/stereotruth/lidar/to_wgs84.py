@@ -62,7 +62,9 @@ class ToWGS84:
     ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
     ``heights`` what was done with the heights, ``notes`` are remarks for the user. ``area``: box of
     longitude and latitude that the operation was chosen for. ``frame``: record of the frame and the
-    epoch of the result and of the file, None if no epoch is wanted.
+    epoch of the result and of the file, None if no epoch is wanted. ``change``: from the file's
+    frame to ITRF2020, None where PROJ's way to WGS 84 is taken. ``exact``: lon, lat (degrees) and
+    height (m) of coordinates x, y and heights in m above the ellipsoid, without polynomials.
     """
 
     system: LidarCRS
@@ -72,6 +74,9 @@ class ToWGS84:
     notes: tuple[str, ...]
     area: tuple[float, float, float, float] | None
     frame: dict[str, object] | None
+    change: FrameChange | None = field(repr=False)
+    exact: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
+    _to_geodetic: pyproj.Transformer = field(repr=False)
     _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
@@ -94,27 +99,22 @@ class ToWGS84:
             height[good] = base[good] + self._geoid(lon[good], lat[good])
         return lon, lat, height
 
-    @property
-    def _exact(self) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """PROJ's own, without polynomials."""
-        transform = self._transform
-        return transform.exact if isinstance(transform, PatchedTransform) else transform
-
     def inverse(self, lon: np.ndarray, lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none.
+        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none."""
+        height = np.zeros(np.shape(lon))
+        if self.change is not None:
+            lon, lat, height = self.change.inverse(lon, lat, height)
+        return self._to_geodetic.transform(lon, lat, height, direction="INVERSE")[:2]
 
-        Of transformations without epochs.
+    def height_shift_m(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        """What an ellipsoidal height of the result is above the file's, m [n], at places [n].
+
+        The undulation of the geoid, and what the change of frame or datum lifts.
         """
-        return self._exact(lon, lat, np.zeros(np.shape(lon)), direction="INVERSE")[:2]
-
-    @property
-    def is_orthometric(self) -> bool:
-        """Whether heights of the file count from a geoid."""
-        return self._geoid is not None
-
-    def undulation(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray | float:
-        """What an ellipsoidal height is above one of the file, m; 0 without a geoid."""
-        return 0.0 if self._geoid is None else self._geoid(lon, lat)
+        shift = np.zeros(np.shape(lon))
+        if self._geoid is None or self._heights_follow_datum:
+            shift = self.exact(*self.inverse(lon, lat), shift)[2]
+        return shift if self._geoid is None else shift + self._geoid(lon, lat)
 
     def ground_boxes(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """West, south, east, north (degrees) [n, 4] around boxes of corners [n, 2 or more].
@@ -123,9 +123,10 @@ class ToWGS84:
         BOX_SLACK of it. NaN where PROJ cannot transform a box.
         """
         share = np.linspace(0.0, 1.0, BOX_SAMPLES)
-        ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
-        x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
-        lon, lat, _ = self._exact(x, y, np.zeros(x.size))
+        across, up = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
+        nodes = np.broadcast_arrays(across[:, :, None], up[:, None, :])
+        x, y = (np.ascontiguousarray(v).reshape(-1) for v in nodes)
+        lon, lat, _ = self.exact(x, y, np.zeros(x.size))
         lon = continuous(lon)
         places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
         places[~np.isfinite(places)] = np.nan
@@ -146,11 +147,6 @@ class ToWGS84:
             "frame": self.frame,
             "geoid": None if self._geoid is None else self._geoid.path.name,
         }
-
-
-def _crossed(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places [n, k, 1] and [n, 1, k] of values [n, k] along both axes."""
-    return x[:, :, None], y[:, None, :]
 
 
 def _best_operation(
@@ -187,11 +183,6 @@ def _best_operation(
             "its geodetic coordinates are taken as WGS 84 (accuracy unknown)"
         )
     return best, notes
-
-
-def _in_frame(horizontal: CRS, geographic: CRS) -> pyproj.Transformer:
-    """From a system to longitude, latitude and height on its own datum, exact and unambiguous."""
-    return pyproj.Transformer.from_crs(_source(horizontal).to_3d(), geographic, always_xy=True)
 
 
 def _change_of_frame(
@@ -337,7 +328,6 @@ def transformation(
     *,
     geoid: str | Path | None = None,
     epochs: Epochs | None = None,
-    keep_frame: bool = False,
     notes: Sequence[str] = (),
 ) -> ToWGS84:
     """The transformation of coordinates of a system, as LiDAR, rasters and control points need it.
@@ -345,8 +335,7 @@ def transformation(
     ``extent``: lowest and highest coordinates [2, 2 or more]; ``geoid``: path of a grid for
     orthometric heights; ``epochs``: that of the images, at which coordinates are brought to
     ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
-    takes them for, most of them WGS 84; ``keep_frame``: the result is in the system's own frame;
-    ``notes``: remarks that go before others.
+    takes them for, most of them WGS 84; ``notes``: remarks that go before others.
 
     Raises InputError: a system that PROJ cannot transform, orthometric heights without a geoid, a
     dynamic frame without an epoch.
@@ -361,13 +350,11 @@ def transformation(
     try:
         area = area_of(system.horizontal, extent)
         change = _change_of_frame(system.horizontal, extent, epochs)
-        if keep_frame:
-            geographic = _source(system.horizontal).geodetic_crs.to_3d()
-            transformer, remarks = _in_frame(system.horizontal, geographic), []
-        elif change is None:
+        if change is None:
             transformer, remarks = _best_operation(system.horizontal, area)
         else:
-            transformer = _in_frame(system.horizontal, change.geographic)
+            source = _source(system.horizontal).to_3d()
+            transformer = pyproj.Transformer.from_crs(source, change.geographic, always_xy=True)
             remarks = list(change.notes)
     except InputError as error:
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
@@ -378,17 +365,16 @@ def transformation(
             remedy="name a system that PROJ can transform (lidar_crs, --crs), or transform the "
             "file",
         ) from error
-    transform, operation = transformer.transform, transformer.description
+    exact, operation = transformer.transform, transformer.description
     accuracy = frame = None
     if transformer.accuracy >= 0:
         accuracy = float(transformer.accuracy)
     if epochs is not None and change is None:
         frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
     if change is not None:
-        transform = _after(transform, change)
+        exact = _after(exact, change)
         operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
-    if system.horizontal.is_projected:
-        transform = PatchedTransform(transform, system.horizontal_unit_m)
+    is_map = system.horizontal.is_projected
     grid = None
     if geoid:
         from .geoid import GeoidGrid  # GDAL, which few scenes need
@@ -408,11 +394,14 @@ def transformation(
         notes=tuple(notes + remarks),
         area=area,
         frame=frame,
-        _transform=transform,
+        change=change,
+        exact=exact,
+        _to_geodetic=transformer,
+        _transform=PatchedTransform(exact, system.horizontal_unit_m) if is_map else exact,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.
-        _heights_follow_datum=modern and not keep_frame and not (grid and grid.above_wgs84),
+        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
     )
 
 

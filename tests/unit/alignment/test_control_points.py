@@ -37,8 +37,8 @@ def test_files_of_spreadsheets_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "the file is empty"),
-        ("id;lon;lat;height;left_col;left_row;right_col;right_row\n", "not separated by commas"),
+        ("", "it is empty"),
+        ("id;lon;lat;height;left_col;left_row;right_col;right_row\n", "separated by commas"),
         ("id,lon,lat,height,left_col,left_row,right_col\n", "'right_row' is missing"),
         (",".join(COLUMNS) + ",note\n", "'note' is unknown"),
         (",".join(COLUMNS) + "\nA,1,2,3,4,5,6\n", "line 2 has 7 cells for 8 columns"),
