@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-import struct
 
+import geopandas
 import numpy as np
 import pyproj
 import pytest
+import shapely
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.catalogue import read_catalogue, resolved
-from stereotruth.lidar.catalogue_ground import cover_of
+from stereotruth.lidar.catalogue import Tile, cover_of, read_catalogue, resolved
 from stereotruth.lidar.catalogue_list import (
     ListedTile,
     TileList,
@@ -24,7 +23,6 @@ from stereotruth.lidar.catalogue_list import (
     unlisted_m2,
     write_list,
 )
-from stereotruth.lidar.catalogue_tiles import Tile
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.products import remote_files
 from stereotruth.products.remote_files import hosts_of, url_of
@@ -85,7 +83,7 @@ def test_stac_items_have_location_outline_dates_and_points(tmp_path):
     assert [tile.href for tile in tiles] == ["./tile_0.copc.laz", "./tile_1.copc.laz"]
     assert [tile.points for tile in tiles] == [1000, 1001]
     assert tiles[0].start == tiles[0].end == "2021-05-02"  # of UTC
-    assert np.allclose(tiles[1].box, [WEST + SIDE, SOUTH, WEST + 2 * SIDE, SOUTH + SIDE])
+    assert np.allclose(tiles[1].outline.bounds, [WEST + SIDE, SOUTH, WEST + 2 * SIDE, SOUTH + SIDE])
 
 
 def test_one_item_is_a_catalogue_and_the_day_of_a_vpc_is_that_of_writing(tmp_path):
@@ -103,7 +101,7 @@ def test_the_tiles_own_coordinates_come_before_degrees(tmp_path):
     tile = read_catalogue(written(tmp_path, collection([item(0, **properties)]))).tiles[0]
     x, y = np.meshgrid(np.linspace(900_000, 901_000, 9), np.linspace(6_200_000, 6_201_000, 9))
     lon, lat = change.transform(x, y)
-    assert np.allclose(tile.box, [lon.min(), lat.min(), lon.max(), lat.max()], atol=1e-7)
+    assert np.allclose(tile.outline.bounds, [lon.min(), lat.min(), lon.max(), lat.max()], atol=1e-7)
     assert pyproj.CRS(tile.crs).to_epsg() == 2154
 
 
@@ -133,7 +131,6 @@ def test_a_box_across_the_antimeridian_covers_nothing_but_itself(tmp_path):
     """Its west is east of its east (RFC 7946, section 5.2)."""
     one = item(0) | {"geometry": None, "bbox": [179.99, -17.0, -179.99, -16.9]}
     tile = read_catalogue(written(tmp_path, collection([one]))).tiles[0]
-    assert len(tile.rings) == 2
     far, near = around(5.0, -16.96, 5.01, -16.95), around(179.992, -16.96, 179.993, -16.95)
     assert cover_of([tile], far).hole_m2 == pytest.approx(far.area_m2)
     assert cover_of([tile], near).taken == (0,) and cover_of([tile], near).hole_m2 == 0
@@ -158,37 +155,17 @@ def test_an_index_in_another_system_is_brought_to_degrees(tmp_path):
     ring = [list(change.transform(*corner)) for corner in square(0)]
     made["features"][0]["geometry"]["coordinates"] = [ring]
     tile = read_catalogue(written(tmp_path, made)).tiles[0]
-    assert np.allclose(tile.box, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
+    assert np.allclose(tile.outline.bounds, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
 
 
-def geopackage(file, rings, srs=4326, hrefs=None):
-    """A GeoPackage of one layer of polygons, by hand."""
-    base = sqlite3.connect(file)
-    base.executescript(
-        "CREATE TABLE gpkg_geometry_columns (table_name, column_name, kind, srs_id, z, m);"
-        "CREATE TABLE gpkg_spatial_ref_sys (srs_name, srs_id, organization, "
-        "organization_coordsys_id, definition);"
-        'CREATE TABLE "my ""tiles" (fid INTEGER PRIMARY KEY, geom BLOB, name TEXT, location TEXT);'
-    )
-    base.execute(
-        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'POLYGON', ?, 0, 0)",
-        ('my "tiles', srs),
-    )
-    base.execute("INSERT INTO gpkg_spatial_ref_sys VALUES ('x', ?, 'EPSG', ?, '')", (srs, srs))
-    for k, ring in enumerate(rings):
-        flat = np.array(ring, "<f8")
-        wkb = struct.pack("<BIII", 1, 3, 1, len(flat)) + flat.tobytes()
-        if k % 2:  # as several polygons, and with an envelope
-            box = [*flat.min(axis=0), *flat.max(axis=0)]
-            envelope = struct.pack("<4d", box[0], box[2], box[1], box[3])
-            head = b"GP\0\3" + struct.pack("<i", srs) + envelope
-            blob = head + struct.pack("<BII", 1, 6, 1) + wkb
-        else:
-            blob = b"GP\0\1" + struct.pack("<i", srs) + wkb
-        href = hrefs[k] if hrefs else f"t{k}.laz"
-        base.execute('INSERT INTO "my ""tiles" VALUES (NULL, ?, ?, ?)', (blob, f"T{k}", href))
-    base.commit()
-    base.close()
+def geopackage(file, rings, srs=4326, layer="my tiles"):
+    """A GeoPackage of one layer: polygons, and several polygons in one."""
+    outlines = [shapely.Polygon(ring) for ring in rings]
+    outlines = [shapely.multipolygons([one]) if k % 2 else one for k, one in enumerate(outlines)]
+    columns = {"name": [f"T{k}" for k in range(len(rings))],
+               "location": [f"t{k}.laz" for k in range(len(rings))]}  # fmt: skip
+    table = geopandas.GeoDataFrame(columns, geometry=outlines, crs=srs)
+    table.to_file(file, layer=layer, driver="GPKG")
     return str(file)
 
 
@@ -197,14 +174,14 @@ def test_a_geopackage_is_read(tmp_path):
     tiles = read_catalogue(file).tiles
     assert [tile.href for tile in tiles] == ["t0.laz", "t1.laz"]
     for k, tile in enumerate(tiles):
-        assert np.allclose(tile.box[0], WEST + k * SIDE)
+        assert np.allclose(tile.outline.bounds[0], WEST + k * SIDE)
 
 
 def test_a_geopackage_in_metres_is_brought_to_degrees(tmp_path):
     change = pyproj.Transformer.from_crs(4326, 2154, always_xy=True)
     ring = [change.transform(*corner) for corner in square(0)]
     tile = read_catalogue(geopackage(tmp_path / "a.gpkg", [ring], 2154)).tiles[0]
-    assert np.allclose(tile.box, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
+    assert np.allclose(tile.outline.bounds, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
 
 
 DAMAGED = {
@@ -253,7 +230,7 @@ DAMAGED = {
 def test_own_coordinates_without_end_leave_those_in_degrees(tmp_path, far):
     one = item(0, **{"proj:code": "EPSG:2154", "proj:bbox": [-far, -far, far, far]})
     (tile,) = read_catalogue(written(tmp_path, collection([one]))).tiles
-    assert tile.box == (WEST, SOUTH, WEST + SIDE, SOUTH + SIDE)
+    assert tile.outline.bounds == (WEST, SOUTH, WEST + SIDE, SOUTH + SIDE)
 
 
 @pytest.mark.parametrize("fault", DAMAGED)
@@ -363,7 +340,7 @@ def around(west, south, east, north):
 
 
 def tile(ring, href="a.laz"):
-    return Tile(href, (np.array(ring, np.float64).T,))
+    return Tile(href, shapely.Polygon(ring))
 
 
 def test_the_tiles_that_touch_the_footprint_are_taken():
@@ -411,10 +388,9 @@ def test_ground_that_no_tile_covers_is_named_with_its_area():
 
 def test_a_hole_in_an_outline_is_a_hole():
     outer, inner = square(0, 0, 3 * SIDE), square(1, 1)
-    ring = [np.array(r, np.float64).T for r in (outer, inner)]
     footprint = around(WEST + SIDE / 2, SOUTH + SIDE / 2, WEST + 2.5 * SIDE, SOUTH + 2.5 * SIDE)
-    assert cover_of([Tile("a.laz", tuple(ring))], footprint).hole_m2 > 0
-    assert cover_of([Tile("a.laz", (ring[0],))], footprint).hole_m2 == 0
+    assert cover_of([Tile("a.laz", shapely.Polygon(outer, [inner]))], footprint).hole_m2 > 0
+    assert cover_of([tile(outer)], footprint).hole_m2 == 0
 
 
 def test_doubled_tiles_are_named():
