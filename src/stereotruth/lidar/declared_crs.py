@@ -106,6 +106,21 @@ def _source(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+def degrees_of(horizontal: CRS, x: Any, y: Any) -> tuple[Any, Any] | None:
+    """Longitude and latitude of coordinates of a system on its own datum, inf where there is none.
+
+    None of a system without a datum, or of a damaged one.
+    """
+    source = _source(horizontal)
+    if source.geodetic_crs is None:
+        return None
+    try:
+        change = pyproj.Transformer.from_crs(source, source.geodetic_crs.to_2d(), always_xy=True)
+    except ProjError:
+        return None
+    return change.transform(x, y)
+
+
 DEPTHS = "they are depths"  # of a system whose vertical axis points down
 
 
@@ -323,21 +338,12 @@ def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
     """
     if one.equals(other, ignore_axis_order=True):
         return True
-    places = []
-    for crs in (one, other):
-        crs = _source(crs)
-        geographic = crs.geodetic_crs
-        if geographic is None:
-            return False
-        try:
-            degrees = pyproj.Transformer.from_crs(crs, geographic, always_xy=True)
-        except ProjError:  # of a damaged system
-            return False
-        lon, lat = degrees.transform(x, y)
-        places.append((lon, lat, geographic.ellipsoid.semi_major_metre))
-    difference = np.abs(np.subtract(*places))
-    same_datum = np.isfinite(difference).all() and difference[2] < 0.01
-    return bool(same_datum and max(difference[:2]) * DEGREE_M < 1e-3)
+    places = [degrees_of(crs, x, y) for crs in (one, other)]
+    if None in places:
+        return False
+    off_m = np.abs(np.subtract(*places)).max() * DEGREE_M
+    axes = [_source(crs).geodetic_crs.ellipsoid.semi_major_metre for crs in (one, other)]
+    return bool(off_m < 1e-3 and abs(axes[0] - axes[1]) < 0.01)  # nor NaN
 
 
 def resolve(

@@ -43,7 +43,7 @@ from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
 from ..numerics.degrees import continuous, turn
-from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
+from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .projection_polynomials import PatchedTransform
 
@@ -197,15 +197,11 @@ def _change_of_frame(
     geographic = _source(horizontal).geodetic_crs
     if epochs is None or geographic is None or not np.isfinite(stated[:, :2]).all():
         return None
-    area = area_of(horizontal, stated)
-    if area is not None:
+    if (area := area_of(horizontal, stated)) is not None:
         place = (area[0] + area[2]) / 2, (area[1] + area[3]) / 2
     else:
-        degrees = pyproj.Transformer.from_crs(
-            _source(horizontal), geographic.to_2d(), always_xy=True
-        )
-        place = degrees.transform(*stated[:, :2].mean(axis=0))
-        if not np.isfinite(place).all():
+        place = degrees_of(horizontal, *stated[:, :2].mean(axis=0))
+        if place is None or not np.isfinite(place).all():
             return None
     return frame_change(geographic, place, *epochs)
 
@@ -215,12 +211,10 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
 
     Whole ones, so that files of one scene have the same.
     """
-    geographic = _source(horizontal).geodetic_crs
-    if geographic is None:
+    corners = degrees_of(horizontal, extent[[0, 0, 1, 1], 0], extent[[0, 1, 0, 1], 1])
+    if corners is None:
         return None
-    x, y = extent[:, 0][[0, 0, 1, 1]], extent[:, 1][[0, 1, 0, 1]]
-    degrees = pyproj.Transformer.from_crs(_source(horizontal), geographic.to_2d(), always_xy=True)
-    lon, lat = degrees.transform(x, y)
+    lon, lat = corners
     if not (np.abs(lon).max() < 179 and np.abs(lat).max() < 89):  # no inf, no NaN either
         return None
     return (
@@ -255,17 +249,8 @@ def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
     from .geoid_candidates import grid_of  # for refusals alone
 
     text = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
-    geographic = _source(system.horizontal).geodetic_crs
-    if geographic is None:
-        return text
-    middle = extent[:, :2].mean(axis=0)
-    try:
-        degrees = pyproj.Transformer.from_crs(
-            _source(system.horizontal), geographic.to_2d(), always_xy=True
-        )
-    except ProjError:  # of a damaged system
-        return text
-    grid = grid_of(datum, *map(float, degrees.transform(*middle)))
+    place = degrees_of(system.horizontal, *extent[:, :2].mean(axis=0))
+    grid = None if place is None else grid_of(datum, *map(float, place))
     if grid is None:
         return text
     if grid.path is not None:
