@@ -88,7 +88,7 @@ def import_gcps(
         raise InputError("is there already", file=to, remedy="name another file, or remove it")
     kinds = {file.suffix.lower() for file in files}
     if kinds == {".points"}:
-        points, said, lines = from_qgis(files, crs)
+        points, said, lines = from_qgis(files, crs, epoch)
     elif kinds == {".gcp"} and len(files) == 1:
         points, said, lines = from_asp(files[0], crs, left, right)
     elif len(files) == 1:
@@ -242,7 +242,7 @@ QGIS = "save the points by QGIS: mapX,mapY,sourceX,sourceY,enable"
 
 
 def from_qgis(
-    files: Sequence[Path], crs: str = ""
+    files: Sequence[Path], crs: str = "", epoch: str = ""
 ) -> tuple[list[Point], dict[str, str], list[str]]:
     """Points of the georeferencer, one file a view; without a column id joined by their place.
 
@@ -257,13 +257,15 @@ def from_qgis(
     tables = [Table.read(file, QGIS) for file in files]
     views = [_qgis_view(table) for table in tables]
     every = [point for view in views for point in view]
-    systems = [_declared(table, crs)["crs"] for table in tables]
+    declared = [_declared(table, crs) for table in tables]
     placed = [
         point
-        for file, view, system in zip(files, views, systems)
-        for point in to_itrf(view, system, None, file, places_only=True)[0]
+        for file, view, said in zip(files, views, declared)
+        for point in to_itrf(
+            view, said["crs"], None, file, epoch or said["epoch"], places_only=True
+        )[0]
     ]
-    if len(set(systems)) > 1:
+    if declared[0]["crs"] != declared[1]["crs"]:
         raise InputError(
             "names another coordinate system than the other file",
             file=files[1],
@@ -290,7 +292,7 @@ def from_qgis(
     ]
     how = "their ids" if named else "their map coordinates"
     counts = f"{len(views[0])} points of {files[0].name}, {len(views[1])} of {files[1].name}"
-    return points, _declared(tables[0], crs), [f"{counts}, joined by {how}"]
+    return points, declared[0], [f"{counts}, joined by {how}"]
 
 
 def _same_place(at: dict, lon: float, lat: float) -> object:

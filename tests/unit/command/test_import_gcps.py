@@ -65,6 +65,19 @@ def qgis(path, rows, view, *, utm=True, ids=False, crs=True):
     return path
 
 
+def test_points_of_qgis_in_a_dynamic_frame_need_an_epoch(rows, tmp_path):
+    files = [qgis(tmp_path / f"{v}.points", rows, v, utm=False) for v in ("left", "right")]
+    for file in files:
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join(["# EPSG: 9000", *lines[1:]]))  # ITRF2014
+    given = {"heights": heights(tmp_path / "h.csv", rows, ("lon", "lat", "height"))}
+    with pytest.raises(InputError, match="nothing states their epoch"):
+        import_gcps(files, tmp_path / "out.csv", **given)
+    import_gcps(files, tmp_path / "out.csv", epoch="2010.5", **given)
+    assert (tmp_path / "out.csv").read_text().startswith("# frame: EPSG:9000\n# epoch: 2010.5\n")
+    assert len(read_gcps(tmp_path / "out.csv").ids) == 6
+
+
 def heights(path, rows, columns=("id", "height")):
     with path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, columns, extrasaction="ignore")
