@@ -95,7 +95,7 @@ class Lines:
             raise InputError(
                 "no such file", file=file, remedy="correct its path, or write it"
             ) from None
-        except (UnicodeDecodeError, OSError) as error:
+        except (UnicodeDecodeError, IsADirectoryError) as error:
             raise InputError(
                 f"cannot be read as text ({error})", file=file, remedy="save it as UTF-8 text"
             ) from None
