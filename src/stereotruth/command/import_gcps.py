@@ -19,7 +19,7 @@ from ..alignment.control_points import COLUMNS, read_gcps
 from ..errors import InputError
 from ..lidar.declared_crs import parse_crs
 from ..lidar.frames import WGS84_NAME, Epoch, Epochs
-from ..lidar.height_raster import HeightRaster
+from ..lidar.height_raster import Floats, HeightRaster
 from ..lidar.to_wgs84 import ToWGS84, check_area, transformation
 from ..numerics.degrees import metres_per_degree, turn
 from ..products.files import as_text
@@ -44,7 +44,6 @@ NAMES = {  # column: what others call it
 }
 
 
-_PLACE = ("x", "y", "height")
 NO_SYSTEM = "EPSG:4326"  # of degrees
 SYSTEM = ("crs", "wkt", "epsg", "frame")  # remarks that declare it, the first before others
 
@@ -105,9 +104,8 @@ def import_gcps(
         points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
     points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
-        lon, lat = (np.array([getattr(p, axis) for p in without]) for axis in "xy")
         surface = HeightRaster.open(raster, geoid, epochs=EPOCHS, whole=False)
-        found = dict(zip((p.id for p in without), surface.heights_at(lon, lat)))
+        found = dict(zip((p.id for p in without), surface.heights_at(*_places(without)[:2])))
         points = [replace(p, height=float(found.get(p.id, p.height))) for p in points]
         notes += [f"{raster.name}: {note}" for note in surface.to_wgs84.notes]
     points = _in_own_frame(points, transform)
@@ -146,7 +144,7 @@ def to_itrf(
     """
     if not points:
         return [], None, []
-    x, y, height = (np.array([getattr(p, name) for p in points]) for name in _PLACE)
+    x, y, height = _places(points)
     if not crs and ((np.abs(x) > 360).any() or (np.abs(y) > 90).any()):
         raise InputError(
             f"ground coordinates such as {x[0]:g}, {y[0]:g} are no degrees, and the file "
@@ -184,19 +182,27 @@ def to_itrf(
     if geoid is not None and not system.ellipsoidal:
         notes.append(f"heights brought to the ellipsoid by {geoid.name}")
     height = height if places_only else np.where(known, lifted, np.nan)
-    placed = np.stack([lon, lat, height], axis=1).tolist()
-    found = [replace(p, **dict(zip(_PLACE, place))) for p, place in zip(points, placed)]
-    return found, transform, [note for note in notes if note]
+    return _placed(points, lon, lat, height), transform, [note for note in notes if note]
+
+
+def _places(points: Sequence[Point]) -> Floats:
+    """x, y, height [3, n] of points."""
+    return np.array([(p.x, p.y, p.height) for p in points]).reshape(-1, 3).T
+
+
+def _placed(points: Sequence[Point], x: Floats, y: Floats, height: Floats) -> list[Point]:
+    """The points at other places."""
+    places = np.stack([x, y, height], axis=1).tolist()
+    return [replace(p, x=x, y=y, height=height) for p, (x, y, height) in zip(points, places)]
 
 
 def _in_own_frame(points: Sequence[Point], transform: ToWGS84 | None) -> list[Point]:
     """Points where they were before a change of frame; so what is written depends on no epoch."""
     if transform is None or transform.change is None:
         return list(points)
-    lon, lat, height = (np.array([getattr(p, name) for p in points]) for name in _PLACE)
+    lon, lat, height = _places(points)
     x, y, known = transform.change.inverse(lon, lat, np.nan_to_num(height))
-    back = np.stack([x, y, np.where(np.isnan(height), np.nan, known)], axis=1).tolist()
-    return [replace(p, **dict(zip(_PLACE, place))) for p, place in zip(points, back)]
+    return _placed(points, x, y, np.where(np.isnan(height), np.nan, known))
 
 
 def _name_of_frame(transform: ToWGS84 | None) -> str:

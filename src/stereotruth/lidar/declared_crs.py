@@ -259,10 +259,6 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     return replace(meaning, epoch=epoch)
 
 
-def _wkt_text(data: bytes) -> str:
-    return data.split(b"\0")[0].decode("utf-8", errors="replace").strip()
-
-
 def _held_against_code(meaning: LidarCRS, x: float, y: float) -> LidarCRS:
     """With a note if a system is another than that of the EPSG code which it names for itself."""
     identity = _source(meaning.horizontal).to_json_dict().get("id", {})
@@ -304,7 +300,8 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
                 found.append(meaning)
 
     def wkt() -> None:
-        if text := _wkt_text(records.get(2112, b"")):
+        data = records.get(2112, b"").split(b"\0")[0]
+        if text := data.decode("utf-8", errors="replace").strip():
             x, y = float(header.mins[0]), float(header.mins[1])
             attempt("WKT", lambda: _held_against_code(interpret_wkt(text), x, y))
 

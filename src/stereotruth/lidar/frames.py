@@ -25,7 +25,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -225,24 +225,16 @@ def _geographic(datum: int) -> CRS:
     return GeographicCRS(name=found.name, datum=found).to_3d()
 
 
-def _is_dynamic(datum: int) -> bool:
-    return Datum.from_epsg(datum).type_name.startswith("Dynamic")
-
-
-def _operation(
-    source: CRS, target: int, place: tuple[float, float] | None
-) -> pyproj.Transformer | None:
-    """PROJ's best transformation between two frames at a place (None: at any), or None.
+def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.Transformer | None:
+    """PROJ's best transformation between two frames at a place, or None.
 
     What it calls a ballpark is none, nor is one that needs a grid which is not installed.
     """
     pyproj.network.set_network_enabled(False)
-    around = None
-    if place is not None:
-        lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
-        west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
-        south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
-        around = AreaOfInterest(west, south, east, north)
+    lon, lat = float(turn(place[0])), place[1]
+    west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
+    south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
+    around = AreaOfInterest(west, south, east, north)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of grids that are not installed
@@ -282,9 +274,10 @@ class _Way:
         return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
 
 
-def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
+def _way(datum: int, place: tuple[float, float]) -> _Way | None:
     """How a datum gets to ITRF2020; None where nothing better than WGS 84 is known."""
-    own, dynamic, known = _geographic(datum), _is_dynamic(datum), REALISATIONS.get(datum)
+    own, known = _geographic(datum), REALISATIONS.get(datum)
+    dynamic = Datum.from_epsg(datum).type_name.startswith("Dynamic")
     direct = None
     if known is None or known.epoch is not None:  # PROJ may have a grid of deformations
         direct = _operation(own, ITRF2020, place)
@@ -308,13 +301,6 @@ def _words(operation: pyproj.Transformer) -> str:
     parts = operation.description.split(" + ")
     forms = ("axis order change", "Conversion from", "Null geographic offset")
     return " + ".join(part for part in parts if not part.startswith(forms)) or "nothing"
-
-
-def _motion(plate: str, years: float) -> Callable[[Floats, Floats, Floats], Place]:
-    def move(lon: Floats, lat: Floats, height: Floats) -> Place:
-        return moved(lon, lat, height, plate, years)
-
-    return move
 
 
 def _refuse_without_epoch(
@@ -381,7 +367,7 @@ def frame_change(
         legs.append(f"{_words(operation)}, at {goal if own is None else own:.3f}")
     years = 0.0 if own is None else goal - own
     if plate is not None and abs(years) * speed(*place, plate) > SETTLED_M:
-        steps.append(_motion(plate, years))
+        steps.append(partial(moved, plate=plate, years=years))
         legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
     notes = list(way.notes)
     if not target.by and plate is not None:

@@ -31,7 +31,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import laspy
 import numpy as np
@@ -225,25 +225,6 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
     )
 
 
-def _after(first: Callable[..., Any], change: FrameChange) -> Callable[..., Any]:
-    def transform(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
-        return change(*first(x, y, z))
-
-    return transform
-
-
-def _refuse_degrees_as_metres(system: LidarCRS, extent: np.ndarray, file: str | Path) -> None:
-    corners = np.abs(extent[:, :2]).max(axis=0)
-    if system.horizontal.is_projected and corners[0] <= 360 and corners[1] <= 90:
-        raise InputError(
-            f"coordinates up to ({corners[0]:g}, {corners[1]:g}) are no coordinates of "
-            f"'{system.name}'; they look like degrees",
-            file=file,
-            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
-            "(longitude/latitude is EPSG:4979)",
-        )
-
-
 def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
     """What to do about heights of a datum: the grid of the place that PROJ has of it."""
     from .geoid_candidates import grid_of  # for refusals alone
@@ -275,7 +256,15 @@ def to_wgs84(
     """
     system, notes = resolve(header, lidar_crs or None, file)
     stated = np.array([header.mins, header.maxs], np.float64)
-    _refuse_degrees_as_metres(system, stated, file)
+    x, y = np.abs(stated[:, :2]).max(axis=0)
+    if system.horizontal.is_projected and x <= 360 and y <= 90:
+        raise InputError(
+            f"coordinates up to ({x:g}, {y:g}) are no coordinates of '{system.name}'; they look "
+            "like degrees",
+            file=file,
+            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
+            "(longitude/latitude is EPSG:4979)",
+        )
     extent = stated if extent is None else extent
     return transformation(system, file, extent, geoid=geoid, epochs=epochs, notes=notes)
 
@@ -350,14 +339,17 @@ def transformation(
             remedy="name a system that PROJ can transform (lidar_crs, --crs), or transform the "
             "file",
         ) from error
-    exact, operation = transformer.transform, transformer.description
-    accuracy = frame = None
+
+    def exact(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        place = transformer.transform(x, y, z)
+        return place if change is None else change(*place)
+
+    operation, accuracy, frame = transformer.description, None, None
     if transformer.accuracy >= 0:
         accuracy = float(transformer.accuracy)
     if epochs is not None and change is None:
         frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
     if change is not None:
-        exact = _after(exact, change)
         operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
     is_map = system.horizontal.is_projected
     grid = None
