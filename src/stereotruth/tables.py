@@ -149,7 +149,7 @@ class Table(Lines):
         file = read.file
         first = next((line for line in read.lines if line.strip()), "")
         separator = max(separators, key=first.count)
-        reader = csv.reader(read.lines, delimiter=separator)
+        reader = csv.reader(read.lines, delimiter=separator, strict=True)
         columns: list[str] = []
         rows = []
         try:

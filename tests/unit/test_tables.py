@@ -68,10 +68,12 @@ def test_cells_at_the_end_of_a_line_may_be_left_out_where_that_is_so(tmp_path) -
         "id,x\nA,1,5\n",
         b"\xff\xfe\0i",
         "id|x\nA|1\n",
+        'id,x\n"A,1\nB,2\n',
         "id,x\n" + "A" * 200_000,
         "id,x\n" + "A,1\n" * 6_000_000,
     ],
     ids=["nothing", "remarks", "missing", "unknown", "twice", "too many", "UTF-16", "separator",
+         "an open quote",
          "a long cell", "too large"],
 )  # fmt: skip
 def test_what_is_no_table_is_refused(tmp_path, content) -> None:
