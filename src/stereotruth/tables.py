@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import InputError, in_number
+from .numerics.decimal_numbers import decimal_number
 
 MOST_BYTES = 20_000_000
 MOST_MISTAKES = 100  # that are told
-LONGEST_NUMBER = 60  # characters; a float64 has 17 digits
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _DECLARED = re.compile(r"#\s*(\w+)\s*[:=]\s*(.*)")
 
 
@@ -62,16 +61,6 @@ class Mistakes(list[InputError]):
         """Raise InputError if there is any."""
         if self:
             raise (self[0] if len(self) == 1 else SheetError(self)) from None
-
-
-def decimal_number(text: str) -> float:
-    """The number that a word of text is, in ASCII digits with a point, as every program reads it.
-
-    ``float`` takes more: ``1_000``, full-width digits, ``nan``. Raises ValueError.
-    """
-    if len(text) > LONGEST_NUMBER or not _NUMBER.fullmatch(text):
-        raise ValueError(f"{text[:40]!r} is no number")
-    return float(text)
 
 
 @dataclass(frozen=True)

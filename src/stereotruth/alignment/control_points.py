@@ -27,10 +27,11 @@ from pyproj.exceptions import CRSError
 
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
+from ..numerics.decimal_numbers import decimal_number
 from ..numerics.degrees import continuous
 from ..products.files import of_text
 from ..settings import epoch_year
-from ..tables import Table, decimal_number
+from ..tables import Table
 
 Floats = NDArray[np.float64]
 
