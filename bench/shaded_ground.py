@@ -26,7 +26,6 @@ from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.status import is_labelled
-from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL, ROUNDING, NoiseCurve, pair_noise
 from stereotruth.products.pictures import save_figure
@@ -78,7 +77,7 @@ def main() -> None:
         )
         limit = least_probability(compared)
         lost.append(labelled & (probability_of_change(compared, diachronic=False) > limit))
-    left, warped = left_and_warped(window, labels.labels.disparity)
+    left, warped = window.images_at(labels.labels.disparity)
     for low, high in ((1, 60), (60, 100), (100, 150), (150, 256)):
         chosen = labelled & (left >= low) & (left < high)
         shares = (f"{100.0 * part[chosen].mean():.1f}" for part in lost)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from ..kernels import kernel
 from ..lidar.lattice import PER_M
 from ..surface.scale import HEIGHT_NOISE_M, PRIOR_NOISE_M

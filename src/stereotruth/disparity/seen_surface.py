@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from ..kernels import inlined, inner, kernel
 from .pixel_points import PX, PixelPoints
 

@@ -7,7 +7,7 @@ import pytest
 
 from stereotruth.disparity.pixel_points import POINT, PX, PixelPoints
 from stereotruth.disparity.seen_surface import COVER_PX, MANY, MAX_COVER_PX, seen_surface
-from stereotruth.epipolar.one_surface import SURFACE_PX
+from stereotruth.epipolar.window_sums import SURFACE_PX
 
 
 def window_of(x: np.ndarray, y: np.ndarray, disparity: np.ndarray, side: int) -> PixelPoints:
