@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from ..lidar.smooth_maps import LocalProjection
 from ..surface.region import SQUARE_BITS, Region, greatest_around
 from ..surface.scale import PART_BITS
 from ..surface.surface_store import Block
 from ..surface.vertices import Vertices
-from .local_projection import LocalProjection
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]

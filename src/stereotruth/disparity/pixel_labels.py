@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ..epipolar.window_sums import SURFACE_PX
 from ..kernels import kernel
 from ..lidar.lattice import PER_M
+from ..lidar.smooth_maps import LocalProjection
 from ..surface.scale import HEIGHT_NOISE_M, PRIOR_NOISE_M
-from .local_projection import LocalProjection
 from .pixel_points import PX, PixelPoints
 from .seen_surface import seen_surface
 

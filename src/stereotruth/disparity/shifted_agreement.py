@@ -148,7 +148,7 @@ def _means(
     known = np.isfinite(compared)
     averaged[np.arange(row, row + rows) % every != 0] = False  # no others are asked for
     to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
-    level, slope = (np.ascontiguousarray(of, dtype=np.float32) for of in (disparity, slope))
+    level, slope = (np.ascontiguousarray(array, np.float32) for array in (disparity, slope))
     strip = right.pixels[row - right.row :, : right.usable.shape[1]]
     at = np.arange(col, col + cols) - compared - right.col
     runs, warped = wanted_runs(known), np.full((AT_ONCE, rows, cols), np.nan, np.float32)
@@ -181,13 +181,13 @@ def _means(
 def _warp_shifted(right: Singles, at: Floats, shifts: Floats, runs: Runs, out: Singles) -> None:
     """Values of the rows of an image ``right`` [h or more, w'] at columns ``at`` [h, w] less each
     of several shifts (px) to ``out`` [n, h, w], NaN for none; of the pixels of ``runs`` alone."""
-    place, four = np.empty(BLOCK), np.empty((4, BLOCK), right.dtype)
+    column, taps = np.empty(BLOCK), np.empty((4, BLOCK), right.dtype)
     for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         for n in range(shifts.size):
             for k in range(size):
-                place[k] = at[y, x0 + k] - shifts[n]
-            values_in_row(right[y], place[:size], four, out[n, y, x0:])
+                column[k] = at[y, x0 + k] - shifts[n]
+            values_in_row(right[y], column[:size], taps, out[n, y, x0:])
 
 
 @kernel

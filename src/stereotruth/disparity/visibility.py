@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lidar.lattice import LATTICE_M
+from ..lidar.smooth_maps import LocalProjection
 from ..surface.surface import GroundSurface
 from .facet_raster import (
     OCCLUSION_TOLERANCE_PX,
@@ -32,7 +33,6 @@ from .facet_raster import (
     raster_prisms,
     right_pixels,
 )
-from .local_projection import LocalProjection
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
