@@ -141,8 +141,8 @@ def _means(
     row, col = window.rows.start + around[0].start, window.cols.start + around[1].start
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
     clear = apart_from_steps(disparity) if apart else np.isfinite(disparity)
-    every, apart_px = max(reach // 2, 1), FAR * reach
-    averaged = box_max(wanted, apart_px)
+    every, far_px = max(reach // 2, 1), FAR * reach
+    averaged = box_max(wanted, far_px)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
     known = np.isfinite(compared)
@@ -167,7 +167,7 @@ def _means(
             original, there, centres, slope, known & clear, window_px, to_compare
         )
         near = surface_means(correlation, level, slope, reach, every, to_average, row)
-        far = surface_means(correlation, level, slope, apart_px, FAR * every, to_average, row)
+        far = surface_means(correlation, level, slope, far_px, FAR * every, to_average, row)
         if first == 0:
             here[:], here_far[:] = near[0], far[0]
         _keep_greatest(near, several, to_average, elsewhere, shifted)
