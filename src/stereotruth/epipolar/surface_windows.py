@@ -70,9 +70,9 @@ def correlations(
     ``window`` (odd, px) wide. NaN beside ``runs`` and where fewer pixels belong to a window than it
     is wide: a few correlate by chance. 0 where either image is constant.
     """
-    return _correlations(left, warped, (disparity, slope, counts, window // 2), None, window, runs)[
-        0
-    ]
+    windows = disparity, slope, counts, window // 2
+    out, _ = _correlations(left, warped, windows, None, window, runs)
+    return out
 
 
 def _correlations(
