@@ -89,7 +89,10 @@ class Members(NamedTuple):
 
 
 @kernel
-def _pad(values: Image, reach: int, rows: tuple[int, int], fill: float, out: Singles) -> None:
+def _pad(
+    values: Image, counts: Bools | None, reach: int, rows: tuple[int, int], fill: float,
+    out: Singles,
+) -> None:  # fmt: skip
     cols = values.shape[2]
     for n in range(len(values)):
         for y in range(rows[0], values.shape[1], rows[1]):
@@ -98,15 +101,26 @@ def _pad(values: Image, reach: int, rows: tuple[int, int], fill: float, out: Sin
             for x in range(cols):
                 value = np.float32(values[n, y, x])
                 row[reach + x] = value if np.isfinite(value) else fill
+            if counts is not None:
+                for x in range(cols):
+                    row[reach + x] = row[reach + x] if counts[y, x] else fill
 
 
-def padded(values: Image, fill: float, reach: int, every: int = 1, first_row: int = -1) -> Singles:
+def padded(
+    values: Image,
+    fill: float,
+    reach: int,
+    every: int = 1,
+    first_row: int = -1,
+    counts: Bools | None = None,
+) -> Singles:
     """``values`` [n, h, w] as float32 with the columns that windows may reach into; ``fill`` there,
-    and where a pixel has none. Of the rows that count, see :class:`Members`."""
+    where a pixel has none, and where ``counts`` [h, w] is false. Of the rows that count, see
+    :class:`Members`."""
     wide = reach + values.shape[2] + reach + TOGETHER * every + REGISTER
     out = np.empty((*values.shape[:2], wide), np.float32)
     rows = (0, 1) if first_row < 0 else (first_row, every)
-    _pad(values, reach, rows, np.float32(fill), out)
+    _pad(values, counts, reach, rows, np.float32(fill), out)
     return out
 
 
@@ -120,8 +134,7 @@ def members_of(
 ) -> Members:
     """Of the neighbours that ``counts`` [h, w] chooses."""
     level, slopes = (np.ascontiguousarray(of, dtype=np.float32) for of in (disparity, slope))
-    counted = np.where(counts, level, np.float32(np.nan))
-    (counted,) = padded(counted[None], np.nan, reach, every, first_row)
+    (counted,) = padded(level[None], np.nan, reach, every, first_row, counts)
     return Members(level, slopes, counted, reach, every, first_row)
 
 
