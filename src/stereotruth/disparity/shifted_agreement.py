@@ -24,10 +24,10 @@ from ..epipolar.surface_windows import (
 from ..epipolar.warping import values_in_row
 from ..epipolar.window_sums import BLOCK, Runs, wanted_runs
 from ..kernels import kernel
+from ..numerics.box_max import box_max
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .seen_surface import box_max
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
