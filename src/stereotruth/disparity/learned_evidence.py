@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bits = NDArray[np.uint32]
 
+ASKED = np.uint32(1)
 UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 LESS = 1.25  # by which the difference of log odds is divided beyond what has been learned
 LEARNED = Path(__file__).with_suffix(".tsv")
@@ -28,16 +30,24 @@ def learned(diachronic: bool) -> Floats:
     return rows[rows[:, 0] == diachronic, 1:].T
 
 
-def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
-    """How many of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]."""
+def beyond_learned(evidence: Singles, diachronic: bool) -> Bits:
+    """Which of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]: the bit
+    ASKED, and from the next one on a bit for each figure."""
     low, high = learned(diachronic)[..., None]
-    return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
+    is_beyond = (evidence < low) | (evidence > high)  # false for NaN
+    return ASKED + (np.uint32(2) << np.arange(len(evidence), dtype=np.uint32)) @ is_beyond
 
 
-def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
+def beyond_counts(beyond: Bits) -> NDArray[np.int64]:
+    """Of pixels [h, w]: how many were asked, and how many lie beyond by each figure [1 + k]."""
+    figures = learned(False).shape[1]
+    return np.array([(beyond >> bit & 1).sum(dtype=np.int64) for bit in range(1 + figures)])
+
+
+def as_learned(probability: Floats, beyond: NDArray[np.bool_]) -> Floats:
     """The probability [n], nearer to UNKNOWN where figures lie ``beyond`` what has been learned:
     the difference of the log odds is divided by LESS."""
     odds, unknown = (
         np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
     )
-    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / np.where(beyond > 0, LESS, 1.0))))
+    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / np.where(beyond, LESS, 1.0))))

@@ -31,6 +31,7 @@ from ..lidar.overlap_check import apart, refuse_apart
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
+from .change_evidence import Evidence
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
@@ -47,6 +48,8 @@ MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
 
 
 LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
+# Of a block, see :func:`.recipe.label_window`.
+COUNTED = "in_grid", "in_frame", "used", "asked", *Evidence._fields
 ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have more labels
 
 
@@ -82,7 +85,7 @@ class _Blocks:
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
-        """Label one block and write it, with its pixels by status and counts of points.
+        """Label one block and write it, with its pixels by status and what is COUNTED.
 
         Nothing, if it is there: a Dask worker that is lost takes with it that it had written it.
         """
@@ -92,7 +95,7 @@ class _Blocks:
         shape = rows.stop - rows.start, cols.stop - cols.start
         fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)
         arrays: dict[str, NDArray] = {}
-        points = np.zeros(3, dtype=np.int64)
+        counted = np.zeros(len(COUNTED), dtype=np.int64)
         for r, c in self.scene.windows.parts(rows, here, self.max_points):
             labelled = label_window(self.scene, r, c)
             if labelled is None:
@@ -106,7 +109,7 @@ class _Blocks:
                 if name not in arrays:
                     arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
                 arrays[name][part] = layer
-            points += counts
+            counted += counts
         image = self.scene.pair.images[0]
         if isinstance(image, MaskedImage) and (masked := image.mask[rows, here] != 0).any():
             arrays.setdefault("status", np.full(shape, fill["status"].fill, np.uint8))
@@ -115,7 +118,7 @@ class _Blocks:
         arrays = self.scene.pair.arrays(arrays)
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
         pixels = np.bincount(status.reshape(-1), minlength=len(Status))
-        out.write((rows, cols), key, arrays, [*pixels.tolist(), *points.tolist()])
+        out.write((rows, cols), key, arrays, [*pixels.tolist(), *counted.tolist()])
 
 
 def _identity(attrs: Mapping[str, Any]) -> str:
@@ -283,15 +286,17 @@ def project_scene(
 
 
 def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
-    """Of pixels by status and points (see :meth:`_Blocks.make`)."""
+    """Of pixels by status and what is counted (see :meth:`_Blocks.make`)."""
     pixels = {status.name.lower(): counts[status] for status in inputs.statuses}
-    in_grid, in_frame, used = counts[len(Status) :]
+    counted = dict(zip(COUNTED, counts[len(Status) :]))
+    asked = max(counted["asked"], 1)
     beyond = "no_points", "out_of_frame", "masked"
     reached = sum(n for name, n in pixels.items() if name not in beyond)
     labelled = sum(counts[status] for status in inputs.statuses if is_labelled(status))
     return {
         "pixels": pixels,
-        "points": {"in_grid": in_grid, "in_frame": in_frame, "used": used},
+        "points": {name: counted[name] for name in COUNTED[:3]},
+        "beyond_learned": {name: round(counted[name] / asked, 4) for name in Evidence._fields},
         "labelled_share": round(labelled / max(reached, 1), 6),
     }
 
