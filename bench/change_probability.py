@@ -49,7 +49,7 @@ from stereotruth.disparity.change_probability import (
 )
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
-from stereotruth.disparity.learned_evidence import LEARNED, UNKNOWN, learned
+from stereotruth.disparity.learned_evidence import LEARNED, learned
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window
@@ -70,7 +70,7 @@ BINS = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.15, CHANGED, 0.7, 1.0
 DENSE_SEED, SPARSE_SEED, FIT_SIDE_PX = 1, 2, 640
 OF_SPARSE = "mixed", "built", "grown", "moved", "leaves", "texture", "water"
 IN_EIGHT_BITS = "mixed", "felled", "grown", "moved", "nothing", "woods", "raised"
-FIELDS = 12  # of either light
+FIELDS = 48  # of either light
 REAL = (
     ("jacksonville", "J001-J002", False, (1, 3)),
     ("marseille", "left-right", False, (1,)),
@@ -80,11 +80,12 @@ REAL = (
     ("jacksonville", "J005-J007", True, (1,)),
     ("jacksonville", "J011-J012", True, (1,)),
 )
+UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 # Share of the pixels that are fitted to, of those that have changed and of others; weight of rare
 # ones
 OF_CHANGED, FEW, OF_RARE = 0.3, 0.05, 5.0
 MOVED = REASONS.split().index("moved")
-BEYOND = 0.0005  # share at either end of what has been learned
+BEYOND = 0.01  # share at either end of what has been learned
 NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 100  # of the trees
 
 

@@ -24,12 +24,14 @@ from stereotruth.disparity.pixel_labels import Labels
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SIDE_PX, BORDER_PX = 400, 70  # of the window; of what the images show around it
+SIDE_PX, BORDER_PX = 240, 70  # of the window; of what the images show around it
 LEVEL_PX = 4  # disparity of the ground
 KINDS = "built", "gone", "felled", "raised", "passing", "kept"
-TRIES, APART_PX = 220, 14  # of a place for something; px between two
+TRIES, APART_PX = 120, 14  # of a place for something; px between two
 GROUND, TREE, ROOF = 2, 5, 6  # ASPRS
-BLANK = 0.15  # share of the fields that have no texture at all, or noise alone
+# Share of the fields that have no texture at all, or noise alone; what share of these has changed
+BLANK, OF_BLANK = 0.15, 0.05
+BLEEDS = 0.3, 0.03  # what the optics bring over from a roof to the pixels beside it, by turns
 
 
 class Field(NamedTuple):
@@ -61,19 +63,22 @@ def made_field(number: int, apart: bool) -> Field:
     noise = level * np.exp(rng.uniform(np.log(0.003), np.log(0.04)))  # as it is stated
     contrast = min(noise * np.exp(rng.uniform(np.log(0.3), np.log(60.0))), 0.4 * level)
     has_texture = rng.random() > BLANK
-    blur = rng.choice([0.0, rng.uniform(0.6, 2.5)])
-    ground = level + (contrast * _texture(rng, side, blur) if has_texture else 0.0)
-    right = np.roll(ground, -LEVEL_PX, axis=1)
+    blur = rng.choice([0.0, rng.uniform(0.6, 2.0), rng.uniform(2.0, 6.0)])
+    ground = np.full((side, side), level)
+    if has_texture:
+        ground += contrast * _texture(rng, side, blur)
     images = _Images(
-        ground * np.ones((side, side)), right * np.ones((side, side)),
+        ground, np.roll(ground, -LEVEL_PX, axis=1),
         np.full((side, side), float(LEVEL_PX)), np.full((side, side), GROUND, np.uint8),
         np.zeros((side, side), np.bool_), np.ones((side, side), np.bool_),
     )  # fmt: skip
-    if has_texture:
+    if not has_texture:
+        _change_unseen(images, rng)
+    else:
         _paint(images, rng, (level, contrast, blur), apart)
     if apart:
         _other_light(images.right, rng)
-    optics, truly = rng.choice([0.0, 0.6]), rng.choice([0.0, 0.5, 1.0])
+    optics, truly = rng.choice([0.0, 0.6]), rng.choice([0.0, 0.5, 1.0, 1.0, 1.0])
     left, right = (
         np.round(
             gaussian_filter(image, optics) + truly * noise * rng.normal(size=image.shape)
@@ -98,6 +103,16 @@ def _texture(rng: np.random.Generator, side: int, blur: float) -> Floats:
     return field / field.std()
 
 
+def _change_unseen(images: _Images, rng: np.random.Generator) -> None:
+    """Parts of blank ground have changed, of which the images show nothing."""
+    side = len(images.left)
+    while images.changed.mean() < OF_BLANK:
+        rows, cols = rng.integers(10, 40, 2)
+        top, first = (rng.integers(0, side - size) for size in (rows, cols))
+        images.changed[top : top + rows, first : first + cols] = True
+    images.same[images.changed] = False
+
+
 def _paint(
     images: _Images, rng: np.random.Generator, look: tuple[float, float, float], apart: bool
 ) -> None:
@@ -120,7 +135,7 @@ def _paint(
         if taken[around].any():
             continue
         taken[top : top + rows, first : first + cols] = True
-        likeness = 1.0 if rng.random() < 0.4 else np.exp(rng.uniform(-1.0, 1.0))
+        likeness = 1.0 if rng.random() < 0.4 else np.exp(rng.uniform(-1.5, 1.5))
         own = contrast * np.exp(rng.uniform(-1.0, 0.7)) * _texture(rng, 64, blur)
         pixels = likeness * (level + own)[:rows, :cols]
         _place(images, kind, np.s_[top : top + rows, first : first + cols], pixels, rng)
@@ -170,6 +185,10 @@ def _place(
     disparity[rim | hidden] = np.nan
     if kind != "kept":
         changed[there], same[there] = True, False
+        return
+    image, end = (left, cols.stop) if rng.random() < 0.5 else (right, cols.stop - shown)
+    for px, share in enumerate(BLEEDS):
+        image[rows, end + px] += share * (pixels.mean() - image[rows, end + px])
 
 
 def _other_light(image: Floats, rng: np.random.Generator) -> None:

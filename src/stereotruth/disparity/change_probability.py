@@ -22,7 +22,7 @@ from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
 from .change_evidence import LabelledWindow, change_evidence
-from .learned_evidence import ASKED, as_learned, beyond_learned
+from .learned_evidence import beyond_learned
 from .surface_means import surface_mean
 
 Floats = NDArray[np.float64]
@@ -92,8 +92,8 @@ def told_by(compared: LabelledWindow, doubtful: Bools, evidence: Singles, diachr
     out.probability[doubtful] = probability_by(by_own, evidence)
     others = with_surroundings(out.probability, doubtful, compared)
     by_trees = probability_by(with_others, np.concatenate([evidence, others]))
+    out.probability[doubtful] = by_trees
     out.beyond[doubtful] = beyond_learned(evidence, diachronic)
-    out.probability[doubtful] = as_learned(by_trees, out.beyond[doubtful] > ASKED)
     return out
 
 
