@@ -82,8 +82,8 @@ REAL = (
 )
 UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
 # Share of the pixels that are fitted to, of those that have changed and of others; weight of rare
-# ones
-OF_CHANGED, FEW, OF_RARE = 0.3, 0.05, 5.0
+# ones and of new texture
+OF_CHANGED, FEW, OF_RARE, OF_TEXTURE = 0.3, 0.05, 5.0, 10.0
 MOVED = REASONS.split().index("moved")
 BEYOND = 0.01  # share at either end of what has been learned
 NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 100  # of the trees
@@ -91,8 +91,8 @@ NUMBER, LEAVES, RATE, LEAST_PIXELS = 100, 16, 0.12, 100  # of the trees
 
 class Marked(NamedTuple):
     """Pixels [h, w] that have ``changed`` or are hidden by what has, those that have been
-    ``kept``, those that have a new ``texture`` alone, and those that are ``rare``: of two lights
-    new texture, moved vehicles of one light, and what is small in real scenes. The ``kind`` of
+    ``kept``, those that have a new ``texture`` alone, and those that are ``rare``: moved vehicles
+    of one light, and what is small in real scenes. The ``kind`` of
     what is planted, 1 the first of KINDS and 0 none."""
 
     changed: Bools
@@ -142,7 +142,7 @@ class City:
             out[window.inner] = pixels
         texture[window.inner] = changes["reason"] == TEXTURE
         moved[window.inner] = changes["reason"] == MOVED
-        rare = texture & kept if self.apart else moved & changed
+        rare = moved & changed & (not self.apart)
         labels = with_crowns(labels, by_lidar.rough, window)
         labelled = is_labelled(labels.status) & (labels.surface_class != WATER_CLASS)
         noise = inputs.noise
@@ -280,7 +280,7 @@ def sample(draw: Draw, folder: Path, first: DecisionTrees | None) -> Sample:
     lower half, with what the ``first`` trees say of the surroundings."""
     of = drawn(draw, folder)
     marked = [pixels[of.doubtful] for pixels in of.marked]
-    changed, kept, _, rare, _ = marked
+    changed, kept, texture, rare, _ = marked
     row = np.nonzero(of.doubtful)[0]
     here = (row < len(of.doubtful) // 2) == (first is None)
     share = np.where(changed, OF_CHANGED, FEW)
@@ -289,7 +289,8 @@ def sample(draw: Draw, folder: Path, first: DecisionTrees | None) -> Sample:
     features = [*of.evidence]
     if first is not None:
         features += surroundings(of, first)
-    weight = np.where(rare, OF_RARE, 1.0) * FEW / share
+    weight = np.select([texture & kept & draw.apart, rare], [OF_TEXTURE, OF_RARE], 1.0)
+    weight *= FEW / share
     return Sample(np.stack(features)[:, chosen].T, changed[chosen], weight[chosen])
 
 

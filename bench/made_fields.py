@@ -31,6 +31,7 @@ TRIES, APART_PX = 120, 14  # of a place for something; px between two
 GROUND, TREE, ROOF = 2, 5, 6  # ASPRS
 # Share of the fields that have no texture at all, or noise alone; what share of these has changed
 BLANK, OF_BLANK = 0.15, 0.05
+TOLD = 4.0  # times the noise, a contrast that tells a new roof from new asphalt
 BLEEDS = 0.3, 0.03  # what the optics bring over from a roof to the pixels beside it, by turns
 
 
@@ -75,7 +76,7 @@ def made_field(number: int, apart: bool) -> Field:
     if not has_texture:
         _change_unseen(images, rng)
     else:
-        _paint(images, rng, (level, contrast, blur), apart)
+        _paint(images, rng, (level, contrast, blur, noise), apart)
     if apart:
         _other_light(images.right, rng)
     optics, truly = rng.choice([0.0, 0.6]), rng.choice([0.0, 0.5, 1.0, 1.0, 1.0])
@@ -114,17 +115,20 @@ def _change_unseen(images: _Images, rng: np.random.Generator) -> None:
 
 
 def _paint(
-    images: _Images, rng: np.random.Generator, look: tuple[float, float, float], apart: bool
+    images: _Images, rng: np.random.Generator, look: tuple[float, float, float, float], apart: bool
 ) -> None:
-    """Things of all kinds, as many as find a place; ``look``: brightness, contrast and blur. Under
-    two lights nothing tells what is small and in one image alone from a shadow."""
-    level, contrast, blur = look
+    """Things of all kinds, as many as find a place; ``look``: brightness, contrast, blur and noise.
+    Under two lights nothing tells what is in one image alone from a shadow where it is small, and
+    from a new surface of the street where it has little contrast: left out."""
+    level, contrast, blur, noise = look
     side = len(images.left)
     taken = np.zeros((side, side), np.bool_)
     for _ in range(TRIES):
         kind = str(rng.choice(KINDS))
         small = kind == "felled" or rng.random() < 0.5
         if kind == "passing":
+            if apart and contrast < TOLD * noise:
+                continue
             small = not apart and rng.random() < 0.8
         low, high = (5, 16) if small else (12, 60)
         rows, cols = rng.integers(low, high, 2)
