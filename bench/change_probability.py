@@ -43,7 +43,7 @@ from stereotruth.disparity.change_probability import (
     TREES,
     UNCHANGED,
     probability_by,
-    told_by,
+    probability_by_evidence,
     trees,
     with_surroundings,
 )
@@ -434,7 +434,9 @@ class Counts(NamedTuple):
     def of(cls, city: City, folder: Path) -> Counts:
         """A city that trees are not fitted to."""
         of = measured(city, folder)
-        probability = told_by(of.compared, of.doubtful, of.evidence, city.apart).probability
+        probability = probability_by_evidence(
+            of.compared, of.doubtful, of.evidence, city.apart
+        ).probability
         labelled, marked = of.compared.labelled, of.marked
         changed, kept = labelled & marked.changed, labelled & marked.kept
         texture, agreed = kept & of.doubtful & marked.texture, (changed | kept) & ~of.doubtful

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import told_of_change
+from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow
@@ -85,7 +85,7 @@ def main() -> None:
             window.of_equal_noise(noise), labels.labels, labelled, labels.surface_class, EQUAL
         )
         limit = least_probability(compared)
-        lost.append(labelled & (told_of_change(compared, diachronic=False).probability > limit))
+        lost.append(labelled & (change_probability(compared, diachronic=False).probability > limit))
     left, warped = left_and_warped(window, labels.labels.disparity)
     for low, high in ((1, 60), (60, 100), (100, 150), (150, 256)):
         chosen = labelled & (left >= low) & (left < high)

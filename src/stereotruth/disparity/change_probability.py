@@ -70,7 +70,7 @@ def trees(diachronic: bool) -> list[DecisionTrees]:
     return DecisionTrees.load(TREES)[diachronic::2]
 
 
-class Told(NamedTuple):
+class ChangeProbability(NamedTuple):
     """What the images of a window tell of its pixels [h, w]: the ``probability`` that what a
     labelled one shows has changed, and which figures of the evidence lie ``beyond`` what was
     learned, see :func:`.beyond_learned`, 0 where the images agree closely."""
@@ -79,16 +79,18 @@ class Told(NamedTuple):
     beyond: NDArray[np.uint32]
 
 
-def told_of_change(compared: LabelledWindow, diachronic: bool) -> Told:
+def change_probability(compared: LabelledWindow, diachronic: bool) -> ChangeProbability:
     """Of a window; ``diachronic``: whether the images share no light."""
     doubtful, evidence = change_evidence(compared)
-    return told_by(compared, doubtful, np.stack(evidence), diachronic)
+    return probability_by_evidence(compared, doubtful, np.stack(evidence), diachronic)
 
 
-def told_by(compared: LabelledWindow, doubtful: Bools, evidence: Singles, diachronic: bool) -> Told:
+def probability_by_evidence(
+    compared: LabelledWindow, doubtful: Bools, evidence: Singles, diachronic: bool
+) -> ChangeProbability:
     """The same, by the ``evidence`` [k, n] of the ``doubtful`` pixels [h, w]."""
     by_own, with_others = trees(diachronic)
-    out = Told(np.full(doubtful.shape, UNCHANGED), np.zeros(doubtful.shape, np.uint32))
+    out = ChangeProbability(np.full(doubtful.shape, UNCHANGED), np.zeros(doubtful.shape, np.uint32))
     out.probability[doubtful] = probability_by(by_own, evidence)
     others = with_surroundings(out.probability, doubtful, compared)
     by_trees = probability_by(with_others, np.concatenate([evidence, others]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import CHANGED, told_of_change
+from stereotruth.disparity.change_probability import CHANGED, change_probability
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.learned_evidence import (
@@ -40,7 +40,7 @@ def probability(
     window: PairWindow, noise: tuple[float, float] = NOISE, diachronic: bool = True
 ) -> np.ndarray:
     of = LabelledWindow(window, LEVEL, ALL, GROUND, noise)
-    return told_of_change(of, diachronic).probability
+    return change_probability(of, diachronic).probability
 
 
 LIGHTS = pytest.mark.parametrize("diachronic", [False, True])
@@ -90,7 +90,7 @@ def test_no_window_changes_it(diachronic: bool) -> None:
     of = LabelledWindow(
         window, labels, np.ones(shape, np.bool_), np.full(shape, 2, np.uint8), NOISE
     )
-    part = told_of_change(of, diachronic).probability
+    part = change_probability(of, diachronic).probability
     inner = np.s_[30:-30, 30:-30]
     assert np.array_equal(whole[11:-7, 13:-9][inner], part[inner])
 
