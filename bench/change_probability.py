@@ -434,9 +434,8 @@ class Counts(NamedTuple):
     def of(cls, city: City, folder: Path) -> Counts:
         """A city that trees are not fitted to."""
         of = measured(city, folder)
-        probability = probability_by_evidence(
-            of.compared, of.doubtful, of.evidence, city.apart
-        ).probability
+        window = of.compared, of.doubtful, of.evidence
+        probability, _ = probability_by_evidence(*window, city.apart)
         labelled, marked = of.compared.labelled, of.marked
         changed, kept = labelled & marked.changed, labelled & marked.kept
         texture, agreed = kept & of.doubtful & marked.texture, (changed | kept) & ~of.doubtful

@@ -46,7 +46,7 @@ class Contradicted(NamedTuple):
     """What the images of a window say of its labels; arrays [h, w].
 
     ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
-    contradict, though these may have changed; ``beyond``: see :class:`.change_probability.ChangeProbability`.
+    contradict, though these may have changed; ``beyond``: see :class:`.ChangeProbability`.
     """
 
     changed: Bools
