@@ -31,7 +31,7 @@ from scipy.ndimage import (
 )
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import probability_of_change
+from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
@@ -431,7 +431,7 @@ def main() -> None:
 def lost_of(planted: Planted, diachronic: bool) -> Bools:
     """Labels of a window that the images contradict."""
     compared = planted.compared
-    probability = probability_of_change(compared, diachronic)
+    probability = change_probability(compared, diachronic).probability
     return planted.labelled & (probability > least_probability(compared))
 
 
