@@ -38,7 +38,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import require_complete
-from stereotruth.products.pictures import save_figure, stretch
+from stereotruth.pages.pictures import save_figure, stretch
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.changes import REASONS, changes_at
 from stereotruth.simulate.cities import Canopy, CitySpec, Dates, ViewSpec, lidar_files

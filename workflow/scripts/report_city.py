@@ -4,7 +4,7 @@ from pathlib import Path
 
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.report.city_files import CityFiles
 from stereotruth.report.index_page import write_index
 from stereotruth.report.page import write_report

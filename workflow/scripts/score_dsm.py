@@ -5,7 +5,7 @@ from stereotruth.evaluation.surface_models.reference import LidarReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":

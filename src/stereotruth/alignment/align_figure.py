@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ..products.files import atomic_file
-from ..products.pictures import round_length
+from ..pages.pictures import round_length
 from .aligned_pair import Alignment
 
 

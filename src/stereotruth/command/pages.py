@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import InputError
-from ..products.html_page import INDEX
+from ..pages.page import INDEX
 from ..report.index_page import pages_of, write_index
 
 

@@ -13,8 +13,8 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..errors import in_number
-from ..products import pictures
-from ..products.pictures import colours, save_figure
+from ..pages import pictures
+from ..pages.pictures import colours, save_figure
 from ..products.rasters import read_disparity, read_image
 
 Picture = NDArray[np.uint8]

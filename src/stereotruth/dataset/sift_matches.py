@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.bilinear import bilinear
-from ..products.pictures import stretch
+from ..pages.pictures import stretch
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -22,7 +22,7 @@ from ..dataset.tile_classes import BUILDING, VEGETATION
 from ..dataset.warped_tile import warp_tile
 from ..epipolar.warping import CorrelationSum
 from ..numerics.error_sums import ErrorSum
-from ..products import pictures
+from ..pages import pictures
 from ..products.files import read_table, write_table
 from ..products.grids import require_complete
 from ..products.rasters import read_tile

@@ -11,7 +11,7 @@ from typing import Any
 from ..dataset.manifest import read_manifest
 from ..errors import InputError
 from ..products.files import read_table
-from ..products.html_page import way
+from ..pages.page import way
 
 Place = str | Path
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..products.charts import Axis, Chart, Point, Series, look
-from ..products.html_tables import minus
-from ..products.pictures import round_length
+from ..pages.figures import Axis, Chart, Point, Series, look
+from ..pages.tables import minus
+from ..pages.pictures import round_length
 
 SIDE = 300.0  # longer side of a frame of residuals
 SHARE = 1 / 8  # of the frame, taken by the longest arrow

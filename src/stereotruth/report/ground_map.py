@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..dataset.footprints import read_footprints
 from ..dataset.quick_looks import SPLIT_COLOURS
-from ..products.html_tables import missed
-from ..products.pictures import encode, round_length, shrink
+from ..pages.tables import missed
+from ..pages.pictures import encode, round_length, shrink
 
 SIDE = 1000.0  # longer side of the drawing
 PICTURE_PX = 1000

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..dataset.label_doubts import ABOUT, ALIGNMENT, LIDAR
 from ..dataset.split_names import NONE, SPLITS
-from ..products.html_tables import Headline, metres, minus, missed, number, spread
+from ..pages.tables import Headline, metres, minus, missed, number, spread
 
 Rows = Sequence[Mapping[str, str]]
 Records = Mapping[str, Mapping[str, Any]]

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import in_number
-from ..products.html_page import INDEX, way, write_page
-from ..products.html_tables import Cell, Column, Table, minus, spread
+from ..pages.page import INDEX, way, write_page
+from ..pages.tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
-from ..products.pictures import encode_file
+from ..pages.pictures import encode_file
 from .timeline import last_run, read_jobs, timeline
 
 PAGES = (

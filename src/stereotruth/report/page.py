@@ -19,9 +19,9 @@ import numpy as np
 from ..dataset import quick_looks
 from ..dataset.pixel_size import PixelSize
 from ..job import progress
-from ..products import pictures
-from ..products.html_page import way, write_page
-from ..products.html_tables import missed, table
+from ..pages import pictures
+from ..pages.page import way, write_page
+from ..pages.tables import missed, table
 from . import sections, tile_pictures
 from .city_files import CityFiles, CityRecords, rows_of
 from .ground_map import ground_map

@@ -11,8 +11,8 @@ import numpy as np
 from ..dataset import quick_looks
 from ..dataset.manifest import Tile
 from ..dataset.split_names import NONE, SPLITS
-from ..products.charts import Chart
-from ..products.html_tables import Table, cells_of, columns_of, limit, missed, table, words
+from ..pages.figures import Chart
+from ..pages.tables import Table, cells_of, columns_of, limit, missed, table, words
 from . import drawings
 
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest

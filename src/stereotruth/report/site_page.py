@@ -16,10 +16,10 @@ from ..epipolar import site_pairs
 from ..epipolar.linked_images import Links
 from ..epipolar.pair_quality import rate
 from ..numerics.degrees import metres_per_degree
-from ..products.charts import Axis
-from ..products.html_page import way, write_page
-from ..products.html_tables import Table, table
-from ..products.pictures import DISPARITIES, SERIES, gradient, round_length
+from ..pages.figures import Axis
+from ..pages.page import way, write_page
+from ..pages.tables import Table, table
+from ..pages.pictures import DISPARITIES, SERIES, gradient, round_length
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
 SIDE, WIDTH, HEIGHT = 600.0, 620.0, 360.0

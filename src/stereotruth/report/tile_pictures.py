@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..dataset.warped_tile import warp_tile
-from ..products import pictures
-from ..products.pictures import Picture, encode, hillshade
+from ..pages import pictures
+from ..pages.pictures import Picture, encode, hillshade
 from ..products.rasters import read_flags, read_image, read_tile
 from .relief import Relief
 

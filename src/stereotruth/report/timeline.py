@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from ..products.charts import Axis
-from ..products.html_tables import Cell, Column, Table, number
+from ..pages.figures import Axis
+from ..pages.tables import Cell, Column, Table, number
 
 PAUSE_S = 600.0  # without any job: what follows is another run
 MOST_BARS = 2000  # the longest jobs; more are not drawn

@@ -8,7 +8,7 @@ import pytest
 
 from stereotruth.command.pages import pages
 from stereotruth.errors import InputError
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 
 
 def test_pages_are_found_and_chosen(tmp_path, monkeypatch):

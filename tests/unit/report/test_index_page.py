@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stereotruth.evaluation.labels_against_truth import Comparison, SceneComparison
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.report.index_page import pages_of, write_index
 
 from ...browser import look, needs_chromium

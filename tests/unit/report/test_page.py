@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.html_page import PAPER
+from stereotruth.pages.page import PAPER
 from stereotruth.report import page
 from stereotruth.report.city_files import CityFiles
 

@@ -7,7 +7,7 @@ import base64
 import numpy as np
 import pytest
 
-from stereotruth.products.pictures import NO_VALUE, hillshade
+from stereotruth.pages.pictures import NO_VALUE, hillshade
 from stereotruth.report.relief import Relief
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...dataset.stereo_dataset import StereoDataset
-from ...products import pictures
-from ...products.charts import HEIGHT, SHAPES, WIDTH, Axis, Chart, Point, Series
-from ...products.html_page import write_page
-from ...products.html_tables import Cell, Column, Headline, Table, minus, table, words
-from ...products.pictures import SERIES, encode, gradient
+from ...pages import pictures
+from ...pages.figures import HEIGHT, SHAPES, WIDTH, Axis, Chart, Point, Series
+from ...pages.page import write_page
+from ...pages.tables import Cell, Column, Headline, Table, minus, table, words
+from ...pages.pictures import SERIES, encode, gradient
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX, estimate

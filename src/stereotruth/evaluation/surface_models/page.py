@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from ...lidar.height_raster import HeightRaster
 from ...products.files import atomic_folder, write_json, write_table
-from ...products.html_page import way, write_page
-from ...products.html_tables import Headline, minus, table
-from ...products.pictures import (
+from ...pages.page import way, write_page
+from ...pages.tables import Headline, minus, table
+from ...pages.pictures import (
     Picture,
     colours,
     encode,

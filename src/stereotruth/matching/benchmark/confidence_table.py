@@ -10,7 +10,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from ...products.files import read_table
-from ...products.pictures import save_figure
+from ...pages.pictures import save_figure
 from .scores import ALL
 from .tables import Table, nothing, plain_table
 

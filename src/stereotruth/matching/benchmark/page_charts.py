@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...products.charts import HEIGHT, WIDTH, Axis, Chart, Point, Series, line, look
+from ...pages.figures import HEIGHT, WIDTH, Axis, Chart, Point, Series, line, look
 from ...products.files import read_table
-from ...products.html_tables import metres
+from ...pages.tables import metres
 
 Row = Mapping[str, Any]
 LEAST_PX = 0.05  # of the axes of errors

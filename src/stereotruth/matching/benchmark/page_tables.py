@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ...products.html_tables import Table
+from ...pages.tables import Table
 from . import tables
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ...products.pictures import (
+from ...pages.pictures import (
     DISPARITIES,
     ERRORS,
     NO_VALUE,

@@ -20,8 +20,8 @@ from typing import Any
 
 from ...errors import InputError, in_number
 from ...products.files import atomic_file, write_table
-from ...products.html_tables import Cell, Column, metres, minus
-from ...products.html_tables import Table as Shown
+from ...pages.tables import Cell, Column, metres, minus
+from ...pages.tables import Table as Shown
 from ..kinds import KINDS
 from . import published_scores
 from .training_data import COLUMNS as TRAINING

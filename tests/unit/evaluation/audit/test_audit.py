@@ -21,8 +21,8 @@ from stereotruth.evaluation.audit import audit as run
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
 from stereotruth.products.files import write_table
-from stereotruth.products.html_page import PAPER
-from stereotruth.products.html_tables import minus
+from stereotruth.pages.page import PAPER
+from stereotruth.pages.tables import minus
 
 from ....browser import CHROMIUM, look
 from ....synthetic.pair_with_block import make

@@ -12,7 +12,7 @@ from stereotruth.matching.benchmark.page import headlines
 from stereotruth.matching.benchmark.page_charts import cumulative_chart, strata_chart
 from stereotruth.matching.benchmark.page_tables import sections
 from stereotruth.matching.benchmark.tables import Table, plain_table, read_scores
-from stereotruth.products.charts import HEIGHT
+from stereotruth.pages.figures import HEIGHT
 
 from ....browser import look, needs_chromium
 from ....synthetic.toy_benchmark import rows

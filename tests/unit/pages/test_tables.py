@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.products import html_tables
+from stereotruth.pages import tables
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

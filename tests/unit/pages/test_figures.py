@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from stereotruth.products.charts import DASHES, SHAPES, Axis, line, look
-from stereotruth.products.pictures import SERIES
+from stereotruth.pages.figures import DASHES, SHAPES, Axis, line, look
+from stereotruth.pages.pictures import SERIES
 
 
 def test_a_value_stands_where_its_share_of_the_axis_is():
