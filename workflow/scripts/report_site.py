@@ -6,9 +6,9 @@ from stereotruth.alignment.site_images import GivenImage, open_image
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.roughness import roughness_m
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import read_json
-from stereotruth.pages.page import INDEX
 from stereotruth.report.index_page import write_index
 from stereotruth.report.site_page import image_of, pairs_of, write_site_page
 

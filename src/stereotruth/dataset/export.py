@@ -48,7 +48,7 @@ from .sift_matches import MATCH_COLUMNS, match_rows
 from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
 from .summary import in_counts, summarise
-from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
+from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks, sigma_by_surface
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
 from .windows import Window, cell_step, choose_windows, scan_scene
 
@@ -335,6 +335,8 @@ def _write_tiles(
         half = settings.disparity_dtype == "float16"
         summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
         summary["quality"] = gates
+        stated = np.sum([checks.stated for checks in scene_checks.values()], axis=0)
+        summary["label_uncertainty"] = sigma_by_surface(stated)
         write_table(scratch / "manifest.csv", rows)
         write_footprints(scratch, [feature(row, ring) for row, ring in written])
         for picture in drawn:

@@ -15,15 +15,17 @@ from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from .pictures import SERIES, show_texts
+from .pictures import SERIES, Picture, encode, show_texts
 
 SVG = "{http://www.w3.org/2000/svg}"
+HREF = "{http://www.w3.org/1999/xlink}href"
 ElementTree.register_namespace("", SVG[1:-1])
 ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
 AXES = "#7b838f"  # axes, ticks and grid
@@ -45,11 +47,13 @@ STYLE = {
     "ytick.color": AXES,
     "xtick.labelcolor": "black",  # is the page's colour of text
     "ytick.labelcolor": "black",
+    "image.composite_image": False,
     "legend.frameon": False,
     "legend.fontsize": 9,
     "svg.fonttype": "none",
     "svg.hashsalt": "stereotruth",
 }
+styled = rc_context(STYLE)  # decorates functions that draw a chart
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ class Plot:
     figure: Figure
     axes: list[list[Axes]]
     hovers: dict[str, tuple[list[str], list[str]]] = field(default_factory=dict)
+    pictures: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -78,9 +83,8 @@ class Plot:
         **options: Any,
     ) -> Plot:  # fmt: skip
         """A figure of ``size`` inches; ``options``: of :meth:`Figure.subplots`."""
-        with rc_context(STYLE):
-            figure = Figure(figsize=size, layout="constrained")
-            axes = figure.subplots(rows, columns, squeeze=False, **options)
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False, **options)
         figure.patch.set_visible(False)
         for axis in axes.flat:
             axis.patch.set_visible(False)
@@ -100,13 +104,19 @@ class Plot:
         artist.set_gid(name)
         self.hovers[name] = list(texts), list(links) or [""] * len(texts)
 
+    def picture(self, axis: Axes, picture: Picture, extent: Sequence[float], limit: int) -> None:
+        """Show a picture at (left, right, bottom, top), as WebP of ``limit`` bytes at most."""
+        name = f"picture{len(self.pictures)}"
+        shown = axis.imshow(np.zeros((2, 2, 4)), extent=extent, interpolation="none")
+        shown.set_gid(name)
+        self.pictures[name] = encode(picture, limit)
+
     def chart(self, values: Sequence[Mapping[str, Any]] = ()) -> Chart:
         """The chart; ``values``: rows of its CSV."""
         show_texts(self.figure)
         stream = io.StringIO()
-        with rc_context(STYLE):
-            FigureCanvasSVG(self.figure)
-            self.figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+        FigureCanvasSVG(self.figure)
+        self.figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
         root = ElementTree.fromstring(stream.getvalue())
         for name in ("width", "height"):
             del root.attrib[name]
@@ -114,6 +124,9 @@ class Plot:
         for group in list(root.iter(f"{SVG}g")):
             if name := group.attrib.pop("id", ""):  # else twice in a page
                 _say(group, *self.hovers.get(name, ([], [])))
+        for image in root.iter(f"{SVG}image"):
+            image.attrib |= {HREF: self.pictures[image.attrib.pop("id")]}
+            image.set("preserveAspectRatio", "none")
         for metadata in root.findall(f"{SVG}metadata"):
             root.remove(metadata)
         return Chart(
@@ -123,6 +136,8 @@ class Plot:
 
 def _say(group: ElementTree.Element, texts: Sequence[str], links: Sequence[str]) -> None:
     """Give titles and links to the marks of a group, or one title to the whole of it."""
+    if not texts:
+        return
     if len(texts) == 1 and not links[0]:
         ElementTree.SubElement(group, f"{SVG}title").text = texts[0]
         return

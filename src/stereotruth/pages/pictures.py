@@ -1,7 +1,8 @@
 """Arrays to 8-bit pictures, pictures to data URIs, figures to files.
 
-Disparities are drawn in ``DISPARITIES``, differences in ``DIFFERENCES``: maps of colours that tell
-without red and green, and whose lightness alone tells in print. Pixels without a value are light
+Disparities are drawn in ``DISPARITIES``, errors in ``ERRORS``, differences in ``DIFFERENCES``: what
+is judged minus what it is judged by, red below and blue above. These maps of colours tell without
+red and green. Pixels without a value are light
 grey.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -139,6 +141,28 @@ def gradient(cmap: str, stops: int = 13) -> str:
     """The colours of a matplotlib map as a CSS gradient, left to right."""
     rgb = (colormaps[cmap](np.linspace(0, 1, stops))[:, :3] * 255 + 0.5).astype(int)
     return f"linear-gradient(90deg,{','.join(f'rgb({r},{g},{b})' for r, g, b in rgb)})"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A scale of colours: what stands at its ends, and the colours as a CSS gradient."""
+
+    low: str
+    high: str
+    colours: str
+
+    @classmethod
+    def of(cls, cmap: str, low: str, high: str) -> Scale:
+        """Of a matplotlib map."""
+        return cls(low, high, gradient(cmap))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A picture of a slider: a data URI, and the scale of its colours."""
+
+    uri: str
+    scale: Scale | None = None
 
 
 def hillshade(disparity: NDArray[np.floating], base_to_height: float) -> Picture:

@@ -4,35 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
 
 from ..epipolar import site_pairs
 from ..epipolar.linked_images import Links
+from ..epipolar.pair_geometry import ray_upwards
 from ..epipolar.pair_quality import rate
 from ..numerics.degrees import metres_per_degree
-from ..pages.figures import Axis
+from ..pages.figures import AXES, Chart, Plot, look, styled
 from ..pages.page import way, write_page
+from ..pages.pictures import DISPARITIES, Scale
 from ..pages.tables import Table, table
-from ..pages.pictures import DISPARITIES, SERIES, gradient, round_length
+from .maps import on_the_ground
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
-SIDE, WIDTH, HEIGHT = 600.0, 620.0, 360.0
 FIRST_DAY = 1.0  # below it, the axis of days is linear
 
 
 @dataclass(frozen=True)
 class SiteImage:
-    """An image: when it was taken (text), its corners on the ground as (lon, lat) degrees."""
+    """An image: when it was taken (text), its corners on the ground as (lon, lat) degrees.
+
+    ``off_nadir``: angle of its middle ray to the vertical, degrees; ``sun``: azimuth and elevation,
+    degrees, None where nothing tells them.
+    """
 
     name: str
     acquired: str
     corners: Sequence[tuple[float, float]]
+    off_nadir: float | None = None
+    sun: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,11 @@ def image_of(image: site_pairs.SiteImage) -> SiteImage:
         float(image.sensor.rpc.height_off),
     )
     corners = [(float(x), float(y)) for x, y in zip(lon, lat)]
-    return SiteImage(image.name, "" if image.time is None else f"{image.time:%Y-%m-%d}", corners)
+    middle = (cols - 1) / 2, (rows - 1) / 2, float(image.sensor.rpc.height_off)
+    upwards = float(ray_upwards(image.sensor, *middle)[2])
+    acquired = "" if image.time is None else f"{image.time:%Y-%m-%d %H:%M}"
+    off_nadir = math.degrees(math.acos(min(upwards, 1.0)))
+    return SiteImage(image.name, acquired, corners, off_nadir, image.sun)
 
 
 def pairs_of(
@@ -107,14 +116,14 @@ def write_site_page(
         "index": way(out, index),
         "page": way(out, page),
         "map": _map(images),
-        "pairs": _chart(pairs),
-        "table": _pairs_table(pairs, way(out, page)),
+        "chart_of_pairs": _chart(pairs, way(out, page)),
+        "images": _images_table(images),
+        "pairs": _pairs_table(pairs, way(out, page)),
+        "counts": (len(images), len(pairs), sum(bool(pair.scene) for pair in pairs)),
         "residuals": _residuals(adjusted),
         "remarks": _remarks(adjusted),
         "closure": _closure(closure),
-        "qualities": gradient(DISPARITIES),
-        "scenes": [pair.scene for pair in pairs if pair.scene],
-        "images": images,
+        "qualities": Scale.of(DISPARITIES, "0", "100 % matched"),
         "unlinked": _unlinked(images, pairs),
     }
     write_page(out, TEMPLATE, values)
@@ -126,61 +135,89 @@ def _unlinked(images: Sequence[SiteImage], pairs: Sequence[Pair]) -> list[str]:
     return Links.of((image.name for image in images), made).sentences
 
 
-def _map(images: Sequence[SiteImage]) -> dict[str, Any]:
-    """Footprints north up in an SVG view box (y down), and a bar for the scale."""
+@styled
+def _map(images: Sequence[SiteImage]) -> Chart:
+    """Footprints, north up, in metres from their south-west corner."""
     every = np.array([corner for image in images for corner in image.corners])
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2
-    metres = np.array(metres_per_degree(float(middle[1])))
-    extent = np.ptp(every, axis=0) * metres
-    scale = SIDE / float(extent.max())
-    width, height = (float(v) for v in extent * scale)
-    shapes = []
+    corner = every.min(axis=0)
+    metres = np.array(metres_per_degree(float(every[:, 1].mean())))
+    east, north = np.ptp(every, axis=0) * metres
+    plot = Plot.of(
+        "footprints of the images",
+        "Footprints at the height of each image's RPC; names on hover.",
+        (5.6, 1.2 + 4.6 * min(north / east, 1.6) + 0.17 * min(len(images), 6)),
+    )
+    table = []
     for k, image in enumerate(images):
-        x, y = ((np.array(image.corners) - middle) * metres * scale * (1, -1)).T
-        x, y = x + width / 2, y + height / 2
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y))
-        colour = SERIES[k % len(SERIES)]
-        shapes.append(
-            {"name": image.name, "day": image.acquired, "points": points, "colour": colour}
-        )
-    bar_m = round_length(float(extent[0]) / 4)
-    return {
-        "width": round(width, 1),
-        "height": round(height, 1),
-        "shapes": shapes,
-        "bar": round(bar_m * scale, 1),
-        "bar_m": bar_m,
-    }
+        x, y = ((np.array(image.corners) - corner) * metres).T
+        style = look(k)
+        (shape,) = plot.axis.fill(x, y, facecolor="none", edgecolor=style["color"], linewidth=1.6)
+        shape.set(linestyle=style["linestyle"], label=image.name)
+        plot.hover(shape, [f"{image.name} {image.acquired}".strip()])
+        table += [
+            {"image": image.name, "lon": f"{lon:.7f}", "lat": f"{lat:.7f}"}
+            for lon, lat in image.corners
+        ]
+    on_the_ground(plot.axis)
+    if len(images) <= 6:
+        plot.figure.legend(loc="outside lower center", ncols=3)
+    return plot.chart(table)
 
 
-def _chart(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Pairs with dates by convergence and days, coloured by their quality."""
-    dated = [(pair, pair.days) for pair in pairs if pair.days is not None]
-    x = Axis(0.0, max([pair.convergence for pair in pairs], default=1.0) * 1.05, WIDTH)
-    longest = max([days for _, days in dated], default=1.0) * 1.1
-    y = Axis(0.0, max(longest, FIRST_DAY), HEIGHT, turned=True, linear_to=FIRST_DAY)
-    points = [
+@styled
+def _chart(pairs: Sequence[Pair], page: str | None) -> Chart | None:
+    """Pairs with dates by convergence and days, coloured by their quality; scenes are squares."""
+    dated = [pair for pair in pairs if pair.days is not None]
+    if not dated:
+        return None
+    undated = len(pairs) - len(dated)
+    more = f" Without dates, so in the table alone: {undated}." if undated else ""
+    plot = Plot.of(
+        "pairs by convergence and days",
+        "Colour: predicted share of the pixels seen in both images that matching finds within "
+        f"1 px. Large squares are scenes.{more}",
+        (6.4, 4.4),
+    )
+    for is_scene, marker, size in ((False, "o", 36), (True, "s", 90)):
+        of = [pair for pair in dated if bool(pair.scene) == is_scene]
+        if not of:
+            continue
+        marks = plot.axis.scatter(
+            [pair.convergence for pair in of],
+            [pair.days for pair in of],
+            s=size, marker=marker, c=[pair.matched for pair in of],
+            cmap=DISPARITIES, vmin=0, vmax=1, edgecolors=AXES, linewidths=1.2,
+        )  # fmt: skip
+        texts = [
+            f"{pair.scene + ': ' if pair.scene else ''}{pair.left} and {pair.right}: "
+            f"{100 * pair.matched:.0f} %, {pair.convergence:.1f}°, {pair.days:.2f} days; "
+            f"{pair.reason}"
+            for pair in of
+        ]
+        links = [f"{page}#scene-{pair.scene}" if page and pair.scene else "" for pair in of]
+        plot.hover(marks, texts, links)
+    plot.axis.set_yscale("symlog", linthresh=FIRST_DAY)
+    plot.axis.set(xlabel="convergence, degrees", ylabel="days apart", xlim=(0, None))
+    plot.axis.set_ylim(-0.2, None)
+    return plot.chart([vars(pair) for pair in dated])
+
+
+def _images_table(images: Sequence[SiteImage]) -> Table | None:
+    """When and from where each image was taken."""
+    rows = [
         {
-            "x": x.at(pair.convergence),
-            "y": y.at(days),
-            "colour": to_hex(colormaps[DISPARITIES](pair.matched)),
-            "scene": pair.scene,
-            "text": f"{pair.left} and {pair.right}: {100 * pair.matched:.0f} %, "
-            f"{pair.convergence:.1f} degrees, {days:.2f} days; {pair.reason}",
+            "image": image.name,
+            "acquired (UTC)": image.acquired,
+            "off_nadir_degrees": _number(image.off_nadir, ".1f"),
+            "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
+            "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),
         }
-        for pair, days in dated
+        for image in images
     ]
-    return {
-        "width": WIDTH,
-        "height": HEIGHT,
-        "points": points,
-        "x_ticks": x.ticks(),
-        "y_ticks": [(at, text) for at, text in y.ticks() if "." not in text],
-        "undated": len(pairs) - len(dated),
-    }
+    return table(rows)
 
 
-def _pairs_table(pairs: Sequence[Pair], page: Path | None) -> Table | None:
+def _pairs_table(pairs: Sequence[Pair], page: str | None) -> Table | None:
     """All pairs; those that are scenes lead to their part of the page."""
     rows = [
         {
@@ -194,18 +231,8 @@ def _pairs_table(pairs: Sequence[Pair], page: Path | None) -> Table | None:
         }
         for pair in pairs
     ]
-    made = table(rows)
-    if made is None or page is None:
-        return made
-    ((heading, lines),) = made.groups
-    at = list(rows[0]).index("scene")
-    linked = [
-        (*cells[:at], replace(cells[at], href=f"{page}#scene-{pair.scene}"), *cells[at + 1 :])
-        if pair.scene
-        else cells
-        for cells, pair in zip(lines, pairs)
-    ]
-    return replace(made, groups=((heading, tuple(linked)),))
+    scenes = [pair.scene for pair in pairs if pair.scene] if page else []
+    return table(rows, links={"scene": {scene: f"{page}#scene-{scene}" for scene in scenes}})
 
 
 def _number(value: Any, form: str = ".3f") -> str:

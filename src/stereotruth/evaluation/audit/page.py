@@ -15,8 +15,8 @@ from ...dataset.stereo_dataset import StereoDataset
 from ...pages import pictures
 from ...pages.figures import HEIGHT, SHAPES, WIDTH, Axis, Chart, Point, Series
 from ...pages.page import write_page
-from ...pages.tables import Cell, Column, Headline, Table, minus, table, words
 from ...pages.pictures import SERIES, encode, gradient
+from ...pages.tables import Cell, Column, Headline, Table, minus, table, words
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX, estimate

@@ -9,9 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...lidar.height_raster import HeightRaster
-from ...products.files import atomic_folder, write_json, write_table
 from ...pages.page import way, write_page
-from ...pages.tables import Headline, minus, table
 from ...pages.pictures import (
     Picture,
     colours,
@@ -22,6 +20,8 @@ from ...pages.pictures import (
     save_figure,
     shrink,
 )
+from ...pages.tables import Headline, minus, table
+from ...products.files import atomic_folder, write_json, write_table
 from .edges import HIGH, LOW, SHARP, S
 from .height_errors import OPEN
 from .score import Verdict

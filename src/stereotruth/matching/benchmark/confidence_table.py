@@ -9,8 +9,8 @@ from typing import Any
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from ...products.files import read_table
 from ...pages.pictures import save_figure
+from ...products.files import read_table
 from .scores import ALL
 from .tables import Table, nothing, plain_table
 

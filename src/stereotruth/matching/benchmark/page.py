@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ...pages.page import way, write_page
-from ...pages.tables import Headline, metres, minus
 from ...pages.pictures import DISPARITIES, ERRORS, encode, encode_file, gradient, shrink
+from ...pages.tables import Headline, metres, minus
 from .page_charts import cumulative_chart, strata_chart
 from .page_tables import sections
 from .panels import ERROR_PX, Column, map_pictures

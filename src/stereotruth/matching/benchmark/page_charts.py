@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ...pages.figures import HEIGHT, WIDTH, Axis, Chart, Point, Series, line, look
-from ...products.files import read_table
 from ...pages.tables import metres
+from ...products.files import read_table
 
 Row = Mapping[str, Any]
 LEAST_PX = 0.05  # of the axes of errors

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, in_number
-from ...products.files import atomic_file, write_table
 from ...pages.tables import Cell, Column, metres, minus
 from ...pages.tables import Table as Shown
+from ...products.files import atomic_file, write_table
 from ..kinds import KINDS
 from . import published_scores
 from .training_data import COLUMNS as TRAINING

@@ -20,9 +20,9 @@ from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
-from stereotruth.products.files import write_table
 from stereotruth.pages.page import PAPER
 from stereotruth.pages.tables import minus
+from stereotruth.products.files import write_table
 
 from ....browser import CHROMIUM, look
 from ....synthetic.pair_with_block import make
