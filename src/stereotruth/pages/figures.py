@@ -26,8 +26,6 @@ from .pictures import SERIES, Picture, encode, show_texts
 
 SVG = "{http://www.w3.org/2000/svg}"
 HREF = "{http://www.w3.org/1999/xlink}href"
-ElementTree.register_namespace("", SVG[1:-1])
-ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
 AXES = "#7b838f"  # axes, ticks and grid
 MARKERS = ("o", "^", "s", "D", "v", "P")
 DASHES = ("-", (0, (6, 2)), (0, (1, 1.5)), (0, (8, 2, 1, 2)), (0, (4, 1)), (0, (2, 1)))
@@ -129,9 +127,12 @@ class Plot:
             image.set("preserveAspectRatio", "none")
         for metadata in root.findall(f"{SVG}metadata"):
             root.remove(metadata)
-        return Chart(
-            self.title, self.caption, ElementTree.tostring(root, "unicode"), as_csv(values)
-        )
+        for element in root.iter():  # as HTML has it: no namespaces
+            element.tag = element.tag.removeprefix(SVG)
+            if HREF in element.attrib:
+                element.set("href", element.attrib.pop(HREF))
+        svg = ElementTree.tostring(root, "unicode")
+        return Chart(self.title, self.caption, svg, as_csv(values))
 
 
 def _say(group: ElementTree.Element, texts: Sequence[str], links: Sequence[str]) -> None:
@@ -153,7 +154,7 @@ def _say(group: ElementTree.Element, texts: Sequence[str], links: Sequence[str])
         if link:
             place = list(parent).index(mark)
             parent.remove(mark)
-            anchor = ElementTree.Element(f"{SVG}a", href=link)
+            anchor = ElementTree.Element("a", href=link)
             anchor.append(mark)
             parent.insert(place, anchor)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ SIDE_PX = 400  # of a picture
 INCHES, DPI = 3.2, 120
 ERROR_PX = 6.0  # end of the scale of errors: twice the threshold of D1
 INVALID = (60, 190, 255)
+NAME_LETTERS = 18  # in a line of the names of rows
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
     aspect = columns[0].left.shape[0] / columns[0].left.shape[1]
     size = INCHES if across else INCHES * 0.8
     figure = Figure(
-        figsize=(size * grid[1] + 0.9, size * aspect * grid[0] + 1.2), layout="constrained"
+        figsize=(size * grid[1] + 2.2, size * aspect * grid[0] + 1.2), layout="constrained"
     )
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
     axes = figure.subplots(*grid, squeeze=False)
@@ -98,10 +100,12 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
             axis = by_name[n, c]
             if name in of:
                 axis.imshow(shrink(of[name], SIDE_PX), cmap="gray", vmin=0, vmax=255)
-            if c == 0:
-                (axis.set_title if across else axis.set_ylabel)(name, fontsize=9)
-            if n == 0:
-                (axis.set_ylabel if across else axis.set_title)(column.title, fontsize=9)
+            if n == 0 if across else c == 0:  # level, so that a low row cuts nothing
+                row = wrap(column.title if across else name, NAME_LETTERS)
+                style = {"rotation": 0, "ha": "right", "va": "center", "fontsize": 9}
+                axis.set_ylabel("\n".join(row), **style)
+            if c == 0 if across else n == 0:
+                axis.set_title(name if across else column.title, fontsize=9)
     _legend(figure, dict(zip(names, by_name)), limits, "bottom" if across else "right")
     save_figure(path, figure, dpi=DPI)
 
