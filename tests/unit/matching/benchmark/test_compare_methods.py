@@ -21,7 +21,7 @@ def test_the_page_is_whole_and_needs_no_network(compared, tmp_path):
     )
     assert seen.wrong == [] and seen.requests == []
     count, loaded, tables, text = seen.found
-    assert count == 5 + 6 and loaded and tables == 5
+    assert count == 5 + 6 + 2 and loaded and tables == 6
     for word in ("Accuracy, time and memory", "table 5 of the paper", "Half", "Kunming", "EPE"):
         assert word in text
 
