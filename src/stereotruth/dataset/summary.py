@@ -105,11 +105,11 @@ def label_uncertainty(summary: Mapping[str, Any]) -> list[str]:
         return []
     total = by.pop("all")
     surfaces = ", ".join(
-        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2f} px" for name, of in by.items()
+        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2g} px" for name, of in by.items()
     )
     return [
-        f"Labels known to {total['uncertainty_median_px']:.2f} px (median), "
-        f"{total['uncertainty_p95_px']:.2f} px for 95 % ({surfaces})"
+        f"Labels known to {total['uncertainty_median_px']:.2g} px (median), "
+        f"{total['uncertainty_p95_px']:.2g} px for 95 % ({surfaces})"
     ]
 
 

@@ -85,14 +85,14 @@ def _uncertainty(by: Mapping[str, Any], height_m_per_px: float | None) -> list[H
         return []
     median, most = (by["all"][f"uncertainty_{name}_px"] for name in ("median", "p95"))
     surfaces = ", ".join(
-        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2f}"
+        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2g}"
         for name, of in by.items()
         if name != "all"
     )
     note = joined(
-        f"median; {most:.2f} px for 95 %", metres(median, height_m_per_px), f"medians: {surfaces}"
+        f"median; {most:.2g} px for 95 %", metres(median, height_m_per_px), f"medians: {surfaces}"
     )
-    return [Headline("labels known to", f"{median:.2f} px", note)]
+    return [Headline("labels known to", f"{median:.2g} px", note)]
 
 
 def _lidar(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:

@@ -114,7 +114,7 @@ def _totals(exports: list[dict[str, Any]]) -> list[Headline]:
         for of in made
         if (total := of.get("label_uncertainty", {}).get("all"))
     ]
-    known = [Headline("labels known to", f"{spread(medians, '.2f')} px", "median of a city")]
+    known = [Headline("labels known to", f"{spread(medians, '.2g')} px", "median of a city")]
     return [
         *(known if medians else ()),
         Headline(
@@ -155,8 +155,8 @@ def _city(root: Path, out: Path, page: Path, export: Mapping[str, Any]) -> tuple
         value_cell(export["labelled_pairs"], "d"),
         value_cell(export["size_px"], "d"),
         value_cell(_labelled(export), ".1f", 100, " %"),
-        value_cell(known.get("uncertainty_median_px"), ".2f"),
-        value_cell(known.get("uncertainty_p95_px"), ".2f"),
+        value_cell(known.get("uncertainty_median_px"), ".2g"),
+        value_cell(known.get("uncertainty_p95_px"), ".2g"),
         *(value_cell(splits.get(split, 0), "d") for split in SPLITS),
         value_cell(errors["mean_absolute"] if errors.get("count") else None, ".3f"),
         Cell(spread(sift, ".2f"), f"{max(sift):.6g}" if sift else ""),

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...pages.figures import Chart, Plot, look, styled
+from ...pages.figures import Chart, Plot, log_axis, look, styled
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, ERRORS, Layer, Scale, encode, encode_file, shrink
 from ...pages.tables import Cell, Column, Headline, joined, metres, minus
@@ -177,8 +177,7 @@ def cumulative_chart(methods: Sequence[Row], folders: Sequence[str | Path]) -> C
         plot.hover(line, [of["label"]])
         values += [{"method": of["label"], **row} for row in rows]
     plot.axis.set_xscale("log")
-    plot.axis.set_xticks([0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20], minor=False)
-    plot.axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    log_axis(plot.axis.xaxis)
     plot.axis.set(xlabel="absolute error, px", ylabel="% of the pixels below", ylim=(0, 102))
     plot.figure.legend(loc="outside lower center", ncols=3)
     return plot.chart(values)
@@ -219,7 +218,7 @@ def strata_chart(methods: Sequence[Row]) -> Chart | None:
     plot.axis.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
     plot.axis.set_ylim(len(names) - 0.5, -0.5)
     plot.axis.set_xscale("log")
-    plot.axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    log_axis(plot.axis.xaxis)
     plot.axis.set_xlabel("EPE, px")
     plot.figure.legend(loc="outside lower center", ncols=3)
     keys = list(dict.fromkeys(key for row in values for key in row))

@@ -258,7 +258,8 @@ def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
     labels = [of["label"] for of in methods]
     figures = [Figure("EPE, px", "filled_epe_px")]
     if methods:
-        figures.append(Figure("D1, %", f"filled_{_d1(methods[0])}", 100, ".2f"))
+        limit = methods[0]["thresholds_px"][0]
+        figures.append(Figure(f"> {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f"))
     groups = list(dict.fromkeys(row.get("group", "") for row in rows))
     found = []
     for group in groups:
@@ -384,11 +385,6 @@ def _plain(methods: Sequence[Row]) -> list[Row]:
 
 def _kind(of: Row) -> str:
     return of["settings"]["kind"]
-
-
-def _d1(of: Row) -> str:
-    """Name of the figure of the first threshold."""
-    return f"d1_{of['thresholds_px'][0]:g}_px_share"
 
 
 def _city(of: Row, city: str) -> Row:

@@ -72,7 +72,13 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     assert texts(five.shown[0][1])[0][-5:-3] == ["506", "700"]
     assert "paper_epe_px" not in five.rows[2]  # the paper's StereoNet was not fine-tuned
     (_, ours), (_, published) = six.shown
-    assert titles(ours) == ["city", "Sgm: EPE, px", "Sgm: D1, %", "Net: EPE, px", "Net: D1, %"]
+    assert titles(ours) == [
+        "city",
+        "Sgm: EPE, px",
+        "Sgm: > 3 px, %",
+        "Net: EPE, px",
+        "Net: > 3 px, %",
+    ]
     assert [heading for heading, _ in ours.groups] == [
         "cities with training tiles",
         "cities without",
