@@ -33,6 +33,7 @@ MARKERS = ("o", "^", "s", "D", "v", "P")
 DASHES = ("-", (0, (6, 2)), (0, (1, 1.5)), (0, (8, 2, 1, 2)), (0, (4, 1)), (0, (2, 1)))
 STYLE = {
     "font.size": 10,
+    "font.sans-serif": ["DejaVu Sans"],
     "axes.edgecolor": AXES,
     "axes.grid": True,
     "axes.axisbelow": True,

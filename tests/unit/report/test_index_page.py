@@ -20,6 +20,7 @@ EXPORT = {
     "labelled_pairs": 4,
     "splits": {"realised": {"train": 2, "val": 1, "test": 1, "none": 0}},
     "share_of_pixels": {"labelled": 0.8, "labelled_between": 0.029, "no_points": 0.171},
+    "label_uncertainty": {"all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104}},
     "quality": {
         "scenes": {"A-1": {"sift_mean_absolute_error_px": 0.2416}},
         "flagged_tiles": {"A_1": "max_sift_error_px"},
@@ -58,22 +59,20 @@ def folder(tmp_path):
 
 def test_figures_are_those_of_the_files(folder):
     text = write_index(folder).read_text()
-    for words in (
-        "4 labelled pairs of 256 × 256 px (2 train, 1 val, 1 test)",
-        "82.9 % of their pixels labelled",
-        "SIFT disparity minus label: 0.24 px mean absolute",
-        "error against the exact truth: 0.021 px",
-        "1 tile beyond a limit of quality",
-    ):
-        assert words in text
     rows = [
         [re.sub("<.*?>", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)]
         for row in text.split("<tr>")
     ]
-    assert ["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"] in rows
-    assert rows.index(["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"]) < rows.index(
-        ["own", "SGM", "1.250 px", "4.21 % (3 px)", "90.0 %", "7"]
+    city = ["4", "256", "82.9 %", "0.041", "0.1", "2", "1", "1", "0.021", "0.24", "1"]
+    assert ["A b", "where the tiles are", *city, "manifest.csv"] in rows
+    net, sgm = (
+        rows.index(["own", label, f"{epe} px", "4.21 % (&gt; 3 px)", "90.0 %", "7"])
+        for label, epe in (("NET", "0.500"), ("SGM", "1.250"))
     )
+    assert net < sgm
+    heads = dict(re.findall(r'<dt>(.*?)</dt><dd class="value">(.*?)</dd>', text))
+    assert heads["labelled pairs"] == "4" and heads["train, val, test"] == "2, 1, 1"
+    assert heads["labels known to"] == "0.041 px" and heads["labels"] == "0.2 million"
     assert ["own", "12", "9", "2", "1", "pairs.csv"] in rows
 
 
