@@ -41,7 +41,12 @@ from .label_doubts import Doubt, ToldDoubt, doubts, surface_figures
 from .layer_kinds import column
 from .orientation import save
 from .quality_limits import flag, missed
-from .quick_looks import draw_contact_sheet, draw_coverage
+from .quick_looks import (
+    STATUS_COLOURS_FILE,
+    draw_contact_sheet,
+    draw_coverage,
+    write_status_colours,
+)
 from .scene_stores import SceneFiles, SceneStores, open_stores
 from .settings import Limits, Settings
 from .sift_matches import MATCH_COLUMNS, match_rows
@@ -339,6 +344,7 @@ def _write_tiles(
         summary["label_uncertainty"] = sigma_by_surface(stated)
         write_table(scratch / "manifest.csv", rows)
         write_footprints(scratch, [feature(row, ring) for row, ring in written])
+        write_status_colours(scratch / STATUS_COLOURS_FILE, cut.flags)
         for picture in drawn:
             picture.result()
     return summary, rows

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..dataset.manifest import read_manifest
 from ..dataset.pixel_size import PixelSize
-from ..dataset.quick_looks import SPLIT_COLOURS
+from ..dataset.quick_looks import SPLIT_COLOURS, status_colours
 from ..dataset.split_names import NONE, SPLITS
 from ..errors import InputError
 from ..job import progress
@@ -233,7 +233,7 @@ def _of_tiles(
         "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "statuses": {name: count / total for name, count in statuses.items() if count},
-        "status_colours": tile_pictures.status_colours(list(statuses)),
+        "status_colours": status_colours(list(statuses)),
         "shares": {row["tile"]: _shares(status_counts(row)) for row in rows},
         "split_colours": SPLIT_COLOURS,
         "no_match": f"rgb{tile_pictures.NO_MATCH}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.dataset.quick_looks import SPLIT_COLOURS
+from stereotruth.dataset.quick_looks import SPLIT_COLOURS, STATUS_COLOURS, status_colours
 from stereotruth.pages.pictures import NO_VALUE
 from stereotruth.products.rasters import write_tiff
 from stereotruth.report import tile_pictures
@@ -39,7 +39,7 @@ def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
     assert np.abs(warped[15:25, 26:44] - tile_pictures.NO_MATCH).max() < 25
     assert np.abs(difference[15:25, 26:44] - NO_VALUE).max() < 25
     status = picture(made.uris["status"])
-    colours = tile_pictures.status_colours(list(FLAGS.values()))
+    colours = status_colours(list(FLAGS.values()))
     for place, name in ((status[60:, 60:], "labelled"), (status[15:25, 26:44], "a_new_reason")):
         assert np.abs(place - tuple(bytes.fromhex(colours[name][1:]))).max() < 25
 
@@ -55,5 +55,5 @@ def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
 
 
 def test_colours_of_status_and_splits_are_apart_for_all_eyes():
-    assert nearest([rgb(colour) for colour in tile_pictures.STATUS_COLOURS.values()]) > 20
+    assert nearest([rgb(colour) for colour in STATUS_COLOURS.values()]) > 20
     assert nearest([rgb(colour) for colour in SPLIT_COLOURS.values()]) > 20
