@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from ..settings import PATTERN
 from .imported_files import imported_files
 
@@ -250,5 +250,5 @@ def need_pytorch(name: str, kind: str) -> None:
     if not all(map(find_spec, ("torch", "tqdm"))):
         raise InputError(
             f"{kind} needs PyTorch and tqdm, which are not installed",
-            remedy=f"pip install 'stereotruth[{KINDS[kind].extra}]'",
+            remedy=install_extra(KINDS[kind].extra),
         )
