@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..epipolar import site_pairs
 from ..epipolar.linked_images import Links
 from ..epipolar.pair_geometry import ray_upwards
-from ..epipolar.pair_quality import rate
+from ..epipolar.pair_quality import RatedPair
+from ..epipolar.site_pairs import SiteImage
 from ..numerics.degrees import metres_per_degree
 from ..pages.figures import AXES, Chart, Plot, look, styled
 from ..pages.page import way, write_page
@@ -25,81 +24,13 @@ TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
 FIRST_DAY = 1.0  # below it, the axis of days is linear
 
 
-@dataclass(frozen=True)
-class SiteImage:
-    """An image: when it was taken (text), its corners on the ground as (lon, lat) degrees.
-
-    ``off_nadir``: angle of its middle ray to the vertical, degrees; ``sun``: azimuth and elevation,
-    degrees, None where nothing tells them.
-    """
-
-    name: str
-    acquired: str
-    corners: Sequence[tuple[float, float]]
-    off_nadir: float | None = None
-    sun: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A pair of images; ``matched``: predicted share; ``scene`` that is made of it, or empty."""
-
-    left: str
-    right: str
-    matched: float
-    convergence: float
-    days: float | None
-    reason: str
-    scene: str
-
-
-def image_of(image: site_pairs.SiteImage) -> SiteImage:
-    """An image with its corners at the height of its RPC."""
-    cols, rows = image.size
-    lon, lat = image.sensor.localize(
-        np.array([0.0, cols - 1.0, cols - 1.0, 0.0]),
-        np.array([0.0, 0.0, rows - 1.0, rows - 1.0]),
-        float(image.sensor.rpc.height_off),
-    )
-    corners = [(float(x), float(y)) for x, y in zip(lon, lat)]
-    middle = (cols - 1) / 2, (rows - 1) / 2, float(image.sensor.rpc.height_off)
-    upwards = float(ray_upwards(image.sensor, *middle)[2])
-    acquired = "" if image.time is None else f"{image.time:%Y-%m-%d %H:%M}"
-    off_nadir = math.degrees(math.acos(min(upwards, 1.0)))
-    return SiteImage(image.name, acquired, corners, off_nadir, image.sun)
-
-
-def pairs_of(
-    images: Sequence[site_pairs.SiteImage],
-    scenes: Mapping[str, tuple[str, str]],
-    roughness_m: float | None,
-) -> list[Pair]:
-    """All pairs of a site, best first.
-
-    ``scenes``: names of the images of each, in any order; ``roughness_m`` of the site, None: not
-    known.
-    """
-    names = {frozenset(pair): scene for scene, pair in scenes.items()}
-    return [
-        Pair(
-            one.pair.left,
-            one.pair.right,
-            one.quality.matched,
-            one.pair.convergence,
-            one.pair.days,
-            one.quality.reason,
-            names.get(frozenset((one.pair.left, one.pair.right)), ""),
-        )
-        for one in rate(images, roughness_m)
-    ]
-
-
 def write_site_page(
     city: str,
     images: Sequence[SiteImage],
-    pairs: Sequence[Pair],
+    pairs: Sequence[RatedPair],
     out: str | Path,
     *,
+    scenes: Mapping[str, Sequence[str]],
     adjusted: Mapping[str, Any],
     closure: Mapping[str, Any],
     page: str | Path | None,
@@ -107,38 +38,71 @@ def write_site_page(
 ) -> None:
     """Write the page of a site to ``out``.
 
-    ``adjusted``, ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there
-    are none; ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all
-    pages.
+    ``pairs``: best first; ``scenes``: names of the images of each, in any order; ``adjusted``,
+    ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there are none;
+    ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all pages.
     """
+    names = {frozenset(pair): scene for scene, pair in scenes.items()}
+    rows = _pair_rows(pairs, names)
+    made = [pair.names for pair in pairs if frozenset(pair.names) in names]
     values = {
         "city": city,
         "index": way(out, index),
         "page": way(out, page),
         "map": _map(images),
-        "chart_of_pairs": _chart(pairs, way(out, page)),
+        "chart_of_pairs": _chart(rows, way(out, page)),
         "images": _images_table(images),
-        "pairs": _pairs_table(pairs, way(out, page)),
-        "counts": (len(images), len(pairs), sum(bool(pair.scene) for pair in pairs)),
+        "pairs": _pairs_table(rows, way(out, page)),
+        "counts": (len(images), len(pairs), len(made)),
         "residuals": _residuals(adjusted),
         "remarks": _remarks(adjusted),
         "closure": _closure(closure),
         "qualities": Scale.of(DISPARITIES, "0", "100 % matched"),
-        "unlinked": _unlinked(images, pairs),
+        "unlinked": Links.of((image.name for image in images), made).sentences,
     }
     write_page(out, TEMPLATE, values)
 
 
-def _unlinked(images: Sequence[SiteImage], pairs: Sequence[Pair]) -> list[str]:
-    """Images that no scene uses, and groups that none links."""
-    made = [(pair.left, pair.right) for pair in pairs if pair.scene]
-    return Links.of((image.name for image in images), made).sentences
+def _pair_rows(
+    pairs: Sequence[RatedPair], scenes: Mapping[frozenset[str], str]
+) -> list[dict[str, str]]:
+    """Rows of the pairs: angles, days, what each promises, the scene that is made of it."""
+    return [
+        {
+            "left": one.pair.left,
+            "right": one.pair.right,
+            "scene": scenes.get(frozenset(one.names), ""),
+            "matched_share": f"{one.quality.matched:.4f}",
+            "height_sigma_m": f"{one.quality.height_sigma_m:.2f}",
+            "height_m_per_px": f"{one.pair.metres_per_px:.2f}",
+            "convergence_degrees": f"{one.pair.convergence:.1f}",
+            "days": "" if one.pair.days is None else f"{one.pair.days:.2f}",
+            "reason": one.quality.reason,
+        }
+        for one in pairs
+    ]
+
+
+def _corners(image: SiteImage) -> np.ndarray:
+    """[4, (lon, lat)] degrees, at the height of the image's RPC."""
+    cols, rows = image.size
+    lon, lat = image.sensor.localize(
+        np.array([0.0, cols - 1.0, cols - 1.0, 0.0]),
+        np.array([0.0, 0.0, rows - 1.0, rows - 1.0]),
+        float(image.sensor.rpc.height_off),
+    )
+    return np.stack([lon, lat], axis=1)
+
+
+def _acquired(image: SiteImage) -> str:
+    return "" if image.time is None else f"{image.time:%Y-%m-%d %H:%M}"
 
 
 @styled
 def _map(images: Sequence[SiteImage]) -> Chart:
     """Footprints, north up, in metres from their south-west corner."""
-    every = np.array([corner for image in images for corner in image.corners])
+    corners = {image.name: _corners(image) for image in images}
+    every = np.concatenate(list(corners.values()))
     corner = every.min(axis=0)
     metres = np.array(metres_per_degree(float(every[:, 1].mean())))
     east, north = np.ptp(every, axis=0) * metres
@@ -149,14 +113,14 @@ def _map(images: Sequence[SiteImage]) -> Chart:
     )
     table = []
     for k, image in enumerate(images):
-        x, y = ((np.array(image.corners) - corner) * metres).T
+        x, y = ((corners[image.name] - corner) * metres).T
         style = look(k)
         (shape,) = plot.axis.fill(x, y, facecolor="none", edgecolor=style["color"], linewidth=1.6)
         shape.set(linestyle=style["linestyle"], label=image.name)
-        plot.hover(shape, [f"{image.name} {image.acquired}".strip()])
+        plot.hover(shape, [f"{image.name} {_acquired(image)}".strip()])
         table += [
             {"image": image.name, "lon": f"{lon:.7f}", "lat": f"{lat:.7f}"}
-            for lon, lat in image.corners
+            for lon, lat in corners[image.name]
         ]
     on_the_ground(plot.axis)
     if len(images) <= 6:
@@ -165,12 +129,12 @@ def _map(images: Sequence[SiteImage]) -> Chart:
 
 
 @styled
-def _chart(pairs: Sequence[Pair], page: str | None) -> Chart | None:
+def _chart(rows: Sequence[Mapping[str, str]], page: str | None) -> Chart | None:
     """Pairs with dates by convergence and days, coloured by their quality; scenes are squares."""
-    dated = [pair for pair in pairs if pair.days is not None]
+    dated = [row for row in rows if row["days"]]
     if not dated:
         return None
-    undated = len(pairs) - len(dated)
+    undated = len(rows) - len(dated)
     more = f" Without dates, so in the table alone: {undated}." if undated else ""
     plot = Plot.of(
         "pairs by convergence and days",
@@ -179,59 +143,53 @@ def _chart(pairs: Sequence[Pair], page: str | None) -> Chart | None:
         (6.4, 4.4),
     )
     for is_scene, marker, size in ((False, "o", 36), (True, "s", 90)):
-        of = [pair for pair in dated if bool(pair.scene) == is_scene]
+        of = [row for row in dated if bool(row["scene"]) == is_scene]
         if not of:
             continue
+        convergence, days, matched = (
+            [float(row[name]) for row in of]
+            for name in ("convergence_degrees", "days", "matched_share")
+        )
         marks = plot.axis.scatter(
-            [pair.convergence for pair in of],
-            [pair.days for pair in of],
-            s=size, marker=marker, c=[pair.matched for pair in of],
+            convergence, days, s=size, marker=marker, c=matched,
             cmap=DISPARITIES, vmin=0, vmax=1, edgecolors=AXES, linewidths=1.2,
         )  # fmt: skip
         texts = [
-            f"{pair.scene + ': ' if pair.scene else ''}{pair.left} and {pair.right}: "
-            f"{100 * pair.matched:.0f} %, {pair.convergence:.1f}°, {pair.days:.2f} days; "
-            f"{pair.reason}"
-            for pair in of
+            f"{row['scene'] + ': ' if is_scene else ''}{row['left']} and {row['right']}: "
+            f"{100 * float(row['matched_share']):.0f} %, {row['convergence_degrees']}°, "
+            f"{row['days']} days; {row['reason']}"
+            for row in of
         ]
-        links = [f"{page}#scene-{pair.scene}" if page and pair.scene else "" for pair in of]
+        links = [f"{page}#scene-{row['scene']}" if page and is_scene else "" for row in of]
         plot.hover(marks, texts, links)
     plot.axis.set_yscale("symlog", linthresh=FIRST_DAY)
     plot.axis.set(xlabel="convergence, degrees", ylabel="days apart", xlim=(0, None))
     plot.axis.set_ylim(-0.2, None)
-    return plot.chart([vars(pair) for pair in dated])
+    return plot.chart(dated)
 
 
 def _images_table(images: Sequence[SiteImage]) -> Table | None:
-    """When and from where each image was taken."""
-    rows = [
-        {
-            "image": image.name,
-            "acquired (UTC)": image.acquired,
-            "off_nadir_degrees": _number(image.off_nadir, ".1f"),
-            "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
-            "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),
-        }
-        for image in images
-    ]
+    """When and from where each image was taken, angles at its middle."""
+    rows = []
+    for image in images:
+        cols, lines = image.size
+        middle = (cols - 1) / 2, (lines - 1) / 2, float(image.sensor.rpc.height_off)
+        upwards = float(ray_upwards(image.sensor, *middle)[2])
+        rows.append(
+            {
+                "image": image.name,
+                "acquired (UTC)": _acquired(image),
+                "off_nadir_degrees": f"{math.degrees(math.acos(min(upwards, 1.0))):.1f}",
+                "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
+                "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),
+            }
+        )
     return table(rows)
 
 
-def _pairs_table(pairs: Sequence[Pair], page: str | None) -> Table | None:
+def _pairs_table(rows: Sequence[Mapping[str, str]], page: str | None) -> Table | None:
     """All pairs; those that are scenes lead to their part of the page."""
-    rows = [
-        {
-            "left": pair.left,
-            "right": pair.right,
-            "scene": pair.scene,
-            "matched_share": f"{pair.matched:.4f}",
-            "convergence_degrees": f"{pair.convergence:.1f}",
-            "days": "" if pair.days is None else f"{pair.days:.2f}",
-            "reason": pair.reason,
-        }
-        for pair in pairs
-    ]
-    scenes = [pair.scene for pair in pairs if pair.scene] if page else []
+    scenes = [row["scene"] for row in rows if row["scene"]] if page else []
     return table(rows, links={"scene": {scene: f"{page}#scene-{scene}" for scene in scenes}})
 
 

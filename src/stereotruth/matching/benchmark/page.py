@@ -12,14 +12,14 @@ from typing import Any
 from ...pages.figures import Chart, Plot, log_axis, look, styled
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, ERRORS, Layer, Scale, encode, encode_file, shrink
-from ...pages.tables import Cell, Column, Headline, joined, metres, minus
+from ...pages.tables import Cell, Column, metres, minus
 from ...pages.tables import Table as Shown
 from ...products.files import read_table
 from . import panels
 from .confidence_table import confidence_chart
 from .protocols import one_id
 from .score_method import describe
-from .tables import Figure, Table, with_interval
+from .tables import Figure, Table, dataset_in_words, with_interval
 
 Row = Mapping[str, Any]
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
@@ -62,7 +62,6 @@ def write_benchmark(
         "index": way(out, index),
         "dataset": dataset,
         "ranking": ranking(methods, pair),
-        "headlines": headlines(methods, tables),
         "methods": [(of["label"], describe(of), _settings(of)) for of in methods],
         "doubts": [f"{of['label']}: {doubt}" for of in methods for doubt in of["doubts"]],
         "links": [
@@ -81,6 +80,7 @@ def write_benchmark(
             if any(shown.groups for _, shown in t.shown)
         ],
         "protocol": one_id(methods),
+        "what": minus(dataset_in_words(methods)),
         "slider": _slider(pair),
         "errors": Scale.of(ERRORS, "0", f"{panels.ERROR_PX:g} px; blue: no disparity"),
         "figure": None if figure is None else encode_file(Path(figure), FIGURE_BYTES, FIGURE_PX),
@@ -223,43 +223,6 @@ def strata_chart(methods: Sequence[Row]) -> Chart | None:
     plot.figure.legend(loc="outside lower center", ncols=3)
     keys = list(dict.fromkeys(key for row in values for key in row))
     return plot.chart([{key: row.get(key) for key in keys} for row in values])
-
-
-def headlines(methods: Sequence[Row], tables: Sequence[Table]) -> list[Headline]:
-    """How much better the best is than the next, and of how many pairs this is said."""
-    first = methods[0]
-    found = []
-    ranked = sorted(
-        (of for of in methods if of["all"]["filled_epe_px"] is not None),
-        key=lambda of: of["all"]["filled_epe_px"],
-    )
-    if ranked:
-        row = dict(ranked[0]["all"])
-        height = metres(row["filled_epe_px"], ranked[0].get("height_m_per_px"))
-        interval = with_interval(row, "filled_epe_px", 1, ".3f").partition(" ")[2]
-        note = joined(ranked[0]["label"], interval and f"95 % {interval}", height)
-        found.append(Headline("least EPE", f"{row['filled_epe_px']:.3f} px", note))
-    if len(ranked) > 1:
-        names = [of["label"] for of in ranked[:2]]
-        rows = next((t.rows for t in tables if t.name == "differences"), ())
-        row = next((row for row in rows if {row["method"], row["less"]} == set(names)), None)
-        if row and row["epe_px"] is not None:
-            ends = [row["epe_px"], row.get("epe_px_low"), row.get("epe_px_high")]
-            if row["method"] == names[0]:  # the best less the next: turned around
-                ends = [None if v is None else -v for v in (ends[0], ends[2], ends[1])]
-            value, low, high = ends
-            note = f"more EPE than {names[0]} on the same tiles"
-            if low is not None and high is not None:
-                note += f", 95 %: {low:+.3f} to {high:+.3f}"
-                note += "; no clear difference" if low <= 0 <= high else ""
-            found.append(Headline(f"next: {names[1]}", f"{value:+.3f} px", minus(note)))
-    split = f"split {first['split']}" if first["split"] else "all splits"
-    low, high = first["disparity_range"]
-    pixels = first["all"]["labelled"] / 1e6
-    note = f"{split}; {pixels:.1f} million labels in [{low}, {high}) px"
-    found.append(Headline("pairs", str(first["tiles"]), minus(note)))
-    found.append(Headline("methods", str(len(methods)), ", ".join(of["label"] for of in methods)))
-    return found
 
 
 def _settings(of: Row) -> str:

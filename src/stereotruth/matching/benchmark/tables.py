@@ -192,7 +192,9 @@ def of_methods(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             keys = ("paper_epe_px", "paper_d1_percent", "paper_ms")
             row |= dict(zip(keys, published))
         rows.append(row)
-    caption = f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {_what(methods)}"
+    caption = (
+        f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {dataset_in_words(methods)}"
+    )
     shown = [(caption, _accuracy(rows, methods))]
     if beside_paper:
         kinds = dict.fromkeys(_kind(of) for of in _plain(methods))
@@ -343,7 +345,7 @@ def _by_city(
                 {"city": "all of group", "group": group, "method": of["label"], **row}
                 for of, row in zip(methods, pooled)
             ]
-    caption = f"Ours: EPE and D1 of {FILLED}. {_what(methods)}"
+    caption = f"Ours: EPE and D1 of {FILLED}. {dataset_in_words(methods)}"
     shown = [(caption, _by_method(rows, "city", methods))]
     if beside_paper:
         there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
@@ -417,7 +419,7 @@ def _number(value: float | None, factor: float, form: str) -> str:
     return "–" if value is None else format(factor * value, form)
 
 
-def _what(methods: Sequence[Row]) -> str:
+def dataset_in_words(methods: Sequence[Row]) -> str:
     """Dataset, split, pairs and range."""
     if not methods:
         return ""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.matching.benchmark.page import cumulative_chart, headlines, ranking, strata_chart
-from stereotruth.matching.benchmark.tables import Table, read_scores
+from stereotruth.matching.benchmark.page import cumulative_chart, ranking, strata_chart
+from stereotruth.matching.benchmark.tables import read_scores
 
 from ....browser import look, needs_chromium
 from ....synthetic.toy_benchmark import rows
@@ -93,29 +93,6 @@ def test_a_constant_is_named_where_methods_are_ranked(scores):
     shown = ranking(methods, None)
     named = {cells[0].key: cells[0].text for cells in shown.groups[0][1]}
     assert named == {"Two": "Two", "Half": "Half\nconstant −3 px"}
-
-
-def test_the_cards_say_who_is_best_and_by_how_much(compared, scores):
-    methods = read_scores(compared / "benchmark" / name for name in ("two", "half"))
-    (row,) = rows(compared / "compared/differences.csv")
-    table = Table("differences", "", [{k: _number(v) for k, v in row.items()}], [])
-    cards = headlines(methods, [table])
-    assert len(cards) <= 6
-    least = min(scores.values(), key=lambda of: of["all"]["filled_epe_px"])
-    assert cards[0].title == "least EPE" and cards[0].note.startswith(least["label"])
-    assert cards[0].value == f"{least['all']['filled_epe_px']:.3f} px"
-    (following,) = (card for card in cards if card.title.startswith("next"))
-    between = abs(
-        scores["two"]["all"]["filled_epe_px"] - scores["half"]["all"]["filled_epe_px"]
-    )  # the same tiles of both: the difference of the pooled figures
-    assert following.value == f"+{between:.3f} px"
-
-
-def _number(value: str) -> str | float | None:
-    try:
-        return float(value) if value else None
-    except ValueError:
-        return value
 
 
 def test_a_method_s_distribution_of_errors_agrees_with_its_d1(compared, scores):
