@@ -171,6 +171,12 @@ def look(number: int) -> dict[str, Any]:
     }
 
 
+def on_the_ground(axes: Axes) -> None:
+    """Axes in metres, north up."""
+    axes.set(xlabel="m east", ylabel="m north", aspect="equal")
+    axes.grid(visible=False)
+
+
 def log_axis(axis: Axis) -> None:
     """Logarithmic ticks at 1, 2 and 5 as plain numbers."""
     axis.set_major_locator(LogLocator(10, (1, 2, 5)))

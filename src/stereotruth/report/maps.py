@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import rasterio
-from matplotlib.axes import Axes
 
 from ..dataset.footprints import read_footprints
 from ..dataset.quick_looks import SPLIT_COLOURS
-from ..pages.figures import AXES, Chart, Plot, look, styled
+from ..pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ..pages.pictures import SERIES, shrink
 from ..pages.tables import minus, missed
 
@@ -22,12 +21,6 @@ PICTURE_PX = 1000
 MARGIN = 0.03  # of the longer side, around all footprints
 BARS = 80  # most bars of a histogram
 NORMAL = (68.3, 95.4)  # % of normal errors below once and twice their uncertainty
-
-
-def on_the_ground(axis: Axes) -> None:
-    """An axis in metres, north up."""
-    axis.set(xlabel="m east", ylabel="m north", aspect="equal")
-    axis.grid(visible=False)
 
 
 @styled

@@ -14,11 +14,10 @@ from ..epipolar.pair_geometry import ray_upwards
 from ..epipolar.pair_quality import RatedPair
 from ..epipolar.site_pairs import SiteImage
 from ..numerics.degrees import metres_per_degree
-from ..pages.figures import AXES, Chart, Plot, look, styled
+from ..pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ..pages.page import way, write_page
 from ..pages.pictures import DISPARITIES, Scale
 from ..pages.tables import Table, table
-from .maps import on_the_ground
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
 FIRST_DAY = 1.0  # below it, the axis of days is linear
