@@ -1,7 +1,7 @@
 """The figures on top of a city's page, most important first; the page folds all but six.
 
 What images and control points say of a scene is as ``export.json`` has it and as the last lines of
-a run print it: over all matches and all labelled pixels of a scene.
+a run print it: over all matches and all labelled pixels of a scene. More of it is in the tables.
 """
 
 from __future__ import annotations
@@ -19,13 +19,6 @@ from ..pages.tables import Headline, joined, metres, minus, missed, number, spre
 
 Rows = Sequence[Mapping[str, str]]
 Records = Mapping[str, Mapping[str, Any]]
-TRUTH = (  # title, column of the truth's table, form, factor, unit, remark
-    ("off by more than 1 px", "share_over_1_px", ".3f", 100, " %", "of the labels, by truth"),
-    ("visible pixels labelled", "share_of_visible_labelled", ".2f", 100, " %", "by truth"),
-    ("hidden pixels labelled", "share_of_hidden_labelled", ".2f", 100, " %", "by truth"),
-    ("y-parallax", "y_parallax_rms_px", ".3f", 1, " px", "rms, by truth"),
-    ("within uncertainty", "share_below_1_uncertainty", ".1f", 100, " %", "68.3 % is right"),
-)
 
 
 def headlines(
@@ -58,7 +51,7 @@ def headlines(
         found.append(Headline("pixels labelled", f"{100 * np.mean(shares):.1f} %", note))
     if "quality" in rows[0]:
         found.append(_gates(labelled, quality))
-    found += _of_images(scenes, height_m_per_px)
+    found += _sift(scenes, height_m_per_px)
     if alignments:
         found.append(_gcps(alignments, refined))
     if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
@@ -71,11 +64,6 @@ def headlines(
         text = minus(f"{min(low):.0f} … {max(high):.0f} px")
         note = metres(max(high) - min(low), height_m_per_px) or "of the tiles"
         found.append(Headline("disparities", text, note))
-    found += _ties(refined)
-    for title, name, form, factor, unit, note in TRUTH:
-        value = number(best.get(name, ""))
-        if value is not None:
-            found.append(Headline(title, minus(format(factor * value, form)) + unit, note))
     return found
 
 
@@ -188,35 +176,20 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     return Headline("limits of quality", text, note, bool(bad or scenes or doubted or told))
 
 
-def _of_images(
-    scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None
-) -> list[Headline]:
-    """What the images say of the labels, scene by scene."""
-    found = []
-
-    def values(name: str) -> list[float]:
-        return [float(of[name]) for of in scenes if of.get(name) is not None]
-
-    def of(count: int) -> str:
-        return "" if count == 1 else f"{count} scenes"
-
-    if errors := values("sift_mean_absolute_error_px"):
-        matches = f"{sum(values('sift_matches')):.0f} matches, mean absolute"
-        noise = f"about {SIFT_NOISE_PX:g} px of it SIFT's own"
-        height = metres(max(errors), height_m_per_px)
-        height = height and f"≤ {height}" if errors[1:] else height
-        note = joined(of(len(errors)), matches, noise, height)
-        found.append(Headline("SIFT disparity − label", f"{spread(errors, '.2f')} px", note))
-    if medians := values("y_parallax_median_px"):
-        text = f"{spread(medians, '+.2f')} px"
-        note = joined(
-            of(len(medians)), f"median; rms {spread(values('y_parallax_rms_px'), '.2f')} px"
-        )
-        found.append(Headline("y-parallax of matches", text, note))
-    if known := values("warp_correlation"):
-        note = joined(of(len(known)), "correlation over the labelled pixels")
-        found.append(Headline("left and warped right", spread(known, ".3f"), note))
-    return found
+def _sift(scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None) -> list[Headline]:
+    """What SIFT matches say of the labels, scene by scene, and SIFT's own noise."""
+    of = [scene for scene in scenes if scene.get("sift_mean_absolute_error_px") is not None]
+    if not of:
+        return []
+    errors = [float(scene["sift_mean_absolute_error_px"]) for scene in of]
+    height = metres(max(errors), height_m_per_px)
+    note = joined(
+        f"{len(of)} scenes" if of[1:] else "",
+        f"{sum(scene['sift_matches'] for scene in of)} matches, mean absolute",
+        f"about {SIFT_NOISE_PX:g} px of it SIFT's own",
+        height and f"≤ {height}" if of[1:] else height,
+    )
+    return [Headline("SIFT disparity − label", f"{spread(errors, '.2f')} px", note)]
 
 
 def _gcps(alignments: Records, refined: Records) -> Headline:
@@ -232,15 +205,3 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
     if refined:
         note += f", {rms(refined, 'after')} px after refinement"
     return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
-
-
-def _ties(refined: Records) -> list[Headline]:
-    ties = [record.get("refinement", {}) for record in refined.values()]
-    if not any(tie.get("after") for tie in ties):
-        return []
-
-    def parallax(when: str) -> str:
-        return spread([tie.get(when, {}).get("y_parallax", {}).get("rms") for tie in ties], ".2f")
-
-    note = f"rms; {parallax('before')} px before refinement"
-    return [Headline("y-parallax of tie points", f"{parallax('after')} px", note)]
