@@ -8,7 +8,7 @@ is in it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,30 @@ LOOK_PX, LOOK_BYTES = 260, 16_000  # of a thumbnail
 def pages_of(root: Path) -> list[Path]:
     """All pages below a folder but the index, sorted."""
     return sorted(page for pattern in PAGES for page in root.glob(pattern))
+
+
+def pages_with(words: Sequence[str]) -> list[Path]:
+    """Pages of this folder with one of the words in their path; without words all, the
+    index of them first.
+
+    Raises InputError if there is none.
+    """
+    found = pages_of(Path())
+    try:
+        index = write_index()
+    except OSError:  # a folder that is read-only: as its last run has left it
+        index = INDEX if INDEX.is_file() else None
+    chosen = [page for page in found if any(word in str(page) for word in words)]
+    if not words and index:
+        chosen = [index, *found]
+    if not chosen:
+        there = f"; there are {', '.join(map(str, found))}" if found else ""
+        raise InputError(
+            f"no page{' of ' + ', '.join(words) if words else ''}{there}",
+            file=Path.cwd(),
+            remedy="stereotruth run report makes the pages of all cities",
+        )
+    return chosen
 
 
 def write_index(root: Path = Path()) -> Path | None:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereotruth.errors import InputError
 from stereotruth.evaluation.labels_against_truth import Comparison, SceneComparison
 from stereotruth.pages.page import INDEX
-from stereotruth.report.index_page import pages_of, write_index
+from stereotruth.report.index_page import pages_of, pages_with, write_index
 
 from ...browser import look, needs_chromium
 
@@ -96,6 +97,21 @@ def test_without_pages_there_is_no_index(tmp_path):
     put(tmp_path / INDEX, "of pages that were deleted since")
     assert write_index(tmp_path) is None
     assert not (tmp_path / INDEX).exists()
+
+
+def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="stereotruth run report"):
+        pages_with([])
+    there = [Path("audit/us3d/index.html"), Path("results/report/A/index.html")]
+    for page in there:
+        page.parent.mkdir(parents=True)
+        page.touch()
+    assert pages_with([]) == [INDEX, *there]  # the index first, which is what opens
+    assert "us3d" in INDEX.read_text(encoding="utf-8")
+    assert pages_with(["A"]) == there[1:]
+    with pytest.raises(InputError, match="no page of B"):
+        pages_with(["B"])
 
 
 @needs_chromium
