@@ -73,7 +73,7 @@ def _pair_rows(
             "scene": scenes.get(frozenset(one.names), ""),
             "matched_share": f"{one.quality.matched:.4f}",
             "height_sigma_m": f"{one.quality.height_sigma_m:.2f}",
-            "height_m_per_px": f"{one.pair.metres_per_px:.2f}",
+            "height_of_1_px_m": f"{one.pair.metres_per_px:.2f}",
             "convergence_degrees": f"{one.pair.convergence:.1f}",
             "days": "" if one.pair.days is None else f"{one.pair.days:.2f}",
             "reason": one.quality.reason,
@@ -163,7 +163,9 @@ def _chart(rows: Sequence[Mapping[str, str]], page: str | None) -> Chart | None:
         plot.hover(marks, texts, links)
     plot.axis.set_yscale("symlog", linthresh=FIRST_DAY)
     plot.axis.set(xlabel="convergence, degrees", ylabel="days apart", xlim=(0, None))
-    plot.axis.set_ylim(-0.2, None)
+    longest = max(float(row["days"]) for row in dated)
+    plot.axis.set_ylim(-0.2, 1.5 * max(longest, FIRST_DAY))
+    plot.axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     return plot.chart(dated)
 
 
