@@ -78,13 +78,10 @@ class Settings:
         from .change_probability import MEANS_PX
         from .change_reasons import REASON_PX
         from .crowns import CROWN_REACH_PX
-        from .seen_surface import OUTER_RINGS
 
-        # the rings of neighbours of a pixel's own points, and of their plane, its pooled noise and
-        # its support; or what may hide a crown
-        reach = max(OUTER_RINGS + 3, CROWN_REACH_PX)
-        # what the images tell of a pixel, and of those around
-        reach += MEANS_PX + max(EVIDENCE_PX, self.window // 2 + 1)
+        # what may hide a crown, farther off than the plane and the noise of a pixel's own points
+        # reach, and what the images tell of a pixel, and of those around
+        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.window // 2 + 1)
         return reach + REASON_PX  # of changes
 
 
