@@ -19,7 +19,8 @@ def test_the_page_is_whole_and_needs_no_network(compared, tmp_path):
         "const dead = [...document.querySelectorAll('a[href^=\"#\"]')].filter("
         "(a) => !document.getElementById(a.getAttribute('href').slice(1))).length;"
         "return [dead, document.images.length,"
-        " [...document.images].every((i) => i.naturalWidth > 0), document.querySelectorAll('table').length, document.body.innerText]",
+        " [...document.images].every((i) => i.naturalWidth > 0),"
+        " document.querySelectorAll('table').length, document.body.innerText]",
     )
     assert seen.wrong == [] and seen.requests == []
     dead, count, loaded, tables, text = seen.found
