@@ -34,7 +34,7 @@ ORDER = (
     {"errors", "kernel_cache"},
     {"kernels"},
     {"job", "numerics", "settings"},
-    {"settings_text", "sheet_rows"},
+    {"settings_text", "tables"},
     {"sheets"},
     {"products"},
     {"lidar", "epipolar", "pages", "simulate"},

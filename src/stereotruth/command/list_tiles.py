@@ -15,10 +15,8 @@ from .. import sheets
 from ..alignment.pair_ground import footprint_of
 from ..configuration import Configuration
 from ..errors import InputError, in_number, without_secrets
-from ..lidar.catalogue import read_catalogue, resolved
-from ..lidar.catalogue_ground import Cover, cover_of
+from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
-from ..lidar.catalogue_tiles import Tile
 from ..lidar.declared_crs import LidarCRS, interpret
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..lidar.settings import Settings as Ingest
