@@ -31,7 +31,7 @@ from scipy.ndimage import (
 )
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import probability_of_change
+from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
@@ -39,7 +39,6 @@ from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import WATER_CLASS, Status, is_labelled
-from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.lidar.ingest import ingest
@@ -369,7 +368,7 @@ def by_matching(window: PairWindow, disparity: Floats) -> tuple[Bools, Bools]:
     known = np.isfinite(disparity)
     low = int(np.floor(disparity[known].min())) - 16
     count = -(-(int(np.ceil(disparity[known].max())) + 16 - low) // 16) * 16
-    left, _ = left_and_warped(window, disparity)
+    left, _ = window.images_at(disparity)
     top = window.rows.start - window.right.row
     right = np.zeros_like(left)
     first = window.right.col - window.cols.start
@@ -432,7 +431,7 @@ def main() -> None:
 def lost_of(planted: Planted, diachronic: bool) -> Bools:
     """Labels of a window that the images contradict."""
     compared = planted.compared
-    probability = probability_of_change(compared, diachronic)
+    probability = change_probability(compared, diachronic).probability
     return planted.labelled & (probability > least_probability(compared))
 
 

@@ -38,7 +38,7 @@ ORDER = (
     {"settings_text", "tables"},
     {"sheets"},
     {"products"},
-    {"lidar", "epipolar", "simulate"},
+    {"lidar", "epipolar", "pages", "simulate"},
     {"alignment", "dataset", "surface"},
     {"disparity", "report"},
     {"evaluation", "matching"},

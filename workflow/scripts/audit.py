@@ -4,7 +4,7 @@ from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
 from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 

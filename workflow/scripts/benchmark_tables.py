@@ -5,7 +5,7 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 

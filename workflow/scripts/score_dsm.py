@@ -4,7 +4,7 @@ from stereotruth.evaluation.surface_models.page import write_verdict
 from stereotruth.evaluation.surface_models.reference import LidarReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
 from stereotruth.job import job
-from stereotruth.products.html_page import INDEX
+from stereotruth.pages.page import INDEX
 from stereotruth.products.making import making
 from stereotruth.report.index_page import write_index
 

@@ -13,8 +13,8 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..errors import in_number
-from ..products import pictures
-from ..products.pictures import colours, save_figure
+from ..pages import pictures
+from ..pages.pictures import colours, save_figure
 from ..products.rasters import read_disparity, read_image
 
 Picture = NDArray[np.uint8]
@@ -62,7 +62,44 @@ def draw_contact_sheet(
     contact_sheet(path, title, tiles, limits)
 
 
+STATUS_COLOURS_FILE = "status_colours.txt"
+STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
+    "labelled": "#eef3f7",
+    "no_points": "#1c1c22",
+    "hidden_in_left": "#d09230",
+    "hidden_in_right": "#a2006a",
+    "low_correlation": "#5e41ed",
+    "changed": "#effa51",
+    "out_of_frame": "#b7928d",
+    "masked": "#172d93",
+    "below_minimum_count": "#6a6028",
+    "edge_in_pixel": "#2183d5",
+    "labelled_between": "#aab1dc",
+    "labelled_by_images": "#ffe9b8",
+    "labelled_crown": "#cce674",
+    "too_uncertain": "#204020",
+}
 SPLIT_COLOURS = {"train": "#0072b2", "val": "#e69f00", "test": "#6f0952", "none": "#8a8a8a"}
+
+
+def status_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
+    unknown = [name for name in names if name not in STATUS_COLOURS]
+    other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
+    return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
+
+
+def write_status_colours(path: Path, flags: Mapping[int, str]) -> None:
+    """The colours of status values as a colour map of QGIS: value, R, G, B, A, meaning by lines.
+
+    It stands beside the tiles: some readers give colours, not values, of a TIFF with a table.
+    """
+    colours = status_colours(list(flags.values()))
+    lines = ["INTERPOLATION:EXACT"]
+    for value, name in flags.items():
+        red, green, blue = bytes.fromhex(colours[name][1:])
+        lines.append(f"{value},{red},{green},{blue},255,{name.replace('_', ' ')}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def coverage_figure(

@@ -5,7 +5,7 @@ each point. Where heights step, such a window mixes surfaces and fails although 
 Here the right image is brought to the left by the labels themselves, and windows hold the pixels of
 one surface only:
 
-- :mod:`stereotruth.epipolar.surface_correlation`: correlation coefficient of the left and the
+- :mod:`stereotruth.epipolar.surface_windows`: correlation coefficient of the left and the
   warped right image in a window around each pixel, over the pixels of its surface;
 - :mod:`.change_evidence`: what both images tell of a label;
 - :mod:`.change_probability`: how probable it is by that, that what a label shows has changed.
@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from .change_evidence import LabelledWindow
-from .change_probability import CHANGED, CROWN_CHANGED, YOUNG_CHANGED, probability_of_change
+from .change_probability import CHANGED, CROWN_CHANGED, YOUNG_CHANGED, change_probability
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .status import WATER_CLASS, Status, is_labelled
@@ -46,11 +46,12 @@ class Contradicted(NamedTuple):
     """What the images of a window say of its labels; arrays [h, w].
 
     ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
-    contradict, though these may have changed.
+    contradict, though these may have changed; ``beyond``: see :class:`.ChangeProbability`.
     """
 
     changed: Bools
     variance: Floats | float
+    beyond: NDArray[np.uint32]
 
 
 def least_probability(compared: LabelledWindow) -> Floats:
@@ -72,10 +73,10 @@ def contradicted(
     as right where these do not contradict them.
     """
     compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
-    probability = probability_of_change(compared, comparison.diachronic)
+    probability, beyond = change_probability(compared, comparison.diachronic)
     changed = labelled & (probability > least_probability(compared))
     variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
-    return Contradicted(changed, variance)
+    return Contradicted(changed, variance, beyond)
 
 
 def without_changes(
@@ -94,4 +95,5 @@ def without_changes(
     status = labels.status.copy()
     status[changed] = Status.CHANGED
     with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
-    return replace(labels, status=status, labels=with_unseen, correlation=correlation)
+    by_both = {"correlation": correlation, "beyond": by_images.beyond}
+    return replace(labels, status=status, labels=with_unseen, **by_both)

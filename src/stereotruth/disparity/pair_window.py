@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_noise import NoiseCurve
+from ..epipolar.warping import warp_rows
 from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
 from .status import Status
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
@@ -63,6 +65,17 @@ class PairWindow:
         )
         return replace(self, left=left, right=right)
 
+    def images_at(self, disparity: Floats) -> tuple[Singles, Floats]:
+        """Left image [h, w], and the right one brought to it by the ``disparity`` (px): its value
+        at (x - disparity, y) of each pixel, NaN where there is none."""
+        top, side = self.rows.start - self.left.row, self.cols.start - self.left.col
+        rows, cols = self.shape
+        left = self.left.pixels[top : top + rows, side : side + cols]
+        top = self.rows.start - self.right.row
+        right = self.right.pixels[top : top + rows, : self.right.usable.shape[1]]
+        at = np.arange(self.cols.start, self.cols.stop) - disparity - self.right.col
+        return left, warp_rows(right, at)
+
     @property
     def inner(self) -> tuple[slice, slice]:
         """The window without its margin."""
@@ -100,7 +113,9 @@ class WindowLabels:
     ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
     1970-01-01, 0 for not known; ``point_count``: points used; ``correlation``: coefficient of both
-    images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
+    images; ``change``: why a pixel has changed (:class:`.reason.Reason`); ``beyond``: which figures
+    of what the images tell lie beyond what was learned, as :func:`.learned_evidence.beyond_learned`
+    has it.
     """
 
     status: Bytes
@@ -111,6 +126,7 @@ class WindowLabels:
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
+    beyond: NDArray[np.uint32]
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -126,6 +142,7 @@ class WindowLabels:
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],
+            beyond=self.beyond[part],
         )
 
     def around(self, part: tuple[slice, slice]) -> WindowLabels:

@@ -40,7 +40,7 @@ from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER, MOVED, TOLD
 from ..matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
 from ..methods import make_method
-from ..user_command import SUFFIXES, read_result
+from ..result_files import SUFFIXES, read_result
 from .identity import identity, machine
 from .prediction_files import RECORD, UNCERTAINTY
 from .submission import SUBMITTED, Submission
@@ -264,11 +264,13 @@ def _check(result: Matched, pair: Pair, name: str) -> None:
 
 
 def _summary(found: Mapping[str, Prediction]) -> dict[str, float | None]:
-    """Median time of a pair, largest memory."""
+    """Median time of a pair, with what the middle 95 % of the pairs took; largest memory."""
     seconds = [of.seconds for of in found.values() if of.seconds is not None]
     memory = [of.memory_mb for of in found.values() if of.memory_mb is not None]
     return {
         "median_seconds": round(median(seconds), 6) if seconds else None,
+        "median_seconds_low": round(float(np.quantile(seconds, 0.025)), 6) if seconds else None,
+        "median_seconds_high": round(float(np.quantile(seconds, 0.975)), 6) if seconds else None,
         "peak_memory_mb": max(memory, default=None),
     }
 
