@@ -31,8 +31,7 @@ BANNED_NAMES = {"of", "way", "look", "outline", "STEP_PX", "CELL_PX"}  # as a wh
 # Each may import what stands in the lines above its own; what shares a line does not know each
 # other.
 ORDER = (
-    {"errors", "kernel_cache"},
-    {"kernels"},
+    {"errors", "kernels"},
     {"job", "numerics", "settings"},
     {"settings_text", "sheet_rows"},
     {"sheets"},

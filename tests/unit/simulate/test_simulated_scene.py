@@ -60,7 +60,6 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "",
         "errors",
         "job",
-        "kernel_cache",
         "kernels",
         "products",
         "products.damaged_chunks",
