@@ -62,7 +62,7 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "job",
         "kernels",
         "products",
-        "products.damaged_chunks",
+        "products.damaged_store",
         "products.files",
         "products.folders",
         "products.grids",
