@@ -25,7 +25,8 @@ from warped_panels import draw_panels
 from stereotruth import sheets
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
+from stereotruth.config.section import merged
 from stereotruth.dataset import warped_tile
 from stereotruth.dataset.manifest import labelled_tiles
 from stereotruth.epipolar.fit import fit_epipolar
@@ -38,7 +39,6 @@ from stereotruth.numerics.error_sums import LIMITS, ErrorSum
 from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
 from stereotruth.project import read_mapping
-from stereotruth.settings import merged
 from stereotruth.simulate.cities import CITIES
 
 PROJECT = Path(__file__).resolve().parents[1]

@@ -32,15 +32,15 @@ BANNED_NAMES = {"of", "way", "look", "outline", "STEP_PX", "CELL_PX"}  # as a wh
 # other.
 ORDER = (
     {"errors", "kernels"},
-    {"job", "numerics", "settings"},
-    {"settings_text", "sheet_rows"},
+    {"job", "numerics", "config", "dates"},
+    {"sheet_rows"},
     {"sheets"},
     {"products"},
     {"lidar", "epipolar", "simulate"},
     {"alignment", "dataset", "surface"},
     {"disparity", "report"},
     {"evaluation", "matching"},
-    {"configuration", "last_lines"},
+    {"last_lines"},
     {"project"},
     {"epochs"},
     {"command"},  # asks all stages what they think of the input, and nothing asks it

@@ -18,10 +18,10 @@ from stereotruth.alignment.align import align
 from stereotruth.alignment.refine import refine
 from stereotruth.command.check import check_project
 from stereotruth.command.findings import Level
+from stereotruth.config.labels import LabelSettings
 from stereotruth.dataset.sure_labels import TOO_UNCERTAIN
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings as ProjectSettings
 from stereotruth.disparity.status import Status
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
@@ -388,7 +388,7 @@ def run_stages(row: dict[str, str], good: Project, folder: Path) -> None:
             outputs = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
             rectify(left, right, model, *outputs, provenance={})
     sides = (rectified / "left.zarr", rectified / "right.zarr")
-    inputs = SceneInputs.of(*sides, stores, ProjectSettings()).with_surface(folder)
+    inputs = SceneInputs.of(*sides, stores, LabelSettings()).with_surface(folder)
     project_scene(inputs, folder / "labels.zarr", code="")
 
 

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
+from ..dates import epoch_year
 from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
 from ..numerics.degrees import continuous
 from ..products.files import of_text
-from ..settings import epoch_year
 
 Floats = NDArray[np.float64]
 

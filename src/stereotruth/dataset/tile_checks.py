@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import Limits
 from ..epipolar.warping import CorrelationSum
 from ..numerics.error_sums import ErrorSum
 from .label_doubts import SceneMatches, agreement
 from .quality_limits import flag, missed
-from .settings import Limits
 from .sift_matches import FIGURES, TileMatches
 
 

@@ -56,7 +56,7 @@ def _log_density(inputs: SceneInputs) -> None:
     per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
     density = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
-    if inputs.settings.on_surface or share > ENOUGH:
+    if inputs.on_surface or share > ENOUGH:
         log.info("%s", density)
         return
     log.warning(
@@ -164,7 +164,7 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     stores["right"] = require_complete(inputs.right_store).attrs
     epipolar = dict(stores["left"]["epipolar"])
     stores |= {f"points/{store.path.name}": store.attrs for store in inputs.stores}
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         stores["surface"] = inputs.ground.attrs
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
     if inputs.alignment is not None:
@@ -190,14 +190,14 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
 
 def _parameters(inputs: SceneInputs) -> dict[str, Any]:
     """Of a scene's labels: its view and the settings."""
-    return {"view": inputs.view} | asdict(inputs.settings)
+    return {"view": inputs.view} | inputs.settings.model_dump()
 
 
 def _content(inputs: SceneInputs, code: str) -> str:
     """Digest of all that the labels follow from but the points."""
     left, right = (require_complete(p).attrs for p in (inputs.left_store, inputs.right_store))
     parameters = _parameters(inputs)
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         parameters["scale"] = asdict(inputs.scale)
     return digest(
         {
@@ -268,7 +268,7 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
-        if tasks and inputs.settings.on_surface:
+        if tasks and inputs.on_surface:
             _ = inputs.noise  # once, and not by each of the threads
         with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)

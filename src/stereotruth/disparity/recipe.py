@@ -58,7 +58,7 @@ def label_window(
     if inputs is None:
         return None
     window, points = inputs
-    recipe = surface_recipe if scene.settings.on_surface else paper_recipe
+    recipe = surface_recipe if scene.on_surface else paper_recipe
     labels = recipe(scene, window, points).within(window.inner)
     layers = layers_of(labels, scene.pair, window)
     in_frames = points.by_pixel.count[window.inner]

@@ -38,3 +38,11 @@ def is_labelled(status: NDArray[np.uint8]) -> NDArray[np.bool_]:
     rough surface."""
     between = (status >= Status.LABELLED_BETWEEN) & (status <= Status.LABELLED_BY_IMAGES)
     return (status == Status.LABELLED) | between | (status == Status.LABELLED_CROWN)
+
+
+def statuses_of(recipe: str) -> list[Status]:
+    """Those that the grids of a recipe name; MASKED comes with masks alone."""
+    statuses = [status for status in Status if status <= Status.EDGE_IN_PIXEL]
+    if recipe == "surface":
+        statuses += [Status.LABELLED_BETWEEN, Status.LABELLED_CROWN]
+    return statuses

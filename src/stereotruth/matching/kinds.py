@@ -18,8 +18,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from ..config.section import PATTERN
 from ..errors import InputError
-from ..settings import PATTERN
 from .imported_files import imported_files
 
 FOLDER = "folder"

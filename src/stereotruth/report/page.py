@@ -26,7 +26,6 @@ from . import sections, tile_pictures
 from .city_files import CityFiles, CityRecords, rows_of
 from .ground_map import ground_map
 from .headlines import headlines
-from .settings import Settings
 
 PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
 BASE64 = 3 / 4  # bytes of a picture per byte in the page
@@ -220,7 +219,7 @@ def write_report(
     out: str | Path,
     *,
     index: str | Path | None = None,
-    sliders: int = Settings.sliders,
+    sliders: int,
     workers: int = 1,
     code: str = "",
 ) -> None:

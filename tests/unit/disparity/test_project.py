@@ -13,13 +13,13 @@ import zarr
 
 import stereotruth.disparity.recipe as module
 from stereotruth.alignment.label_uncertainty import label_covariance
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
@@ -133,10 +133,10 @@ def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, n
         return facet_labels(visible, own, *rest)
 
     monkeypatch.setattr(module, "facet_labels", record)
-    inputs = scene.inputs(Settings())
+    inputs = scene.inputs(LabelSettings())
     rows, cols = scene.model.shape
     layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
-    inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
+    inner = (slice(inputs.margin, -inputs.margin),) * 2
     own = recorded[0]
     return Labels(own.disparity[inner], own.slope[:, *inner], own.variance[inner]), layers
 
@@ -324,7 +324,7 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
 
 def test_blocks_can_go_to_other_processes(plane) -> None:
     """A block's task is made of plain values, whatever has been opened before."""
-    scene = plane.inputs(Settings())
+    scene = plane.inputs(LabelSettings())
     window = slice(100, 140), slice(120, 170)
     first = label_window(scene, *window)
     second = label_window(pickle.loads(pickle.dumps(scene)), *window)
@@ -437,7 +437,7 @@ def test_the_store_says_what_decided_on_its_light(
     images = [plane.images[0], tmp_path / "right.zarr"]
     told = {"taken": "2020-06-01T04:00:00+00:00", "sun": [150.0, 75.0]}
     write_image(images[1], plane.model, image_of(plane.surface), **told)
-    inputs = SceneInputs.of(*images, [plane.store], Settings(recipe="paper"))
+    inputs = SceneInputs.of(*images, [plane.store], LabelSettings(recipe="paper"))
     cells = {"left": (left_cell, None, None), "right": ("", None, None)}
     project_scene(inputs.in_light(None, cells), tmp_path / "out.zarr", code="test")
     attrs = open_grid(tmp_path / "out.zarr").attrs

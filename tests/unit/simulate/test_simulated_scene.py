@@ -75,5 +75,4 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.remote_files",
         "products.web_requests",
         "products.runs",
-        "settings",
     }
