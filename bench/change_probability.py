@@ -38,11 +38,12 @@ from stereotruth.disparity.change_probability import (
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.learned_evidence import LEARNED, learned
 from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
+from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.numerics.decision_trees import LEAF, DecisionTrees
 from stereotruth.simulate.changes import REASONS, TEXTURE
+from stereotruth.status import is_labelled
 
 SEEN_ALONE = "moved", "water"  # no two lights tell the first, no labels show the second
 APART = CONDITIONS[1]

@@ -31,7 +31,6 @@ from stereotruth.alignment.align import align
 from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.lidar.ingest import ingest
@@ -47,6 +46,7 @@ from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE, WATER
 from stereotruth.simulate.training_cities import training_city
+from stereotruth.status import Status, is_labelled
 
 FIRST_CITY = 4000  # of the numbers of cities
 SIDE_PX = 800

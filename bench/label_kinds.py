@@ -26,13 +26,13 @@ from wooded_scenes import MIXED, Draw, Scene
 from stereotruth.alignment.align import align
 from stereotruth.alignment.refine import refine
 from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.status import is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import open_grid, require_complete
 from stereotruth.simulate.surfaces import TREE, WATER
+from stereotruth.status import is_labelled
 
 DENSITIES = (4.0, 1.0)  # points/m²
 GCPS = 15

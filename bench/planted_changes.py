@@ -38,12 +38,13 @@ from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import WATER_CLASS, Status, is_labelled
 from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.products.files import atomic_folder
+from stereotruth.status import Status, is_labelled
 from stereotruth.surface.make_surface import make_surface
 
 Floats = NDArray[np.float64]

@@ -38,7 +38,6 @@ from stereotruth.dataset.sift_matches import match_tile
 from stereotruth.dataset.warped_tile import WarpedTile
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
@@ -47,6 +46,7 @@ from stereotruth.epipolar.warping import warp_rows
 from stereotruth.evaluation.scene_warping import warp_scene
 from stereotruth.numerics.degrees import metres_per_degree
 from stereotruth.products.grids import require_complete
+from stereotruth.status import Status, is_labelled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -18,7 +18,7 @@ import numpy as np
 from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity import recipe
 from stereotruth.disparity.facet_labels import facet_labels
-from stereotruth.disparity.status import Status
+from stereotruth.status import Status
 
 from .box_scene import Scene
 

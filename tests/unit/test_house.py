@@ -31,7 +31,7 @@ BANNED_NAMES = {"of", "way", "look", "outline", "STEP_PX", "CELL_PX"}  # as a wh
 # Each may import what stands in the lines above its own; what shares a line does not know each
 # other.
 ORDER = (
-    {"errors", "kernels"},
+    {"errors", "kernels", "status"},
     {"job", "numerics", "config", "dates"},
     {"sheet_rows"},
     {"sheets"},

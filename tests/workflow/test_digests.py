@@ -77,7 +77,7 @@ REACH = {
 }
 # Modules of the hall that any digest may hold. The sheets are none of them: they say which scenes
 # there are, and a scene more is no other scene.
-ANYWHERE = {"errors", "job", "kernels", "numerics", "dates"}
+ANYWHERE = {"errors", "job", "kernels", "numerics", "dates", "status"}
 # Who reports and records does not change what is computed.
 NOT_COVERED = {"job", "products.provenance", "products.atomic_outputs", "report.index_page"}
 

@@ -22,13 +22,13 @@ from stereotruth.config.labels import LabelSettings
 from stereotruth.dataset.sure_labels import TOO_UNCERTAIN
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import Status
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.status import Status
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 

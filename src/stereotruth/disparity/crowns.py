@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
+from ..lidar.point_store import WATER_CLASS
+from ..status import Status, is_labelled
 from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
 from ..surface.vertices import Vertices
@@ -39,7 +41,6 @@ from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .pixel_scale import PixelScale
 from .seen_surface import box_max
-from .status import WATER_CLASS, Status, is_labelled
 from .visibility import FACET_IN_RIGHT, PRISM_IN_LEFT, PRISM_IN_RIGHT, VisibleSurface, hidden_by
 
 Floats = NDArray[np.float64]

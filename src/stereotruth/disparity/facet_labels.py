@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..status import Status, is_labelled
 from ..surface.scale import FACET_RESIDUAL_PX
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels, OwnLabels
-from .status import Status, is_labelled
 from .visibility import VISIBLE, VisibleSurface
 
 _STATUS = np.array(  # by visibility

@@ -29,7 +29,7 @@ from ..epipolar.shown_ground import GroundOfImages
 from ..errors import InputError
 from ..job import progress
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..lidar.point_store import PointStore, open_stores
+from ..lidar.point_store import VEGETATION_CLASSES, PointStore, open_stores
 from ..numerics.degrees import DEGREE_M
 from ..products.grids import Layer, atomic_store, blocks, create_grid
 from ..products.provenance import digest
@@ -50,7 +50,6 @@ from .facet_raster import (
 )
 from .pixel_scale import PixelScale
 from .seen_surface import box_max
-from .status import VEGETATION_CLASSES
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from ..config.labels import LabelSettings
 from ..products.grids import Layer
+from ..status import Reason, Status, is_labelled, statuses_of
 from .pair_window import PairWindow, WindowLabels
-from .reason import Reason
 from .right_view import Pair
-from .status import Status, is_labelled, statuses_of
 
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
@@ -111,12 +110,12 @@ def _disparity(on_surface: bool, view: str) -> dict[str, str]:
 def _status(settings: LabelSettings, view: str, masked: bool) -> dict[str, object]:
     """Attributes of the layer status."""
     other = _other(view)
-    statuses = [*statuses_of(settings.recipe), *([Status.MASKED] if masked else [])]
+    statuses = statuses_of(settings.recipe, masked)
     attributes = {
         "units": "1",
         "long_name": "why a pixel has a label or none",
         "flag_values": [int(status) for status in statuses],
-        "flag_meanings": " ".join(status.name.lower() for status in statuses),
+        "flag_meanings": " ".join(status.label for status in statuses),
         f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre sees",
         "changed": "LiDAR and images show different surfaces there, or water",
         "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other surfaces",

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ..config.labels import LabelSettings
 from ..lidar.lattice import PER_DEG
+from ..status import Status
 from .pair_window import PairWindow, WindowLabels
 from .paper_correlation import correlate
 from .pixel_labels import Labels, condense, noise_variance
 from .pixel_points import PixelPoints
-from .status import Status
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]

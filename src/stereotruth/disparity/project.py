@@ -31,12 +31,12 @@ from ..lidar.overlap_check import apart, refuse_apart
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
+from ..status import Status, carries_label, is_labelled
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
 from .recipe import label_window
 from .scene_inputs import SceneInputs
-from .status import Status, is_labelled
 
 log = logging.getLogger("stereotruth")
 
@@ -284,7 +284,7 @@ def project_scene(
 
 def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
     """Of pixels by status and points (see :meth:`_Blocks.make`)."""
-    pixels = {status.name.lower(): counts[status] for status in inputs.statuses}
+    pixels = {status.label: counts[status] for status in inputs.statuses}
     in_grid, in_frame, used = counts[len(Status) :]
     beyond = "no_points", "out_of_frame", "masked"
     reached = sum(n for name, n in pixels.items() if name not in beyond)
@@ -302,7 +302,7 @@ def _log_summary(recipe: str, summary: Mapping[str, Any]) -> None:
     log.info(
         "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
         recipe,
-        sum(n for name, n in pixels.items() if is_labelled(Status[name.upper()])),
+        sum(n for name, n in pixels.items() if carries_label(name)),
         100.0 * share,
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_noise import EQUAL
+from ..status import Status
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
@@ -42,7 +43,6 @@ from .paper_recipe import paper_labels
 from .pixel_labels import OwnPoints, own_labels
 from .scene_inputs import SceneInputs
 from .seen_surface import MAX_COVER_PX
-from .status import Status
 from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
 

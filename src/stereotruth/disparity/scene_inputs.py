@@ -29,6 +29,7 @@ from ..lidar.point_store import PointStore, open_stores
 from ..lidar.strip_offsets import StripOffsets
 from ..products.grids import require_complete
 from ..products.provenance import digest
+from ..status import Status, statuses_of
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
@@ -43,7 +44,6 @@ from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
 from .seen_surface import OUTER_RINGS
-from .status import Status, statuses_of
 
 log = logging.getLogger("stereotruth")
 
@@ -195,7 +195,7 @@ class SceneInputs:
     @property
     def statuses(self) -> list[Status]:
         """Those that occur."""
-        return [*statuses_of(self.settings.recipe), *([Status.MASKED] if self.has_masks else [])]
+        return statuses_of(self.settings.recipe, self.has_masks)
 
     @cached_property
     def noise(self) -> tuple[NoiseCurve, NoiseCurve]:

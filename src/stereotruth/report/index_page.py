@@ -17,6 +17,7 @@ from ..products.html_page import INDEX, way, write_page
 from ..products.html_tables import Cell, Column, Table, minus, spread
 from ..products.locks import exclusive
 from ..products.pictures import encode_file
+from ..status import carries_label
 from .timeline import last_run, read_jobs, timeline
 
 PAGES = (
@@ -108,7 +109,7 @@ def _city(root: Path, out: Path, page: Path) -> dict[str, Any]:
         pairs = in_number(export["labelled_pairs"], "labelled pair")
         facts.append(f"{pairs} of {size} ({split})")
         shares = export["share_of_pixels"]
-        labelled = sum(share for status, share in shares.items() if status.startswith("labelled"))
+        labelled = sum(share for status, share in shares.items() if carries_label(status))
         facts.append(f"{100 * labelled:.1f} % of their pixels labelled")
     sift = [of["sift_mean_absolute_error_px"] for of in scenes]
     if any(value is not None for value in sift):

@@ -14,28 +14,13 @@ from ..dataset.warped_tile import warp_tile
 from ..products import pictures
 from ..products.pictures import Picture, encode, hillshade
 from ..products.rasters import read_flags, read_image, read_tile
+from ..status import BY_LABEL
 from .relief import Relief
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 NO_DIFFERENCE = (178, 182, 188)  # and in the difference
 GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
 DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
-STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
-    "labelled": "#eef3f7",
-    "no_points": "#1c1c22",
-    "hidden_in_left": "#d09230",
-    "hidden_in_right": "#a2006a",
-    "low_correlation": "#5e41ed",
-    "changed": "#effa51",
-    "out_of_frame": "#b7928d",
-    "masked": "#172d93",
-    "below_minimum_count": "#6a6028",
-    "edge_in_pixel": "#2183d5",
-    "labelled_between": "#aab1dc",
-    "labelled_by_images": "#ffe9b8",
-    "labelled_crown": "#cce674",
-    "too_uncertain": "#204020",
-}
 
 
 @dataclass
@@ -89,9 +74,10 @@ def disparity_limits(counted: Iterable[Mapping[int, int]]) -> tuple[float, float
 
 def status_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
-    unknown = [name for name in names if name not in STATUS_COLOURS]
+    known = {name: BY_LABEL[name].colour for name in names if name in BY_LABEL}
+    unknown = [name for name in names if name not in known]
     other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
-    return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
+    return known | other
 
 
 def _shown(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:

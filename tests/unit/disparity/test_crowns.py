@@ -9,7 +9,7 @@ from stereotruth.config.labels import LabelSettings
 from stereotruth.dataset.sure_labels import NAME, TOO_UNCERTAIN
 from stereotruth.disparity.crowns import _clearance, _higher
 from stereotruth.disparity.recipe import label_window
-from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.status import Status, is_labelled
 
 from ...synthetic.box_scene import Scene, on_ground, write_points
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES

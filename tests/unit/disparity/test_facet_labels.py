@@ -9,8 +9,8 @@ from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels, OwnLabels, OwnPoints
-from stereotruth.disparity.status import Status
 from stereotruth.disparity.visibility import VISIBLE, VisibleSurface
+from stereotruth.status import Status
 
 
 @pytest.mark.parametrize("see_through", [True, False])

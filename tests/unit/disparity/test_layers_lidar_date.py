@@ -10,10 +10,10 @@ import xarray as xr
 
 from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import is_labelled
 from stereotruth.lidar.gps_times import day_of
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.products.grids import require_complete
+from stereotruth.status import is_labelled
 from stereotruth.surface.make_surface import make_surface
 
 from ...synthetic.box_scene import Scene, project_with, surfaces_of, write_points

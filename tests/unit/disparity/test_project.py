@@ -17,15 +17,14 @@ from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
 from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore, query_points
 from stereotruth.products.grids import open_grid
+from stereotruth.status import Reason, Status, is_labelled
 
 from ...synthetic.box_scene import (
     ROOF,

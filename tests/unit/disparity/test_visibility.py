@@ -8,7 +8,7 @@ import pytest
 from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import Status, is_labelled, statuses_of
+from stereotruth.status import Status, is_labelled, statuses_of
 
 from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
@@ -120,6 +120,6 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
 
 @pytest.mark.parametrize("recipe", ["surface", "paper"])
 def test_labels_between_points_need_the_surface(recipe) -> None:
-    statuses = statuses_of(recipe)
+    statuses = statuses_of(recipe, masked=False)
     assert (Status.LABELLED_BETWEEN in statuses) == (recipe == "surface")
     assert not {Status.LABELLED_BY_IMAGES, Status.MASKED} & set(statuses)

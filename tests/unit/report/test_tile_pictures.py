@@ -8,6 +8,7 @@ import pytest
 from stereotruth.dataset.quick_looks import SPLIT_COLOURS
 from stereotruth.products.rasters import write_tiff
 from stereotruth.report import tile_pictures
+from stereotruth.status import Status
 
 from ...synthetic.colour_vision import nearest, rgb
 from ...synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
@@ -53,5 +54,5 @@ def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
 
 
 def test_colours_of_status_and_splits_are_apart_for_all_eyes():
-    assert nearest([rgb(colour) for colour in tile_pictures.STATUS_COLOURS.values()]) > 20
+    assert nearest([rgb(status.colour) for status in Status]) > 20
     assert nearest([rgb(colour) for colour in SPLIT_COLOURS.values()]) > 20

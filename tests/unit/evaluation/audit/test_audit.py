@@ -26,7 +26,7 @@ from stereotruth.products.html_tables import minus
 from ....browser import CHROMIUM, look
 from ....synthetic.pair_with_block import make
 
-LIMITS = Audit(0.3, 0.3, 0.05, 0.01, 0.01)
+LIMITS = Audit(contradicted_share=0.05, hidden_share=0.01)
 ONE_SHOWN = LIMITS.model_copy(update={"worst": 1})
 
 
