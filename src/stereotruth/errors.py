@@ -35,6 +35,14 @@ def in_number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def install_extra(extra: str) -> str:
+    """How an extra of the package is installed, as a remedy: no index has the package itself."""
+    return (
+        f"install the extra {extra}: pip install '.[{extra}]' in a checkout, "
+        f"pip install './stereotruth-VERSION-py3-none-any.whl[{extra}]' beside the wheel"
+    )
+
+
 class InputError(ValueError):
     """Input that cannot be used: names the file (and scene), what is wrong, and the remedy.
 

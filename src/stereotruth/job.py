@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, told_by_system, without_secrets
+from .errors import InputError, install_extra, told_by_system, without_secrets
 
 log = logging.getLogger("stereotruth")
 # New objects before garbage is collected: compiling kernels makes many that stay, and walking
@@ -189,7 +189,7 @@ def dask_scheduler(address: str | None, seconds: float = 30.0) -> Iterator[Any]:
     except ImportError as error:
         raise InputError(
             f"dask.scheduler_address is {address}, but distributed is not installed",
-            remedy="pip install 'stereotruth[cluster]', or set it to null",
+            remedy=f"{install_extra('cluster')}; or set it to null",
         ) from error
     try:
         client = Client(address, timeout=seconds)

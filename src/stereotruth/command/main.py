@@ -334,9 +334,9 @@ def pairs(
     elif diachronic or any(limit is not None for limit in limits):
         choice = Choice(most, convergence, days, diachronic, each)
     given = {"lidar": lidar, "gcps": gcps, "lidar_crs": lidar_crs, "geoid": geoid}
-    rated, lines = list_pairs(city, choice, given, configfile)
-    show_pairs(rated)
-    for line in lines:
+    listing = list_pairs(city, choice, given, configfile)
+    show_pairs(listing.rated, listing.chosen)
+    for line in listing.lines:
         typer.echo(line)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from .add_scene import append_row
 from .site import images_of, scene_pairs
 
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
+ALIKE_BASES = 1.5  # greatest ratio
 LEAST_SHARED = 0.05  # of the smaller image's ground
 INGESTED = Path("results/ingest")
 # What a pair takes from its city's other rows.
@@ -60,59 +61,76 @@ class Choice:
         """The chosen of pairs that are listed best first, in that order.
 
         First those that link all images, since images that no pair links are not adjusted together;
-        then the best. Where ``most`` are too few to link all, they link as many as they can.
+        then the best. Where ``most`` are too few to link all, they link as many as they can. A pair
+        counts for less, the more pairs of like convergence are chosen before it.
         """
         allowed = [rated for rated in pairs if self.allows(rated.pair)]
-        names = [(rated.pair.left, rated.pair.right) for rated in allowed]
-        most = len(names) if self.most is None else self.most
-        used: Counter[str] = Counter()
-        chosen = self._linking(names, used)
-        if len(chosen) > most:
-            used.clear()
-            chosen = self._growing(names, used, most)
-        chosen |= self._others(names, chosen, used, most - len(chosen))
-        return [rated for rated, pair in zip(allowed, names) if pair in chosen]
+        most = len(allowed) if self.most is None else self.most
+        taking = _linking(allowed, self.each)
+        if len(taking.taken) > most:
+            taking = _growing(allowed, self.each, most)
+        while len(taking.taken) < most and taking.take():
+            pass
+        return [rated for rated in allowed if rated.names in taking.taken]
 
-    def _linking(self, pairs: Sequence[Names], used: Counter[str]) -> set[Names]:
-        """The best pairs that link all images which a pair is allowed of; ``used``: pairs of each
-        image, which are counted on."""
-        chosen: set[Names] = set()
-        for pair in pairs:
-            if new_links([pair], chosen) and self._take(pair, used):
-                chosen.add(pair)
-        return chosen
 
-    def _growing(self, pairs: Sequence[Names], used: Counter[str], most: int) -> set[Names]:
-        """The best pair, and ``most`` − 1 more, each the best of those that link one image more to
-        the images before (Prim 1957); where none does, the best of two others."""
-        chosen: set[Names] = set()
-        linked: set[str] = set()
-        while len(chosen) < most:
-            more = [pair for pair in pairs if (pair[0] in linked) != (pair[1] in linked)]
-            others = [pair for pair in pairs if linked.isdisjoint(pair)]
-            taken = next((pair for pair in (*more, *others) if self._take(pair, used)), None)
-            if taken is None:
-                break
-            chosen.add(taken)
-            linked.update(taken)
-        return chosen
+class _Taking:
+    """Pairs that are taken one by one, each time the one that adds most to those before it.
 
-    def _others(
-        self, pairs: Sequence[Names], chosen: set[Names], used: Counter[str], most: int
-    ) -> set[Names]:
-        """The best pairs but for the ``chosen``, ``most`` at most."""
-        others: set[Names] = set()
-        for pair in pairs:
-            if len(others) < most and pair not in chosen and self._take(pair, used):
-                others.add(pair)
-        return others
+    ``each``: pairs that one image may be in; None: any number.
+    """
 
-    def _take(self, pair: Names, used: Counter[str]) -> bool:
-        """Whether neither image of a pair is in as many as it may be; then the pair is counted."""
-        if self.each is not None and max(used[name] for name in pair) >= self.each:
+    def __init__(self, pairs: Sequence[RatedPair], each: int | None) -> None:
+        self.left = {one.names: one for one in pairs}
+        self.alike = dict.fromkeys(self.left, 0)  # how many of those taken
+        self.each = each
+        self.used: Counter[str] = Counter()
+        self.taken: list[Names] = []
+
+    def take(self, wanted: Callable[[Names], object] = lambda _: True) -> bool:
+        """Take the best of those ``wanted``, by names; false if there is none."""
+        free = [names for names in self.left if self._may(names) and wanted(names)]
+        if not free:
             return False
-        used.update(pair)
+        best = max(free, key=lambda names: self.left[names].quality.bits / (1 + self.alike[names]))
+        pair = self.left.pop(best).pair
+        for names, other in self.left.items():
+            self.alike[names] += _alike(pair, other.pair)
+        self.used.update(best)
+        self.taken.append(best)
         return True
+
+    def _may(self, names: Names) -> bool:
+        return self.each is None or max(self.used[name] for name in names) < self.each
+
+
+def _linking(pairs: Sequence[RatedPair], each: int | None) -> _Taking:
+    """The best pairs that link all images which a pair is of."""
+    taking = _Taking(pairs, each)
+    while taking.take(lambda names: new_links([names], taking.taken)):
+        pass
+    return taking
+
+
+def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Taking:
+    """The best pair, and ``most`` − 1 more, each the best of those that link one image more to
+    the images before (Prim 1957); where none does, the best of two others."""
+    taking = _Taking(pairs, each)
+
+    def links(names: Names) -> bool:
+        return sum(name in taking.used for name in names) == 1
+
+    def apart(names: Names) -> bool:
+        return not any(name in taking.used for name in names)
+
+    while len(taking.taken) < most and (taking.take(links) or taking.take(apart)):
+        pass
+    return taking
+
+
+def _alike(one: SitePair, other: SitePair) -> bool:
+    """Whether two pairs tell much the same of heights: by bases over height."""
+    return max(one.base, other.base) <= ALIKE_BASES * min(one.base, other.base)
 
 
 def roughness_of(city: str, settings: Configuration) -> float | None:
@@ -150,7 +168,7 @@ def write_pairs(
     rated: Sequence[RatedPair],
     settings: Configuration,
     given: dict[str, str],
-) -> list[str]:
+) -> str:
     """Append a row for each chosen pair that no scene is made of yet; returns what was done.
 
     ``given``: cells of OF_CITY; those that are empty are taken from the city's first row. Raises
@@ -171,20 +189,17 @@ def write_pairs(
             file=rows,
             remedy="name it: --lidar FOLDER (and --gcps, --geoid, --lidar-crs)",
         )
-    made = {frozenset(names_in_pair(scene, images)): name for name, scene in scenes.items()}
-    lines, written = [], 0
-    chosen = choice.of(rated)
-    for pair in (one.pair for one in chosen):
-        if before := made.get(frozenset((pair.left, pair.right))):
-            lines.append(f"{rows}: {pair.left} and {pair.right} are scene {before} already")
+    made = {frozenset(names_in_pair(scene, images)) for scene in scenes.values()}
+    written = 0
+    for pair in (one.pair for one in choice.of(rated)):
+        if frozenset((pair.left, pair.right)) in made:
             continue
         name = _free_name(pair, scenes)
         cells = {"scene": name, "city": city, "left_image": pair.left, "right_image": pair.right}
         sheets.check(cells | here, sheets.Scene, f"scene {name}")
         append_row(rows, sheets.Scene, cells | here)
         written += 1
-    lines.append(f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}")
-    return lines
+    return f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}"
 
 
 def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
@@ -195,17 +210,24 @@ def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
 
 
 COLUMNS = (
-    "left", "right", "matched", "m/px", "convergence", "bisector", "asymmetry", "sun", "days",
-    "shared", "pixels", "reason",
+    "", "left", "right", "bits/px", "matched", "m/px", "convergence", "bisector", "asymmetry",
+    "sun", "days", "shared", "pixels", "reason",
 )  # fmt: skip
 
 
-def table(rated: Sequence[RatedPair]) -> list[tuple[str, ...]]:
-    """The listed pairs as text: COLUMNS, one row a pair; degrees, days, shares."""
+def table(
+    rated: Sequence[RatedPair], chosen: Collection[tuple[str, str]] = ()
+) -> list[tuple[str, ...]]:
+    """The listed pairs as text: COLUMNS, one row a pair; degrees, days, shares.
+
+    ``chosen``: names of the images of pairs that are scenes, in either order.
+    """
+    marked = {frozenset(names) for names in chosen}
     return [
         (
-            one.pair.left,
-            one.pair.right,
+            "*" if frozenset(one.names) in marked else "",
+            *one.names,
+            f"{one.quality.bits:.1f}",
             f"{100 * one.quality.matched:.0f} %",
             f"{one.pair.metres_per_px:.1f}",
             f"{one.pair.convergence:.1f}°",
@@ -225,40 +247,52 @@ def _days(days: float) -> str:
     return f"{days:.0f}" if days >= 1 else "same pass" if days < 0.02 else "same day"
 
 
+@dataclass(frozen=True)
+class Listing:
+    """All pairs of a site, best first; names of the images of those that are scenes; and in words
+    how rough the site is, what was written, and which images are unused or without a link."""
+
+    rated: list[RatedPair]
+    chosen: list[tuple[str, str]]
+    lines: list[str]
+
+
 def list_pairs(
     city: str,
     choice: Choice | None,
     given: dict[str, str],
     configfiles: Sequence[Path] | None = None,
-) -> tuple[list[RatedPair], list[str]]:
-    """All pairs of a site, best first; and in words how rough the site is, what was written
-    (nothing if ``choice`` is None), and which images the scenes leave unused or without a link."""
+) -> Listing:
+    """All pairs of a site. ``choice`` is written to the scenes sheet; None: nothing is."""
     settings, _ = configured(configfiles)
     roughness = roughness_of(city, settings)
     rated = rated_pairs(city, settings, roughness)
     lines = [_in_words(city, roughness)]
     if choice is not None:
-        lines += write_pairs(city, choice, rated, settings, given)
-    return rated, lines + _unlinked(city, rated, settings)
-
-
-def _unlinked(city: str, rated: Sequence[RatedPair], settings: Configuration) -> list[str]:
-    """What the scenes of a site leave unused or without a link, and the best pairs that would link
-    it; nothing if the site has no scenes."""
+        lines.append(write_pairs(city, choice, rated, settings, given))
     cities = sheets.read_cities(sheet(settings, "cities"))
     images = read_images(settings, cities)
     scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images)
-    made = scene_pairs(city, scenes, images)
-    if not made:
-        return []
-    of_city = [name for name, image in images.items() if image.city == city]
-    lines = Links.of(of_city, made).sentences
+    chosen = scene_pairs(city, scenes, images)
+    if chosen:
+        lines.append(f"* {len(chosen)} of them are scenes of {sheet(settings, 'scenes')}")
+        of_city = [name for name, image in images.items() if image.city == city]
+        lines += _unlinked(of_city, rated, chosen)
+    return Listing(rated, chosen, lines)
+
+
+def _unlinked(
+    images: Sequence[str], rated: Sequence[RatedPair], chosen: Sequence[tuple[str, str]]
+) -> list[str]:
+    """What the scenes of a site leave unused or without a link, and the best pairs that would link
+    it."""
+    lines = Links.of(images, chosen).sentences
     if not lines:
         return []
-    pairs = {(one.pair.left, one.pair.right): one for one in rated}
-    missing = [pairs[names] for names in new_links(pairs, made)]
+    pairs = {one.names: one for one in rated}
+    missing = [pairs[names] for names in new_links(pairs, chosen)]
     told = "; ".join(
-        f"{one.pair.left} and {one.pair.right} ({100 * one.quality.matched:.0f} %, "
+        f"{one.pair.left} and {one.pair.right} ({one.quality.bits:.1f} bits/px, "
         f"{one.pair.convergence:.0f}°)"
         for one in missing
     )

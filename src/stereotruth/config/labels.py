@@ -197,7 +197,7 @@ class Dataset(Section):
     catalogs: tuple[Literal["stac", "croissant"], ...] = ()
     """descriptions of `dataset/` in it: STAC (`stac/collection.json` and an item for each pair,
     with orientation files and RPCs) and Croissant (`croissant.json`); they need
-    `pip install 'stereotruth[catalog]'`"""
+    the extra `catalog`"""
 
     acquired: Annotated[dict[str, Text], Unit("scene: date")] = Field(default_factory=dict)
     """when scenes were taken, such as `2020-10-25` or `2020-10-25T03:12:45Z`, for STAC; items of

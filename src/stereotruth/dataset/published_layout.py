@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from ..job import progress
 from ..products.files import atomic_folder, write_table
 from ..products.provenance import file_sha256
@@ -141,7 +141,7 @@ def _module(catalog: str) -> ModuleType:
     except ModuleNotFoundError as error:
         raise InputError(
             f"dataset.catalogs: {catalog} needs {error.name}, which is not installed",
-            remedy="pip install 'stereotruth[catalog]', or leave it out",
+            remedy=f"{install_extra('catalog')}; or leave it out",
         ) from None
     return module
 

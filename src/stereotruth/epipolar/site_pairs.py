@@ -25,7 +25,6 @@ from .virtual_points import frame, inside
 Floats = NDArray[np.float64]
 
 SAMPLES = 65  # along each side of an image, of the ground that it shares
-SAME_PASS = timedelta(minutes=15)  # between the images of one pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,17 +170,15 @@ def order(
     rays: tuple[Floats, Floats],
     height: float,
 ) -> tuple[SiteImage, SiteImage]:
-    """Left and right of a pair: of one pass the backward view is left, else the steeper one.
+    """Left and right of a pair: the backward view is left; across the track, the steeper one.
 
     The steeper view hides less of the ground, and what is left has the labels.
     """
-    together = one.time is None or other.time is None or abs(one.time - other.time) <= SAME_PASS
-    if together:
-        seen = view_order(one.sensor, other.sensor, overlap, height)
-        if seen == "left looks backward":
-            return one, other
-        if seen == "left looks forward":
-            return other, one
+    seen = view_order(one.sensor, other.sensor, overlap, height)
+    if seen == "left looks backward":
+        return one, other
+    if seen == "left looks forward":
+        return other, one
     steeper = rays[0][2] >= rays[1][2]
     return (one, other) if steeper else (other, one)
 

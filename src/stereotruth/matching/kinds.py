@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config.section import PATTERN
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from .imported_files import imported_files
 
 FOLDER = "folder"
@@ -250,5 +250,5 @@ def need_pytorch(name: str, kind: str) -> None:
     if not all(map(find_spec, ("torch", "tqdm"))):
         raise InputError(
             f"{kind} needs PyTorch and tqdm, which are not installed",
-            remedy=f"pip install 'stereotruth[{KINDS[kind].extra}]'",
+            remedy=install_extra(KINDS[kind].extra),
         )

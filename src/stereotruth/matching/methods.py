@@ -10,7 +10,7 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from .kinds import MOVED, TOLD, kind_of
 from .matcher import Matcher
 from .polarity import with_polarity
@@ -38,7 +38,7 @@ def make_method(name: str, settings: Mapping[str, Any], workers: int = 1) -> Mat
             raise
         raise InputError(
             f"{settings['kind']} needs {error.name}, which is not installed",
-            remedy=f"pip install 'stereotruth[{kind.extra}]'" if kind.extra else "install it",
+            remedy=install_extra(kind.extra) if kind.extra else "install it",
         ) from error
     made = module.make(name, settings["kind"], options, workers)
     return with_polarity(name, made, **moved)

@@ -48,7 +48,7 @@ from pandora.img_tools import add_disparity
 from pandora.state_machine import PandoraMachine
 from scipy.special import ndtri
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from .kinds import MCCNN, MCCNN_MODULES, mccnn_weights
 from .matcher import DisparityRange, UncertainMatcher, called
 
@@ -154,7 +154,7 @@ def _steps_of(pipeline: str | None) -> dict[str, Any]:
     if missing := [name for name in MCCNN_MODULES if not find_spec(name)]:
         raise InputError(
             f"pipeline mccnn needs {', '.join(missing)}, which is not installed",
-            remedy="pip install 'stereotruth[mccnn]'",
+            remedy=install_extra("mccnn"),
         )
     (weights,) = mccnn_weights()
     optimization = {**PIPELINE["optimization"], "penalty": MCCNN_PENALTY}

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
-from ..errors import InputError
+from ..errors import InputError, install_extra
 from .ranges import Ranges, RangeStream, WebRanges, changed
 from .web_requests import WEB, info_of, read_whole, too_large
 
@@ -102,7 +102,7 @@ def _file_system(scheme: str) -> Any:
     except ImportError as error:
         raise InputError(
             f"{scheme}:// cannot be read here ({error})",
-            remedy="pip install 'stereotruth[storage]'",
+            remedy=install_extra("storage"),
         ) from error
 
 

@@ -70,40 +70,36 @@ def test_all_pairs_are_listed_best_first_whatever_the_order_of_the_sheet(rows):
     settings, _ = configured()
     rated = rated_pairs("Stack", settings)
     assert len(rated) == 6
-    assert [r.quality.matched for r in rated] == sorted(
-        (r.quality.matched for r in rated), reverse=True
-    )
+    assert [r.quality.bits for r in rated] == sorted((r.quality.bits for r in rated), reverse=True)
     write_images(rows[::-1])
     assert rated_pairs("Stack", settings) == rated
     assert Path("s.tsv").read_text() == HEADER
 
 
 def test_chosen_pairs_become_rows_that_the_sheet_is_read_with(rows):
-    rated, lines = list_pairs("Stack", Choice(most=2), LIDAR)
-    assert len(written()) == 2 and "2 of 6 pairs written" in lines[1]
+    listing = list_pairs("Stack", Choice(most=2), LIDAR)
+    assert len(written()) == 2 and "2 of 6 pairs written" in listing.lines[1]
+    assert listing.chosen == written() and "* 2 of them are scenes" in listing.lines[2]
+    assert sum(line[0] == "*" for line in table(listing.rated, listing.chosen)) == 2
     row = Path("s.tsv").read_text().splitlines()[1].split("\t")
     assert row[4:] == ["lidar", "", "", "gcps/all.csv"]
     assert all("-" in name and "_" not in name for name in (row[0],))
-    _, lines = list_pairs("Stack", Choice(convergence=None), {})  # LiDAR of the rows before
-    assert sorted(map(sorted, written())) == sorted(
-        sorted((r.pair.left, r.pair.right)) for r in rated
-    )
-    assert sum("already" in line for line in lines) == 2
+    list_pairs("Stack", Choice(convergence=None), {})  # LiDAR of the rows before
+    assert sorted(map(sorted, written())) == sorted(sorted(r.names) for r in listing.rated)
 
 
 def test_points_that_scenes_have_ingested_enter_the_prediction(rows):
-    rated, lines = list_pairs("Stack", Choice(most=2), LIDAR)
-    assert "no LiDAR of Stack has been ingested" in lines[0]
+    before = list_pairs("Stack", Choice(most=2), LIDAR)
+    assert "no LiDAR of Stack has been ingested" in before.lines[0]
     scene = Path("s.tsv").read_text().splitlines()[1].split("\t")[0]
     rng = np.random.default_rng(1)
     xyz = np.array([500_040.0, 3_390_070.0, 0.0]) + rng.uniform(0, (90, 90, 30), (30_000, 3))
     write_las(Path("tall.las"), xyz=xyz)
     ingest(Path("tall.las"), Path(f"results/ingest/Stack/{scene}/tall.points"))
-    again, lines = list_pairs("Stack", None, {})
-    assert "steps of" in lines[0] and not any("written" in line for line in lines)
-    names = [[(one.pair.left, one.pair.right) for one in listed] for listed in (rated, again)]
-    assert names[0] == names[1]
-    assert all(one.quality.matched < two.quality.matched for one, two in zip(again, rated))
+    after = list_pairs("Stack", None, {})
+    assert "steps of" in after.lines[0] and not any("written" in line for line in after.lines)
+    matched = [{r.names: r.quality.matched for r in listed.rated} for listed in (before, after)]
+    assert all(matched[1][names] < matched[0][names] for names in matched[0])
 
 
 def test_without_lidar_nothing_is_written(rows):
@@ -139,9 +135,12 @@ def test_limits(choice, change, taken):
     assert choice.allows(replace(PAIR, **change)) is taken
 
 
-def rated(*names: str) -> list[RatedPair]:
-    pairs = [replace(PAIR, left=name[0], right=name[1]) for name in names]
+def rate_all(pairs: list[SitePair]) -> list[RatedPair]:
     return [RatedPair(pair, quality_of(pair)) for pair in pairs]
+
+
+def rated(*names: str) -> list[RatedPair]:
+    return rate_all([replace(PAIR, left=name[0], right=name[1]) for name in names])
 
 
 @pytest.mark.parametrize(
@@ -176,22 +175,35 @@ def test_chosen_pairs_link_as_many_images_as_they_can(listed, most, taken):
     assert [one.pair.left + one.pair.right for one in chosen] == taken.split()
 
 
+def test_the_choice_spreads_over_convergences():
+    pairs = [
+        replace(PAIR, left=left, right=right, convergence=convergence)
+        for left, right, convergence in (("A", "B", 18.0), ("B", "C", 17.0), ("A", "C", 35.0))
+    ]
+    listed = rate_all(pairs)
+    assert listed[0].names == ("A", "B") and listed[1].names == ("B", "C")
+    assert [one.names for one in Choice(most=2).of(listed)] == [("A", "B"), ("A", "C")]
+
+
 def test_images_without_a_link_are_named_with_the_pairs_that_would_link_them(rows):
     best = rated_pairs("Stack", configured()[0])[0].pair
-    _, lines = list_pairs("Stack", Choice(most=1), LIDAR)
+    lines = list_pairs("Stack", Choice(most=1), LIDAR).lines
     assert lines[-2].startswith("2 images in no pair: ")
     assert not any(f" {name}" in lines[-2] for name in (best.left, best.right))
-    assert lines[-1].startswith("best pairs that would link them: ") and lines[-1].count("%") == 2
+    assert (
+        lines[-1].startswith("best pairs that would link them: ")
+        and lines[-1].count("bits/px") == 2
+    )
     (links,) = [findings for findings in check_project() if findings.scene == "images"]
     assert [f.text for f in links if f.about == "pairs"] == [f"Stack: {lines[-2]}"]
-    _, lines = list_pairs("Stack", Choice(most=3), {})
-    assert "Next: stereotruth check" in lines[-1]
+    lines = list_pairs("Stack", Choice(most=3), {}).lines
+    assert "Next: stereotruth check" in lines[-2]
 
 
 def test_the_table_has_a_line_a_pair(capsys):
     pairs = rated("AB", "AC")
     assert all(len(line) == len(command.COLUMNS) for line in table(pairs))
-    show_pairs(pairs, Console(width=200))
+    show_pairs(pairs, console=Console(width=200))
     assert "20.0°" in capsys.readouterr().out
 
 

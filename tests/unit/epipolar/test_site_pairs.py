@@ -77,7 +77,7 @@ def test_the_order_of_the_images_plays_no_part(images):
     assert pairs_of_site(images) == pairs_of_site(images[::-1])
 
 
-def test_left_is_the_backward_view_of_a_pass_and_else_the_steeper_one():
+def test_left_is_the_backward_view():
     site = drawn_site(0, 2026, images=2, side_px=160)  # of one pass
     back, ahead = sorted(site.images, key=lambda image: image.look_deg)
     (pair,) = pairs_of_site([exact_image(site, image) for image in site.images])

@@ -156,7 +156,7 @@ def test_without_torch_a_network_says_what_to_install(monkeypatch):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(InputError, match=r"needs torch.*pip install 'stereotruth\[networks\]'"):
+    with pytest.raises(InputError, match=r"needs torch.*the extra networks"):
         make_method("stereonet", {"kind": "stereonet"})
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from ...errors import InputError, install_extra
 
 Arrays = list[NDArray[np.float32]]
 MOST_BYTES = 2 << 30  # of all arrays of a file, as they are in memory
@@ -35,7 +35,7 @@ def read_weights(path: str | Path) -> list[Arrays]:
         raise InputError(
             "h5py is needed to read Keras weights",
             file=path,
-            remedy="pip install 'stereotruth[networks]'",
+            remedy=install_extra("networks"),
         ) from error
     try:
         with h5py.File(path, "r") as file:
