@@ -219,7 +219,7 @@ def write_report(
     out: str | Path,
     *,
     index: str | Path | None = None,
-    sliders: int,
+    sliders: int = 0,
     workers: int = 1,
     code: str = "",
 ) -> None:

@@ -195,8 +195,6 @@ def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"block_px": 200}, "multiple of 256"),
-        ({"overlap_px": 200}, "overlap"),
         ({"entry": {"kind": "sgm", "mode": "none"}}, "no mode"),
         ({"offset": 5000}, "no disparity at all"),
     ],
