@@ -40,12 +40,18 @@ from stereotruth.products.grids import require_complete
 from stereotruth.products.pictures import save_figure, stretch
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.changes import REASONS, changes_at
-from stereotruth.simulate.cities import Canopy, CitySpec, Dates, ViewSpec, lidar_files
+from stereotruth.simulate.cities import (
+    Canopy,
+    CitySpec,
+    Dates,
+    ViewSpec,
+    lidar_files,
+    training_city,
+)
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE, WATER
-from stereotruth.simulate.training_cities import training_city
 from stereotruth.status import Status, is_labelled
 
 FIRST_CITY = 4000  # of the numbers of cities

@@ -26,11 +26,9 @@ from label_tables import print_table
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from stereotruth.matching.networks.image_scaling import scaled
-from stereotruth.matching.networks.inference import mixed, precision_of
-from stereotruth.matching.networks.load_network import load_network
+from stereotruth.matching.networks.inference import load_network, mixed, precision_of
 from stereotruth.matching.networks.training_state import make_optimiser
-from stereotruth.matching.networks.weights import SavedNetwork
+from stereotruth.matching.networks.weights import SavedNetwork, scaled
 from stereotruth.products.files import write_json
 
 RANGE = (-64, 128)

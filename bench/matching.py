@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from stereotruth.dataset.stereo_dataset import find_pairs
-from stereotruth.matching.networks import image_scaling, inference, weights
+from stereotruth.matching.networks import inference, weights
 from stereotruth.matching.sgm import MODES, STEP, SemiGlobalMatcher, pad, to_8_bits
 from stereotruth.products.rasters import read_image
 
@@ -136,7 +136,7 @@ def networks(
             model = weights.SavedNetwork(kind, RANGE, 3 if left.ndim == 3 else 1)
             method = inference.NetworkMethod(model, model.build(), device, precision)
             ready = [
-                torch.from_numpy(image_scaling.scaled(image, model, None))[None].to(device)
+                torch.from_numpy(weights.scaled(image, model, None))[None].to(device)
                 for image in (left, right)
             ]
 

@@ -26,11 +26,17 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.lidar.strip_moves import move_strips
-from stereotruth.simulate.cities import CitySpec, FlightStrip, Jitter, ViewSpec, lidar_files
+from stereotruth.simulate.cities import (
+    CitySpec,
+    FlightStrip,
+    Jitter,
+    ViewSpec,
+    lidar_files,
+    training_city,
+)
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
-from stereotruth.simulate.training_cities import training_city
 
 OFFSETS_M = (0.31, 0.0, 0.07), (-0.2, 0.25, -0.06), (0.1, -0.33, 0.09), (-0.25, -0.15, -0.08)
 DENSITIES = 10.6, 2.6, 5.0, 4.0  # points/m²

@@ -28,10 +28,10 @@ from stereotruth.evaluation.surface_models.height_errors import OPEN, SOLID
 from stereotruth.evaluation.surface_models.reference import LidarReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
 from stereotruth.lidar.ingest import ingest
+from stereotruth.simulate.built_city import top_surface
 from stereotruth.simulate.cities import CITIES, CitySpec, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.surfaces import IN_LIDAR
-from stereotruth.simulate.top_surface import top_surface
 
 Heights = NDArray[np.float64]
 EVERY = {"Demo": DEMO, **CITIES}

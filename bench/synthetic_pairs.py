@@ -31,11 +31,17 @@ from stereotruth.matching.image_faults import as_images, smooth
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
 from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files
+from stereotruth.simulate.cities import (
+    CITIES,
+    CitySpec,
+    SceneSpec,
+    ViewSpec,
+    lidar_files,
+    training_city,
+)
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
-from stereotruth.simulate.training_cities import training_city
 
 VIEWS = ("left", "right")
 SEED = 12  # of the fresh cities, their control points' noise and the faults of images

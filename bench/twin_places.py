@@ -10,7 +10,7 @@ from pathlib import Path
 from wooded_scenes import Draw
 
 from stereotruth.simulate.cities import CitySpec
-from stereotruth.simulate.twins import twin_city
+from stereotruth.simulate.twin_world import twin_city
 
 
 @dataclass(frozen=True)

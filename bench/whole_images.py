@@ -12,8 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereotruth.matching.matcher import Matcher
-from stereotruth.matching.scenes.scene_tiles import blend_lists, predict_tile
-from stereotruth.matching.scenes.tiling import BLOCK_PX, OVERLAP_PX, Tiling, inside, view_of
+from stereotruth.matching.scenes.tiling import (
+    BLOCK_PX,
+    OVERLAP_PX,
+    Tiling,
+    blend_lists,
+    inside,
+    predict_tile,
+    view_of,
+)
 
 DisparityRange = tuple[int, int]
 

@@ -36,10 +36,10 @@ from stereotruth.numerics.error_sums import ErrorSum
 from stereotruth.numerics.robust import median_and_nmad
 from stereotruth.products.grids import Layer, atomic_store, blocks, create_grid, require_complete
 from stereotruth.products.pictures import colours, stretch
+from stereotruth.simulate.built_city import top_surface
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.render import simulate_image
-from stereotruth.simulate.top_surface import top_surface
 
 ROOT = Path(__file__).parents[1]
 SIZE = 4096

@@ -33,12 +33,12 @@ from stereotruth.simulate.cities import (
     SceneSpec,
     ViewSpec,
     lidar_files,
+    training_city,
 )
 from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE
-from stereotruth.simulate.training_cities import training_city
 from stereotruth.simulate.truth import SURFACES, truth_at
 
 Floats = NDArray[np.float64]

@@ -35,9 +35,8 @@ from .products.remote_files import (
     place_of,
     stand_in,
 )
-from .simulate.cities import lidar_files
-from .simulate.city_files import FOLDER as SYNTHETIC_FOLDER
-from .simulate.city_files import city_of, synthetic_city
+from .simulate.cities import FOLDER as SYNTHETIC_FOLDER
+from .simulate.cities import city_of, lidar_files, synthetic_city
 
 log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parent

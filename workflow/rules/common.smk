@@ -25,7 +25,7 @@ from stereotruth.project import (
     surfaces_of,
 )
 from stereotruth.dates import epoch_year
-from stereotruth.simulate import city_files
+from stereotruth.simulate import cities
 
 RULES = Path(workflow.current_basedir.get_path_or_uri(secret_free=True))
 CONDA = FILES / "envs" / "workflow.yaml"

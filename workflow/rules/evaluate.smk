@@ -17,7 +17,7 @@ rule grid_truth:
         runtime=60,
     params:
         script=content_of("../scripts/grid_truth.py"),
-        code=source_digest("evaluation.epipolar_truth", "simulate.city_files"),
+        code=source_digest("evaluation.epipolar_truth", "simulate.cities"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
     script:

@@ -21,13 +21,13 @@ def with_files_beside(scene, view):
 
 def file_of_city(wildcards):
     """The file of a synthetic city of the project's own; none of the six has one."""
-    file = city_files.file_of(wildcards.city)
+    file = cities.file_of(wildcards.city)
     return [given(file)] if file.is_file() else []
 
 
 def files_of_place(wildcards):
     """The files of the real place that a synthetic city is the twin of."""
-    city = city_files.synthetic_city(wildcards.city)
+    city = cities.synthetic_city(wildcards.city)
     return [given(file) for file in city.twin.files] if city and city.twin else []
 
 

@@ -16,7 +16,7 @@ rule simulate_city:
         runtime=30,
     params:
         script=content_of("../scripts/simulate_city.py"),
-        code=source_digest("simulate.built_city", "simulate.city_files"),
+        code=source_digest("simulate.built_city", "simulate.cities"),
     message:
         "Building synthetic city {wildcards.city}"
     script:
@@ -43,7 +43,7 @@ rule simulate_image:
     params:
         script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.render", "simulate.city_files"),
+        code=source_digest("simulate.render", "simulate.cities"),
     message:
         "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
     script:
@@ -72,7 +72,7 @@ rule simulate_lidar:
         script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
-        code=source_digest("simulate.lidar", "simulate.city_files"),
+        code=source_digest("simulate.lidar", "simulate.cities"),
     message:
         "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
     script:
@@ -101,7 +101,7 @@ rule simulate_truth:
     params:
         script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.truth", "simulate.control_points", "simulate.city_files"),
+        code=source_digest("simulate.truth", "simulate.control_points", "simulate.cities"),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"
     script:

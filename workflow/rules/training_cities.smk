@@ -1,6 +1,6 @@
 """Tiles of cities that no test shows, to train on."""
 
-from stereotruth.simulate.training_cities import cities_for
+from stereotruth.simulate.cities import cities_for
 
 
 rule training_city:

@@ -4,7 +4,7 @@ from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.provenance import describe
-from stereotruth.simulate.city_files import city_of
+from stereotruth.simulate.cities import city_of
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

@@ -3,7 +3,7 @@
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.simulate.built_city import write_surfaces
-from stereotruth.simulate.city_files import city_of
+from stereotruth.simulate.cities import city_of
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

@@ -2,7 +2,7 @@
 
 from stereotruth.job import job
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.simulate.city_files import city_of
+from stereotruth.simulate.cities import city_of
 from stereotruth.simulate.lidar import simulate_lidar_tile
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from ..project import (
     sheet,
 )
 from ..sheets import Scene
-from ..simulate.city_files import city_of, file_of
+from ..simulate.cities import city_of, file_of
 from .check_scene import Looked, SceneFacts, check_scene
 from .findings import Findings, Level
 from .resources import check_resources

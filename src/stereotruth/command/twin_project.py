@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from ..simulate.cities import LEFT_GSD_M
-from ..simulate.city_files import file_of, write_city
-from ..simulate.twins import SUN_DEG, twin_city
+from ..simulate.cities import LEFT_GSD_M, file_of, write_city
+from ..simulate.twin_world import SUN_DEG, twin_city
 from .example_city import append_row, append_settings, city_row
 from .new_project import begin
 

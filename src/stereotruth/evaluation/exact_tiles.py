@@ -23,10 +23,9 @@ from ..errors import InputError
 from ..products.files import atomic_folder, link
 from ..products.grids import require_complete
 from ..products.rasters import write_tiff
-from ..simulate.cities import CitySpec
+from ..simulate.cities import TILES_A_CITY, CitySpec, training_city
 from ..simulate.control_points import simulate_points
 from ..simulate.render import simulate_image
-from ..simulate.training_cities import TILES_A_CITY, training_city
 from .epipolar_truth import truth_window
 
 NODATA = -999.0

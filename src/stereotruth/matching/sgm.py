@@ -13,7 +13,7 @@ image, where either image has no data, outside the disparity range, and where Op
 ``uncertainty`` of an entry states a standard uncertainty, which takes more time:
 
 ==========  =======================================================================================
-left_right  the spread (:mod:`.spread`) between the disparities of left pixels and those of their
+left_right  the spread (:mod:`.matcher`) between the disparities of left pixels and those of their
             matches, of a second matching with the right image as reference
 peak_ratio  1 px × the mean grey difference of 5 × 5 px at the disparity over the least one at any
             disparity that is 2 px or more away: it puts pixels in order, and its size means nothing
@@ -39,8 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .matcher import DisparityRange, called
-from .spread import WINDOW_PX, spread
+from .matcher import WINDOW_PX, DisparityRange, called, spread
 
 MODES = {
     "sgbm": cv2.STEREO_SGBM_MODE_SGBM,  # five paths

@@ -15,13 +15,12 @@ from pathlib import Path
 
 from ..config.labels import Simulate
 from ..errors import InputError
-from .cities import CITIES, CitySpec, SceneSpec, lidar_files
-from .city_files import read_city
+from .cities import CITIES, CitySpec, SceneSpec, lidar_files, read_city
 from .control_points import simulate_points, write_gcps
 from .lidar import simulate_lidar_tile
 from .render import simulate_image
 from .truth import simulate_truth
-from .twins import twin_city
+from .twin_world import twin_city
 
 log = logging.getLogger("stereotruth")
 

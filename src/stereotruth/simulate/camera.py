@@ -7,7 +7,9 @@ jitter of roll and pitch, which RPCs cannot follow. Image
 coordinates are (col, row), (0, 0) the centre of the upper-left pixel.
 
 A camera is a flat float64 array for the kernels, made by :func:`aim`; its fields are the constants
-below. Where the radius of the orbit is 0, it is one of :mod:`.rpc_cameras`.
+below. Where the radius of the orbit is 0, it sees as given RPCs do, for the twin of a place that
+real images show: each line has a position, and each pixel looks from there through a ground point,
+both smooth functions of the image coordinates but for jitter (:func:`.rpcs.rpc_camera`).
 Positions and directions come out in the world frame of the city (see ``geodesy``).
 """
 
@@ -21,18 +23,82 @@ import numpy as np
 from ..kernels import inlined, kernel
 from .cities import Jitter
 from .geodesy import EARTH_RATE, GRAVITY, LocalFrame
-from .jitter_waves import (
-    END,
-    MOST_WAVES,
-    PER_ROW,
-    PHASE,
-    PITCH_WAVE,
-    ROLL_WAVE,
-    WAVE,
-    WAVES,
-    swings,
-)
-from .rpc_cameras import direction_by_rpc, pose_by_rpc, project_by_rpc
+
+WAVES, WAVE = 37, 38  # number of the waves of jitter, and the first one's fields
+ROLL_WAVE, PITCH_WAVE, PER_ROW, PHASE = 0, 1, 2, 3  # amplitudes and frequency in rad, phase
+MOST_WAVES = 8
+END = WAVE + 4 * MOST_WAVES
+
+
+@inlined
+def swings(cam, row):
+    """What all waves together add to roll and pitch at a line."""
+    roll = pitch = 0.0
+    for k in range(int(cam[WAVES])):
+        at = WAVE + 4 * k
+        swing = math.sin(cam[at + PHASE] + cam[at + PER_ROW] * row)
+        roll += cam[at + ROLL_WAVE] * swing
+        pitch += cam[at + PITCH_WAVE] * swing
+    return roll, pitch
+
+
+PER_COL, PER_LINE = 12, 35  # what jitter is measured by: 1, so that it is in px
+MIDDLE_ROW = 36
+GROUND_X, GROUND_Y = END, END + 10  # cubics of (u, v): where a pixel looks at z = 0
+STATION_X, STATION_Y, STATION_Z = END + 20, END + 23, END + 26  # quadratic in v; one height
+# u = (col − MIDDLE_COL) / COLS, v likewise by MIDDLE_ROW
+MIDDLE_COL, COLS, ROWS = END + 27, END + 28, END + 29
+INVERSE = END + 30  # (col, row) per metre of ground, row by row
+RPC_SIZE = END + 34
+CLOSE_PX = 1e-7
+
+
+@inlined
+def _cubic(cam, at, u, v):
+    c = cam[at] + cam[at + 1] * u + cam[at + 2] * v
+    c += cam[at + 3] * u * u + cam[at + 4] * u * v + cam[at + 5] * v * v
+    c += cam[at + 6] * u * u * u + cam[at + 7] * u * u * v
+    return c + cam[at + 8] * u * v * v + cam[at + 9] * v * v * v
+
+
+@inlined
+def pose_by_rpc(cam, row, out):
+    """Write the position of a line to out[:3], its v to out[3], and to out[4:6] what jitter adds to
+    u and v there."""
+    v = (row - cam[MIDDLE_ROW]) / cam[ROWS]
+    out[0] = cam[STATION_X] + v * (cam[STATION_X + 1] + v * cam[STATION_X + 2])
+    out[1] = cam[STATION_Y] + v * (cam[STATION_Y + 1] + v * cam[STATION_Y + 2])
+    out[2] = cam[STATION_Z]
+    out[3] = v
+    swing_col, swing_row = swings(cam, row)
+    out[4], out[5] = swing_col / cam[COLS], swing_row / cam[ROWS]
+
+
+@inlined
+def direction_by_rpc(cam, line, col):
+    """Direction (not normalised, z < 0) of the ray of a column, given its line's pose."""
+    u, v = (col - cam[MIDDLE_COL]) / cam[COLS] + line[4], line[3] + line[5]
+    x, y = _cubic(cam, GROUND_X, u, v), _cubic(cam, GROUND_Y, u, v)
+    return x - line[0], y - line[1], -line[2]
+
+
+@inlined
+def project_by_rpc(cam, x, y, z, line):
+    """(col, row) of a world point; ``line`` gets the pose of the row."""
+    col, row = cam[MIDDLE_COL], cam[MIDDLE_ROW]
+    for _ in range(40):
+        pose_by_rpc(cam, row, line)
+        dx, dy, dz = direction_by_rpc(cam, line, col)
+        miss_x = x - line[0] - dx / dz * (z - line[2])
+        miss_y = y - line[1] - dy / dz * (z - line[2])
+        step_col = cam[INVERSE] * miss_x + cam[INVERSE + 1] * miss_y
+        step_row = cam[INVERSE + 2] * miss_x + cam[INVERSE + 3] * miss_y
+        col += step_col
+        row += step_row
+        if abs(step_col) < CLOSE_PX and abs(step_row) < CLOSE_PX:
+            break
+    return col, row
+
 
 ALTITUDE_M = 505e3
 INCLINATION_DEG = 97.4
@@ -40,16 +106,12 @@ LOOK_DEG = {"left": -5.0, "right": 26.0}  # along track, negative looks back
 
 RADIUS, MOTION, P, Q = 0, 1, 2, 5  # orbit: radius, inertial rate, in-plane axes in ECEF at time 0
 TIME0, PERIOD = 8, 9  # time of row 0, seconds per row
-LOOK, COL0, PITCH_PER_COL = (
-    10,
-    11,
-    12,
-)  # tangent of the look angle, principal column, tangent per px
+LOOK, COL0, PITCH_PER_COL = 10, 11, 12  # tangent of the look, principal column, tangent per px
 ROLL, PITCH, YAW, TIME_REF = 13, 16, 19, 22  # polynomials of (time - TIME_REF), degree 2, rad
 FRAME = 23  # origin and axes of the world frame
 SLOPE = 35  # d(look tangent)/d(row) of a ground point, start value of the solver
 ROWS_MID = 36
-SIZE = END  # of jitter_waves
+SIZE = END
 
 
 @inlined

@@ -5,7 +5,17 @@ Nothing here computes or reads anything, so that a workflow can plan with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+import math
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..products.files import atomic_file
 
 LEFT_GSD_M = 0.65
 RIGHT_GSD_M = 0.80
@@ -318,3 +328,151 @@ def tile_index(scene: SceneSpec, file_name: str) -> tuple[int, int]:
     """(east, north) index of a LiDAR file within its scene."""
     north, east = file_name.rsplit(".", 1)[0].removeprefix(f"{scene.name}_").split("_")
     return int(east), int(north)
+
+
+TILES_A_CITY = 4  # two by two
+# least and most of each, in metres, degrees and shares; relief is drawn by its logarithm
+RELIEF_M = (4.0, 420.0)
+TOWERS_M = (22.0, 105.0)
+LON, LAT = (75.0, 122.0), (20.0, 38.0)
+APART_DEG = 0.2  # from the cities that tests show
+FIRST_SEED = 1 << 20  # of worlds; the others' are below
+GREATEST_LEAN = 0.35  # relief over wavelength at most
+FLAT = {"towers": 3, "slabs": 4, "lowrise": 3, "industry": 2, "park": 1.5, "fields": 2}
+STEEP = {"towers": 1, "slabs": 1, "lowrise": 2, "village": 3, "fields": 2, "forest": 3, "bare": 0.5}
+
+
+def training_city(number: int, seed: int, side_px: int) -> CitySpec:
+    """City ``number`` of ``seed``, whose one scene has a left image of ``side_px`` squared.
+
+    The same numbers give the same city everywhere.
+    """
+    rng = np.random.default_rng([seed, number, 0x7261696E])
+    relief = math.exp(rng.uniform(*np.log(RELIEF_M)))
+    steep = relief > 100.0
+    base = STEEP if steep else FLAT
+    zones = {name: weight * float(rng.uniform(0.2, 1.8)) for name, weight in base.items()}
+    highest = float(rng.uniform(TOWERS_M[0] + 15.0, TOWERS_M[1]))
+    lon, lat = _place(rng)
+    side = side_px * LEFT_GSD_M
+    wavelength = float(np.clip(rng.uniform(0.5, 1.6) * side, relief / GREATEST_LEAN, 3000.0))
+    character = Character(
+        relief_m=relief,
+        valley=float(rng.uniform(0.2, 0.55)),
+        wavelength_m=wavelength,
+        max_slope_deg=float(rng.uniform(25, 42) if steep else rng.uniform(8, 22)),
+        river_m=float(rng.choice([0.0, rng.uniform(40, 160)])),
+        lakes=float(rng.choice([0.0, 1.0])),
+        zones=zones,
+        towers_m=(float(rng.uniform(TOWERS_M[0], highest - 10.0)), highest),
+        trees=float(rng.uniform(0.3, 1.3)),
+        zone_m=float(rng.uniform(180, 380)),
+    )
+    name = f"Training-{number}"
+    scene = SceneSpec(
+        name, (0.0, 0.0), side_px, side_px, int(rng.integers(FIRST_SEED, 2**31)),
+        ascending=bool(rng.random() < 0.5), ragged_m=(0.0, 0.0),
+    )  # fmt: skip
+    return CitySpec(
+        name,
+        lon=lon,
+        lat=lat,
+        epsg=32601 + int((lon + 180.0) // 6.0),
+        base_height_m=float(rng.uniform(5, 1900)),
+        world_seed=int(rng.integers(FIRST_SEED, 2**31)),
+        character=character,
+        scenes=(scene,),
+        sun_azimuth_deg=float(rng.uniform(115, 190)),
+        sun_elevation_deg=float(rng.uniform(32, 66)),
+    )
+
+
+def _place(rng: np.random.Generator) -> tuple[float, float]:
+    """Longitude and latitude away from the cities that tests show."""
+    while True:
+        lon, lat = float(rng.uniform(*LON)), float(rng.uniform(*LAT))
+        if all(max(abs(lon - c.lon), abs(lat - c.lat)) > APART_DEG for c in CITIES.values()):
+            return lon, lat
+
+
+def cities_for(count: int) -> tuple[list[int], list[int]]:
+    """Numbers of the cities that ``count`` training tiles come from, and of those to validate by.
+
+    A tenth as many tiles validate, of one city at least; sets of more tiles hold those of fewer.
+    """
+    training = -(-count // TILES_A_CITY)
+    validation = max(1, round(count / (10 * TILES_A_CITY)))
+    return [2 * k + 1 for k in range(training)], [2 * k for k in range(validation)]
+
+
+FOLDER = Path("data/synthetic")  # of the working directory
+
+
+def file_of(name: str) -> Path:
+    """The file of a city that is none of the six."""
+    return FOLDER / name / "city.json"
+
+
+def synthetic_city(name: str) -> CitySpec | None:
+    """The city of a name, one of the six or of the project's own; None if there is none.
+
+    Raises InputError for a file that holds no city.
+    """
+    if name in CITIES:
+        return CITIES[name]
+    file = file_of(name).absolute()
+    if not file.is_file():
+        return None
+    return _read(file, file.stat().st_mtime_ns)
+
+
+def city_of(name: str) -> CitySpec:
+    """As :func:`synthetic_city`; raises InputError if there is none."""
+    city = synthetic_city(name)
+    if city is None:
+        raise InputError(
+            f"{name!r} is no synthetic city", file=file_of(name), remedy="write its file again"
+        )
+    return city
+
+
+def read_city(file: str | Path) -> CitySpec:
+    """The city of a file. Raises InputError that names the field that is wrong."""
+    from pydantic import TypeAdapter, ValidationError  # slow to import, and few cities have a file
+
+    try:
+        given = json.loads(Path(file).read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(
+            f"cannot be read as JSON: {error}", file=file, remedy="correct it, or make it again"
+        ) from None
+    try:
+        return TypeAdapter(CitySpec).validate_python(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"{where}: {first['msg']}", file=file, remedy="correct it, or make it again"
+        ) from None
+
+
+@lru_cache(maxsize=8)
+def _read(file: Path, changed_ns: int) -> CitySpec:
+    del changed_ns  # another time of the file is another city
+    return read_city(file)
+
+
+def write_city(city: CitySpec, file: str | Path) -> None:
+    """Write what a city has other than the defaults."""
+    with atomic_file(file) as scratch:
+        scratch.write_text(json.dumps(_plain(city), indent=2) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {
+            f.name: _plain(given)
+            for f in fields(value)
+            if (given := getattr(value, f.name)) != f.default or f.default is MISSING
+        }
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value

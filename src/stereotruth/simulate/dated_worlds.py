@@ -137,7 +137,7 @@ def _crops(city: CitySpec, s: Surfaces, passed: float) -> np.ndarray:
     """By how much the terrain's coefficients [ny, nx] stand higher under crops, m."""
     from scipy.spatial import cKDTree  # slow to import, and most cities have one date
 
-    from .zones import ZONE_KINDS
+    from .layout import ZONE_KINDS
 
     ny, nx = s.terrain.shape
     x, y = np.meshgrid(s.x0 + s.step * np.arange(nx), s.y0 + s.step * np.arange(ny))

@@ -1,6 +1,6 @@
 """Airborne LiDAR of a city: two crossed sets of flight lines over the same exact surfaces.
 
-A city may have strips instead, each with an error of its own (:mod:`.lidar_strips`).
+A city may have strips instead, each with an error of its own (:mod:`.lidar`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import logging
 import math
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import laspy
@@ -21,12 +22,10 @@ from ..errors import InputError
 from ..kernels import inlined, kernel
 from ..products.files import atomic_file
 from .built_city import surfaces_of
-from .cities import CitySpec, SceneSpec, lidar_files, tile_index
+from .cities import CitySpec, FlightStrip, SceneSpec, lidar_files, tile_index
 from .dated_worlds import world_of
 from .geodesy import LocalFrame
-from .layout import frame_of
-from .lidar_coverage import coverage, covered
-from .lidar_strips import FlownStrip, flown_strips
+from .layout import frame_of, half_size, image_axes
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
 
 log = logging.getLogger("stereotruth")
@@ -329,3 +328,122 @@ def simulate_lidar_tile(
         )
     log.info("%s: %.2f million points", tile_name, counts.sum() / 1e6)
     return {str(k): int(v) for k, v in enumerate(counts) if v}
+
+
+def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
+    """Packed outline float64[21] of a scene's LiDAR coverage, see :func:`covered`.
+
+    It reaches beyond the image at the first columns and last rows, and ends inside it, raggedly,
+    at the last columns and first rows, with a block missing in the corner between them. That of a
+    twin is a rectangle.
+    """
+    if city.twin is not None:  # what the file covers, and not the image's margin around it
+        cos, sin = math.cos(city.twin.turned_rad), math.sin(city.twin.turned_rad)
+        outline = [0.0, 0.0, cos, sin, -sin, cos, *city.twin.half_m]
+        return np.array([*outline, *np.zeros(13)])
+    across, along = image_axes(city, scene)
+    rng = np.random.default_rng([scene.pose_seed, 6])
+    beyond = 35.0 + 0.12 * city.character.relief_m
+    return np.array([
+        *scene.centre_m, *across, *along, *half_size(scene), beyond, *scene.ragged_m,
+        *rng.uniform(0, 2 * np.pi, 6), *scene.gap_m, *rng.uniform(0, 2 * np.pi, 2),
+    ])  # fmt: skip
+
+
+@inlined
+def covered(c, x, y):
+    """Whether a plan position lies in the LiDAR coverage."""
+    dx, dy = x - c[0], y - c[1]
+    a, b = dx * c[2] + dy * c[3], dx * c[4] + dy * c[5]
+    if a < -c[6] - c[8] or b > c[7] + c[8]:
+        return False
+    # the waves below stay within these factors: most points need no sine
+    if a < c[6] - 1.95 * c[9] and b > -c[7] + 1.95 * c[10]:
+        inside = True
+    else:
+        edge_a = 1 + 0.5 * math.sin(b / 150 + c[11]) + 0.3 * math.sin(b / 61 + c[12])
+        edge_a += 0.15 * math.sin(b / 19 + c[13])
+        edge_b = 1 + 0.5 * math.sin(a / 170 + c[14]) + 0.3 * math.sin(a / 53 + c[15])
+        edge_b += 0.15 * math.sin(a / 17 + c[16])
+        inside = a <= c[6] - c[9] * edge_a and b >= -c[7] + c[10] * edge_b
+    if not inside or a < c[6] - 1.07 * c[17] or b > -c[7] + 1.07 * c[18]:
+        return inside
+    gap_a = c[17] * (1 + 0.05 * math.sin(b / 90 + c[19]) + 0.02 * math.sin(b / 23))
+    gap_b = c[18] * (1 + 0.05 * math.sin(a / 80 + c[20]) + 0.02 * math.sin(a / 21))
+    return a < c[6] - gap_a or b > -c[7] + gap_b
+
+
+OVERLAP = 0.3  # of a strip's width, shared with the next one
+SPEED_M_S = 60.0
+START_S = 275_400_000.0  # adjusted GPS time of the first strip, in 2020
+TURN_S = 240.0  # from the end of a strip to the beginning of the next one
+EDGE_OF_LINE = np.uint8(0x80)
+EDGE_PULSES = 3.0  # from a strip's end: lines that end earlier leave its ground, not the strip
+
+
+@dataclass(frozen=True)
+class FlownStrip:
+    """A strip over a scene: its ``number`` from 1 on, and its ``west`` and ``east`` end, m.
+
+    ``south``, ``north``: where its line begins and ends.
+    """
+
+    strip: FlightStrip
+    number: int
+    west: float
+    east: float
+    south: float
+    north: float
+
+    @property
+    def spacing_m(self) -> float:
+        """Of its pulses."""
+        return self.strip.spacing_m
+
+    def taken(self, xyz: np.ndarray, info: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those of points [n, 3] that it measures, where it has them, and their ``info`` [n, 6]."""
+        inside = (xyz[:, 0] >= self.west) & (xyz[:, 0] < self.east)
+        xyz, info = xyz[inside], info[inside]
+        across = xyz[:, 0] - (self.west + self.east) / 2
+        xyz = xyz + self.strip.offset_m
+        xyz[:, 2] -= across * math.tan(math.radians(self.strip.roll_deg))
+        info[:, 5] = self.number
+        return xyz, info
+
+    def tell(self, fields: np.ndarray, header: laspy.LasHeader, xyz: np.ndarray) -> None:
+        """Fill the fields of points at ``xyz`` [n, 3] that tell when and where in a line they were
+        measured; lines of pulses lie one behind the other in their order."""
+        if "gps_time" in fields.dtype.names:
+            start = START_S + self.number * ((self.north - self.south) / SPEED_M_S + TURN_S)
+            fields["gps_time"] = start + (xyz[:, 1] - self.south) / SPEED_M_S
+        new = np.diff(xyz[:, 1]) > self.spacing_m / 2
+        across, near = xyz[:, 0] - self.strip.offset_m[0], EDGE_PULSES * self.spacing_m
+        edge = np.append(new, True) & (across > self.east - near)
+        edge |= np.append(True, new) & (across < self.west + near)
+        flags = "classification_flags" if header.point_format.id >= 6 else "bit_fields"
+        fields[flags] |= edge * EDGE_OF_LINE
+
+
+def flown_strips(city: CitySpec, scene: SceneSpec) -> list[FlownStrip]:
+    """The strips of a city over a scene, each beside the one before; none if it has none."""
+    if not city.strips:
+        return []
+    c = coverage(city, scene)
+    corners = np.array([
+        c[:2] + a * c[2:4] + b * c[4:6]
+        for a in (-c[6] - c[8], c[6])
+        for b in (-c[7], c[7] + c[8])
+    ])  # fmt: skip
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    step = (high[0] - low[0]) / (len(city.strips) - OVERLAP * (len(city.strips) - 1))
+    return [
+        FlownStrip(
+            strip,
+            number,
+            low[0] + (number - 1) * step * (1 - OVERLAP),
+            low[0] + (number - 1) * step * (1 - OVERLAP) + step,
+            low[1],
+            high[1],
+        )
+        for number, strip in enumerate(city.strips, 1)
+    ]

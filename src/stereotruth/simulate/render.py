@@ -22,9 +22,8 @@ from .camera import Pass, aim, direction, jittering, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
 from .dated_worlds import world_of
 from .geodesy import LocalFrame
-from .given_rpcs import read_rpc, rpc_camera
 from .layout import frame_of, half_size, scene_coordinates
-from .rpcs import FittedRPC, draw_bias, fit_rpc
+from .rpcs import FittedRPC, draw_bias, fit_rpc, read_rpc, rpc_camera
 from .surfaces import (
     CLOSE_M,
     LEFT_VIEW,

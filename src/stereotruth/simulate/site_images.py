@@ -14,7 +14,7 @@ from .camera import Pass, aim, drift_of_attitude, jittering
 from .control_points import GCP_COUNT, GCP_NOISE_PX, marks, spread_out, visible_in
 from .dated_worlds import world_of
 from .layout import frame_of
-from .lidar_coverage import coverage
+from .lidar import coverage
 from .render import (
     LEFT_COLLAR,
     SHOWN,

@@ -12,8 +12,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from .camera import ALTITUDE_M
-from .cities import Canopy, CitySpec, Jitter, SceneSpec, ViewSpec
-from .training_cities import training_city
+from .cities import Canopy, CitySpec, Jitter, SceneSpec, ViewSpec, training_city
 
 FIRST_DAY = datetime(2023, 2, 1, tzinfo=UTC)
 DAYS = 700  # that the passes of a drawn site are spread over

@@ -43,7 +43,7 @@ class Surfaces(NamedTuple):
     ``ground_look`` float64[2]: factors on the ground's reflectance and on its contrast.
     ``*_first``/``*_list``: objects by cell. ``cell_top`` float32[ny, nx]: greatest z of an object
     in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
-    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.zones.draw_zones`. ``resurfaced``: share
+    ``zones``, ``zone_cells``, ``zone_near``: see :func:`.layout.draw_zones`. ``resurfaced``: share
     of the streets that have another texture.
     ``patches`` float32[rows, cols, 3]: z in the middle and slopes along x and y of the patches of
     :mod:`.patches`, from cell (``patch_i``, ``patch_j``) on; ``patch_side`` uint8[rows, cols]:

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels import kernel
-from .buildings import FLAT, choose_changed, place_buildings
-from .canopy import place_canopy
+from .buildings import FLAT, choose_changed, place_buildings, place_vehicles
+from .canopy import place_canopy, place_trees
 from .cities import CitySpec
 from .dated_worlds import dated_buildings, dated_trees
-from .layout import extent
+from .layout import draw_zones, extent
 from .surfaces import (
     CELL_M,
     IN_IMAGES,
@@ -35,10 +35,7 @@ from .terrain import (
     make_terrain,
     spectral_noise,
 )
-from .trees import place_trees
 from .twin_world import patch_tops, place_of
-from .vehicles import place_vehicles
-from .zones import draw_zones
 
 log = logging.getLogger("stereotruth")
 

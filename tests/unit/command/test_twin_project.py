@@ -10,8 +10,8 @@ from stereotruth.command.main import init
 from stereotruth.command.twin_project import Options, with_twin
 from stereotruth.errors import InputError
 from stereotruth.project import configured, is_synthetic, lidar_of, read_scenes
-from stereotruth.simulate.city_files import city_of, file_of
-from stereotruth.simulate.twins import twin_city
+from stereotruth.simulate.cities import city_of, file_of
+from stereotruth.simulate.twin_world import twin_city
 
 from ...synthetic import house_points as place
 

@@ -145,7 +145,7 @@ def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
 
 def test_mccnn_that_is_not_installed_names_its_extra(monkeypatch):
     monkeypatch.setattr(pandora_pipeline, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"mc_cnn.*'stereotruth\[mccnn\]'"):
+    with pytest.raises(InputError, match=r"mc_cnn.*the extra mccnn"):
         method(pipeline="mccnn")
 
 

@@ -252,6 +252,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
         "Bare",
         CityFiles(tmp_path / "tiles", truth="none", truth_table="none"),
         tmp_path / "index.html",
+        sliders=2,
     )
     text = (tmp_path / "index.html").read_text()
     sections = re.findall(r'<section id="(\w+)"', text)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from stereotruth.simulate.cities import FlightStrip, lidar_files
-from stereotruth.simulate.lidar import simulate_lidar_tile
-from stereotruth.simulate.lidar_strips import TURN_S, flown_strips
+from stereotruth.simulate.lidar import TURN_S, flown_strips, simulate_lidar_tile
 
 from ...synthetic.small_cities import TOWN
 

@@ -19,6 +19,7 @@ import logging
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...errors import InputError
-from ..spread import spread
-from .image_scaling import Scaling, image_statistics, scaled
+from ..matcher import spread
+from .keras_weights import read_keras
 from .layers import channels_last, perplexity, resize
-from .load_network import load_network
-from .weights import SavedNetwork, covering
+from .weights import SavedNetwork, Scaling, covering, image_statistics, load_weights, scaled
 
 log = logging.getLogger("stereotruth")
 
@@ -211,3 +211,17 @@ def make(name: str, kind: str, settings: Mapping[str, Any], workers: int) -> Net
         torch.set_num_threads(workers)
     precision = precision_of(settings.get("precision"), device)
     return NetworkMethod(model, network, device, precision, uncertainty)
+
+
+def load_network(
+    path: str | Path, kind: str, scaling: str | None = None
+) -> tuple[SavedNetwork, nn.Module]:
+    """The network of a file, which tells its kind itself; one of Keras is taken for ``kind``.
+
+    ``scaling``: of the images for a file of Keras, see :func:`keras_weights.read_keras`.
+    Raises InputError if there is no such file, or it does not hold the network's weights.
+    """
+    if Path(path).suffix in (".h5", ".hdf5"):
+        return read_keras(path, kind, scaling)
+    model, network, _ = load_weights(path)
+    return model, network

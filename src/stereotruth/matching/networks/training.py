@@ -32,9 +32,7 @@ from ...job import progress
 from ...products.locks import exclusive
 from .inference import choose_device, mixed, padding, precision_of
 from .layers import channels_last
-from .losses import loss_of
 from .training_pairs import LabelledPairs
-from .training_record import publish_training
 from .training_settings import TrainingSettings, check_crop
 from .training_state import (
     FORMAT,
@@ -43,11 +41,36 @@ from .training_state import (
     freeze_parts,
     learning_rate_of,
     make_optimiser,
+    publish_training,
     read_state,
     save_state,
     start,
 )
 from .weights import SavedNetwork, save_weights
+
+
+def loss_of(outputs: Sequence[Tensor], disparity: Tensor, weights: Sequence[float]) -> Tensor:
+    """Weighted sum over the outputs of the mean smooth L1 over labelled pixels.
+
+    ``outputs``: [N, h, w], of the labels' size or a whole part of it and then in their own pixels;
+    ``disparity``: [N, H, W] px, NaN unlabelled. 0 without any label.
+    """
+    valid = torch.isfinite(disparity)
+    known = torch.where(valid, disparity, 0.0)
+    total = disparity.new_zeros(())
+    for output, weight in zip(outputs, weights):
+        scale = disparity.shape[1] // output.shape[1]
+        target, where = known, valid
+        if scale > 1:  # means over the labelled pixels only
+            share = F.avg_pool2d(valid.float().unsqueeze(1), scale).squeeze(1)
+            where = share > 0
+            pooled = F.avg_pool2d(known.unsqueeze(1), scale).squeeze(1)
+            target = pooled / share.clamp_min(1e-6) / scale
+        if where.any():
+            error = F.smooth_l1_loss(output.float()[where], target[where])
+            total = total + weight * error
+    return total
+
 
 log = logging.getLogger("stereotruth")
 

@@ -28,8 +28,7 @@ from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...errors import InputError
 from ...products.rasters import read_image
 from ..image_faults import FAULTS, faulty_pair
-from .image_scaling import scaled
-from .weights import SavedNetwork
+from .weights import SavedNetwork, scaled
 
 TRIES = 10  # random windows looked at for one with enough labels
 LABELLED_SHARE = 0.1  # that is enough

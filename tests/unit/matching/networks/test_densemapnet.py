@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
 from stereotruth.matching.networks import keras_weights
-from stereotruth.matching.networks.image_scaling import scaled
+from stereotruth.matching.networks.weights import scaled
 
 from ....synthetic.keras_reference import REFERENCE, SHAPE, drawn_images, drawn_weights
 from ....synthetic.small_networks import method

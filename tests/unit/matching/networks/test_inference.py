@@ -11,7 +11,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereotruth.errors import InputError
 from stereotruth.matching.kinds import NETWORKS
-from stereotruth.matching.networks import image_scaling, inference, keras_weights, weights
+from stereotruth.matching.networks import inference, keras_weights, weights
 from stereotruth.matching.networks.inference import NetworkMethod
 from stereotruth.matching.networks.weights import SavedNetwork
 
@@ -51,12 +51,12 @@ def test_parts_of_an_image_share_its_scaling() -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 60000, (100, 90)).astype(np.uint16)
     known = image[image != 0].astype(float)
-    mean, deviation = image_scaling.image_scaling(image)
+    mean, deviation = weights.weights(image)
     assert (mean, deviation) == pytest.approx((known.mean(), known.std()))
-    assert image_scaling.image_scaling(da.from_array(image, chunks=37)) == (mean, deviation)
+    assert weights.weights(da.from_array(image, chunks=37)) == (mean, deviation)
     scaling = method().scaling(image, image)
-    part = image_scaling.scaled(image[:10], method().model, scaling.left)
-    assert np.array_equal(part, image_scaling.scaled(image, method().model, None)[:, :10])
+    part = weights.scaled(image[:10], method().model, scaling.left)
+    assert np.array_equal(part, weights.scaled(image, method().model, None)[:, :10])
 
 
 @pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "densemapnet"])

@@ -15,8 +15,8 @@ from torch.utils.data import DataLoader
 from stereotruth.config.methods import Augmentation
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
-from stereotruth.matching.networks.image_scaling import scaled
 from stereotruth.matching.networks.training_pairs import LabelledPairs
+from stereotruth.matching.networks.weights import scaled
 from stereotruth.products.rasters import read_image
 
 from ....synthetic.small_pairs import SIZE

@@ -7,8 +7,8 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 import torch.nn.functional as F
 
-from stereotruth.matching.networks import convolution_gradient
-from stereotruth.matching.networks.convolution_gradient import convolve
+from stereotruth.matching.networks import layers
+from stereotruth.matching.networks.layers import convolve
 
 
 @pytest.mark.parametrize("dilation", [1, 2, 8])  # 8: some taps see nothing but padding
@@ -31,7 +31,7 @@ def test_values_and_gradients_are_those_of_pytorch(dilation: int, last: bool) ->
 
 
 def test_where_nothing_is_learned_or_channels_are_few_it_is_pytorchs_own(monkeypatch) -> None:
-    monkeypatch.setattr(convolution_gradient, "_Convolution", None)
+    monkeypatch.setattr(layers, "_Convolution", None)
     x, kernel = torch.randn(1, 32, 5, 5), torch.randn(32, 32, 3, 3)
     assert torch.equal(convolve(x, kernel, None, 1), F.conv2d(x, kernel, None, 1, 1))
     with torch.no_grad():

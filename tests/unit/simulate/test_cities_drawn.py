@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from stereotruth.simulate.cities import CITIES
-from stereotruth.simulate.training_cities import APART_DEG, cities_for, training_city
+from stereotruth.simulate.cities import APART_DEG, CITIES, cities_for, training_city
 
 
 def test_the_same_numbers_give_the_same_city_and_others_another():

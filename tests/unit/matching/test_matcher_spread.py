@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.matching.spread import spread
+from stereotruth.matching.matcher import spread
 
 
 def test_two_independent_results_tell_their_standard_deviation():

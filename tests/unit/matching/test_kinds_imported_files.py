@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.matching.imported_files import imported_files
-from stereotruth.matching.kinds import KINDS
+from stereotruth.matching.kinds import KINDS, imported_files
 
 PACK = {"pack/__init__.py", "pack/deep.py"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-from stereotruth.matching.networks.losses import loss_of
+from stereotruth.matching.networks.training import loss_of
 
 
 def test_the_loss_counts_labelled_pixels_only() -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from whole_images import match
 
-from stereotruth.matching.scenes.scene_tiles import blend
-from stereotruth.matching.scenes.tiling import Tiling
+from stereotruth.matching.scenes.tiling import Tiling, blend
 
 from ....synthetic.exact_method import SHAPE, Exact, coded
 

@@ -11,11 +11,10 @@ import pyproj
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.simulate.built_city import surfaces_of
+from stereotruth.simulate.built_city import surfaces_of, top_surface
 from stereotruth.simulate.camera import rays
 from stereotruth.simulate.changes import BUILT, DEMOLISHED, changes_at
-from stereotruth.simulate.cities import Dates, FlightStrip, Jitter, ViewSpec
-from stereotruth.simulate.city_files import read_city, write_city
+from stereotruth.simulate.cities import Dates, FlightStrip, Jitter, ViewSpec, read_city, write_city
 from stereotruth.simulate.dated_worlds import YOUNG
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.patches import PATCH_M, PATCHES_A_CELL
@@ -30,9 +29,8 @@ from stereotruth.simulate.surfaces import (
     WALL,
     terrain_heights,
 )
-from stereotruth.simulate.top_surface import top_surface
 from stereotruth.simulate.truth import truth_at
-from stereotruth.simulate.twins import twin_city
+from stereotruth.simulate.twin_world import twin_city
 
 from ...synthetic import house_points as place
 

@@ -9,7 +9,7 @@ import pytest
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
 from stereotruth.errors import InputError
-from stereotruth.matching.networks.keras_files import read_weights
+from stereotruth.matching.networks.keras_weights import read_weights
 
 KERNEL = np.arange(6, dtype=np.float32).reshape(2, 3)
 

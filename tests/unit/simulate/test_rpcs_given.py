@@ -12,11 +12,11 @@ from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.camera import jittering, locate, project
 from stereotruth.simulate.cities import Jitter
 from stereotruth.simulate.geodesy import LocalFrame
-from stereotruth.simulate.given_rpcs import NAMES, RATIOS, read_rpc, rpc_camera
 from stereotruth.simulate.layout import frame_of
 from stereotruth.simulate.render import prepare
+from stereotruth.simulate.rpcs import NAMES, RATIOS, read_rpc, rpc_camera
 from stereotruth.simulate.truth import truth_at
-from stereotruth.simulate.twins import twin_city
+from stereotruth.simulate.twin_world import twin_city
 
 from ...synthetic import house_points as place
 from ...synthetic.small_cities import ONE_BOX

@@ -1,7 +1,7 @@
-"""Roofs of a twin: points that lie in planes, and the raster of planar patches made of them.
+"""Ground, roofs and crowns of the twin of a real place, from its points.
 
-Planes are grown from point to point by the points' neighbours (Rabbani et al. 2006, Segmentation
-of point clouds using smoothness constraint): whatever they come to is what the twin has.
+Roofs are planes that grow over points from smooth seeds; crowns are ellipsoids whose tops are the
+points of leaves that were hit first; the ground is what lies below both.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from ..kernels import inlined, kernel
 from .patches import NOTHING, PATCH_M
+from .twin_points import Points
 
 NEIGHBOURS = 10  # by which the plane of a point is told
 THIN_M = 0.4  # one point at most in a square of this side
-ROUGH_M = 0.12  # rms of the neighbours off their plane: less for a point that a plane begins with
+SEED_ROUGH_M = (
+    0.12  # rms of the neighbours off their plane: less for a point that a plane begins with
+)
 OFF_M = 0.18  # of a plane: a point so near belongs to it
 JOIN_M = 0.45  # what no plane took up joins the one beside it, so near
 TURN = math.cos(math.radians(28))  # of the normals within a plane
@@ -98,7 +102,7 @@ def _grow(xyz, near, normal, rough, order, number, planes):
     queue = np.empty(len(xyz), np.int64)
     sums, plane = np.zeros(9), np.zeros(5)
     for seed in order:
-        if number[seed] >= 0 or rough[seed] > ROUGH_M or normal[seed, 2] < 0.4:
+        if number[seed] >= 0 or rough[seed] > SEED_ROUGH_M or normal[seed, 2] < 0.4:
             continue
         ox, oy, oz = xyz[seed, 0], xyz[seed, 1], xyz[seed, 2]
         plane[:3] = 0.0
@@ -131,7 +135,7 @@ def _grow(xyz, near, normal, rough, order, number, planes):
                 dx, dy = xyz[q, 0] - ox - plane[0], xyz[q, 1] - oy - plane[1]
                 off = xyz[q, 2] - oz - plane[2] - plane[3] * dx - plane[4] * dy
                 turn = normal[q, 2] - plane[3] * normal[q, 0] - plane[4] * normal[q, 1]
-                if abs(off) * scale < OFF_M and (turn * scale > TURN or rough[q] > ROUGH_M):
+                if abs(off) * scale < OFF_M and (turn * scale > TURN or rough[q] > SEED_ROUGH_M):
                     number[q] = count
                     queue[size] = q
                     size += 1
@@ -323,3 +327,159 @@ def _sides(z: np.ndarray) -> np.ndarray:
     smooth = ndimage.gaussian_filter(level.astype(np.float64), SIDE_M / PATCH_M, mode="nearest")
     down_y, down_x = (-d for d in np.gradient(smooth))
     return np.rint(np.arctan2(down_y, down_x) * (128 / math.pi)).astype(np.int64).astype(np.uint8)
+
+
+GROUND_CLASSES = (2, 9)
+STEP_M = 2.0  # between the coefficients of the spline
+FILTER_M = 1.0  # cells in which the lowest points are sought
+WIDEST_M = 30.0  # half the width of the widest building, where no class tells the ground
+STEEP = 0.15  # rise over run of ground that the search for objects lets pass
+LOW_M = 3.0  # a cell so far below those around has a false point
+NEAR_M = 0.5  # of the lowest surface: ground
+BEYOND = 64  # squares of ground that tell how high it lies where the file ends
+MAX_SLOPE = 1.0  # less steep than any ray, so that each meets the ground once
+
+
+def is_ground(points: Points) -> np.ndarray:
+    """Which points lie on the ground, bool[n]: by their class, or else the lowest ones.
+
+    Without classes by a progressive morphological filter (Zhang et al. 2003, doi
+    10.1109/TGRS.2003.810682): objects are what openings of growing width cut off.
+    """
+    if points.has_class(*GROUND_CLASSES):
+        return np.isin(points.label, GROUND_CLASSES)
+    low = points.xyz[:, :2].min(axis=0)
+    i, j = ((points.xyz[:, :2] - low) / FILTER_M).astype(int).T
+    lowest = np.full((j.max() + 1, i.max() + 1), np.inf)
+    np.minimum.at(lowest, (j, i), points.xyz[:, 2])
+    lowest = _filled(lowest)
+    around = ndimage.median_filter(lowest, 5, mode="nearest")
+    lowest = np.where(lowest < around - LOW_M, around, lowest)
+    surface, is_object = lowest, np.zeros(lowest.shape, bool)
+    for half in _windows():
+        opened = ndimage.grey_opening(surface, size=2 * half + 1, mode="nearest")
+        is_object |= surface - opened > STEEP * half * FILTER_M
+        surface = opened
+    ground = _filled(np.where(is_object, np.inf, lowest))
+    return np.abs(points.xyz[:, 2] - ground[j, i]) < NEAR_M
+
+
+def _windows() -> list[int]:
+    """Half widths of the openings, cells: each some half wider than the one before."""
+    halves = [1]
+    while halves[-1] * FILTER_M < WIDEST_M:
+        halves.append(math.ceil(1.5 * halves[-1]))
+    return halves
+
+
+def _filled(heights: np.ndarray) -> np.ndarray:
+    """Heights with those of the nearest cell in place of infinite ones."""
+    holes = ~np.isfinite(heights)
+    if not holes.any():
+        return heights
+    at = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return heights[tuple(at)]
+
+
+def terrain_of(xyz: np.ndarray, x0: float, y0: float, shape: tuple[int, int]) -> np.ndarray:
+    """Spline coefficients [ny, nx] of the terrain from (x0, y0) on, STEP_M apart.
+
+    ``xyz`` [n, 3]: points on the ground. Linear between them, as under buildings; beyond them the
+    median height of the nearest ones. No slope is above MAX_SLOPE.
+    """
+    i, j = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / STEP_M).astype(np.int64).T
+    square = j * (i.max() + 1) + i
+    count = np.bincount(square)
+    mean = np.column_stack([np.bincount(square, weights=xyz[:, k]) for k in range(3)])
+    mean = mean[count > 0] / count[count > 0, None]
+    x, y = np.meshgrid(x0 + STEP_M * np.arange(shape[1]), y0 + STEP_M * np.arange(shape[0]))
+    z = np.full(shape, np.nan)
+    if len(mean) > 3:
+        z = LinearNDInterpolator(mean[:, :2], mean[:, 2])(x, y)
+    beyond = ~np.isfinite(z)
+    at = np.column_stack([x[beyond], y[beyond]])
+    _, near = cKDTree(mean[:, :2]).query(at, min(BEYOND, len(mean)))
+    z[beyond] = np.median(mean[near, 2].reshape(len(at), -1), axis=1)
+    return _less_steep(z)
+
+
+def _less_steep(z: np.ndarray) -> np.ndarray:
+    """Heights that no slope along x or y exceeds MAX_SLOPE / √2: what is steeper gives way."""
+    rise = MAX_SLOPE / math.sqrt(2) * STEP_M
+    while True:
+        lower = z.copy()
+        for axis in (0, 1):
+            ahead, behind = np.roll(lower, -1, axis), np.roll(lower, 1, axis)
+            last = [slice(None)] * 2
+            last[axis] = -1
+            ahead[tuple(last)] = np.inf
+            last[axis] = 0
+            behind[tuple(last)] = np.inf
+            lower = np.minimum(lower, np.minimum(ahead, behind) + rise)
+        if np.array_equal(lower, z):
+            return z
+        z = lower
+
+
+CLASSES = (3, 4, 5)
+ROOFS = (6, 17)  # 17: bridge decks
+OBJECT_M = 1.5  # above the ground: less is none
+ROUGH_M = 0.2  # rms of neighbours off their plane: more is no roof
+SEVERAL = 0.6  # share of the neighbours whose pulses had more returns: more is no roof
+SPACING_M = 1.2  # between tops
+TREE_M = 6.0  # between trees
+RADIUS_M = (1.0, 1.35)
+DEPTH_M = 5.0  # of a crown below its top at most
+BOTTOM = 0.3  # of a top's height above the ground
+LEAF = 0.15  # reflectance of a leaf of style 1
+POROSITY = 0.3  # share of the pulses that the top of a crown lets pass
+
+
+def is_leaf(points: Points) -> np.ndarray:
+    """Which points above the ground are leaves, bool[n]; the others are roofs.
+
+    By their class; where the file has no classes of roofs or of plants, by how rough the surface is
+    around them and how many pulses went through it, as most of their neighbours say.
+    """
+    if points.has_class(*CLASSES) and points.has_class(*ROOFS):
+        return np.isin(points.label, CLASSES)
+    if len(points.xyz) <= NEIGHBOURS:
+        return np.zeros(len(points.xyz), bool)
+    near = cKDTree(points.xyz).query(points.xyz, NEIGHBOURS)[1]
+    _, rough = local_planes(points.xyz, near)
+    several = np.mean(~points.single[near], axis=1)
+    leaf = (rough > ROUGH_M) | (several > SEVERAL)
+    for _ in range(3):
+        leaf = np.mean(leaf[near], axis=1) > 0.5
+    return leaf
+
+
+class Crowns(NamedTuple):
+    """``ellipsoids`` float64[n, 6] and their ``style`` [n, 2], as in :class:`.surfaces.Surfaces`;
+    ``tree`` [n]: number of the tree that one is part of; ``foot`` [n]: z of the ground below."""
+
+    ellipsoids: np.ndarray
+    style: np.ndarray
+    tree: np.ndarray
+    foot: np.ndarray
+
+
+def crowns_of(points: Points, ground: np.ndarray, rng: np.random.Generator) -> Crowns:
+    """The crowns whose leaves are ``points``; ``ground`` [n]: z of the ground below each of them.
+
+    A tree is what lies nearest to the highest top of TREE_M².
+    """
+    first = np.flatnonzero(points.first)
+    top = first[thinned(points.xyz[first], SPACING_M)]
+    xyz, foot = points.xyz[top], ground[top]
+    tall = xyz[:, 2] - foot
+    bottom = np.maximum(foot + BOTTOM * tall, xyz[:, 2] - DEPTH_M)
+    half = np.maximum((xyz[:, 2] - bottom) / 2, 0.4)
+    radius = rng.uniform(*RADIUS_M, len(top))
+    crowns = np.column_stack([xyz[:, :2], xyz[:, 2] - half, radius, half, (radius / half) ** 2])
+    light = np.full(len(top), 1.0) if points.tint is None else points.tint[top] / LEAF
+    style = np.column_stack([np.clip(light, 0.4, 1.6), np.full(len(top), POROSITY)])
+    tree = np.zeros(len(top), np.int64)
+    if len(top):
+        tree = cKDTree(xyz[thinned(xyz, TREE_M), :2]).query(xyz[:, :2])[1]
+    return Crowns(crowns, style, tree, foot)

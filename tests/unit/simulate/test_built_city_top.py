@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.simulate.built_city import top_surface
 from stereotruth.simulate.layout import frame_of
 from stereotruth.simulate.surfaces import terrain_heights
-from stereotruth.simulate.top_surface import top_surface
 from stereotruth.simulate.world import build_surfaces
 
 from ...synthetic.small_cities import GROUND, ONE_BOX, ROOF
