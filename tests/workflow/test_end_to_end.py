@@ -19,7 +19,6 @@ from stereotruth.alignment.refine import refine
 from stereotruth.command.check import check_project
 from stereotruth.command.findings import Level
 from stereotruth.config.labels import LabelSettings
-from stereotruth.dataset.sure_labels import TOO_UNCERTAIN
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.epipolar.image_reader import open_pair
@@ -182,7 +181,7 @@ def test_the_store_of_a_scene_opens_by_xarray_alone(made):
             wanted = here.disparity.values.astype(np.float64) - int(row["right_offset_px"])
             status = here.status.values.copy()
             unsure = (status == Status.LABELLED_CROWN) & (here.uncertainty.values > 0.5)
-            wanted[unsure], status[unsure] = np.nan, TOO_UNCERTAIN
+            wanted[unsure], status[unsure] = np.nan, Status.TOO_UNCERTAIN
             for kind, values in (("disp", wanted), ("status", status)):
                 path = made.folder / "tiles/Tiny" / row[kind]
                 found = rioxarray.open_rasterio(path, masked=kind == "disp")[0].values
