@@ -1,4 +1,4 @@
-"""Reading a COPC file by footprint: points, bytes, time, memory, faults, requests. See README.md.
+"""Reading a COPC file by footprint: points, bytes, time, memory, requests. See README.md.
 
 Files are made (tests/synthetic/copc_server.py) and served on the loopback by a server that counts.
 """
@@ -6,61 +6,33 @@ Files are made (tests/synthetic/copc_server.py) and served on the loopback by a 
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import multiprocessing
 import os
-import shutil
 import struct
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
-import laspy
 import numpy as np
-from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.synthetic.copc_server import (
-    CORNER,
-    FILE_FAULTS,
     INFO_AT,
-    SERVER_FAULTS,
-    damaged,
     make_copc,
     serving,
 )
-from tests.synthetic.ept import FAULTS, make_ept
 
-from stereotruth.errors import InputError, in_number
+from stereotruth.errors import in_number
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.octree import open_octree
-from stereotruth.lidar.octree_nodes import Octree
+from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 
 DENSITY = 10.0  # points/m²
 LON, LAT = 117.0, 29.83  # of the made files' corner
-
-
-class Square:
-    """A square of ground in the system of the made file."""
-
-    def __init__(self, side: float) -> None:
-        self.low = CORNER[:2] + 700
-        self.high = self.low + side
-
-    def touches(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        return ((low[:, :2] <= self.high) & (high[:, :2] >= self.low)).all(axis=1)
-
-    def contains(self, xyz: np.ndarray) -> np.ndarray:
-        x = xyz[:2].T
-        return ((x >= self.low) & (x <= self.high)).all(axis=1)
 
 
 def cells_of(share: float, side: float) -> Footprint:
@@ -98,15 +70,6 @@ def of_own_process(work: Callable[..., Any], *arguments: Any) -> tuple[float, fl
     return result
 
 
-def stand_in(url: str, size: int) -> Path:
-    """What the workflow has in the place of a URL, in the working directory."""
-    parts = urlsplit(url)
-    place = Path("results", "remote", parts.scheme, parts.netloc, parts.path.lstrip("/"))
-    place.parent.mkdir(parents=True, exist_ok=True)
-    place.write_text(json.dumps({"size": size, "content": '"one"'}) + "\n")
-    return place
-
-
 def same_cells(whole: PointStore, part: PointStore) -> bool:
     """Whether a store has the cells of another one in its footprint, to the byte."""
     at = np.stack([whole.cell_row - part.footprint.row, whole.cell_col - part.footprint.col])
@@ -124,7 +87,7 @@ def trace(points: int, levels: int) -> None:
     file = Path("tile.copc.laz")
     file.write_bytes(make_copc(points, side, levels).content)
     with serving(file.read_bytes()) as server:
-        place = stand_in(server.url, file.stat().st_size)
+        place = server.stand_in()
         for store in ("first.points", "second.points"):
             ingest(place, store, footprint=cells_of(0.01, side))
             nodes = PointStore(store).attrs["nodes"]
@@ -159,7 +122,7 @@ def measure(points: int, levels: int) -> None:
     print(f"of a core {part_core_s:.2f} s of {whole_core_s:.2f} s: {share:.4f}")
     print(f"memory {part_mb:.0f} MB, of the whole file as LAZ {whole_mb:.0f} MB")
     with serving(file.read_bytes()) as server:
-        place = stand_in(server.url, size)
+        place = server.stand_in()
         ingest(place, "web.points", footprint=footprint)
         nodes_bytes = PointStore("web.points").attrs["bytes"][0]
         print_trace(file, server.requests)
@@ -179,15 +142,16 @@ def print_trace(file: Path, requests: Sequence[str]) -> None:
     for number, text in enumerate(requests, 1):
         first, last = map(int, text.rpartition("=")[2].split("-"))
         last = min(last, size - 1)
-        nodes = [n for n in octree.nodes if first <= n.start and n.start + n.bytes - 1 <= last]
+        ends = octree.nodes["start"] + octree.nodes["bytes"]
+        nodes = octree.nodes[(octree.nodes["start"] >= first) & (ends - 1 <= last)]
         what = "chunk table" if last + 1 < hierarchy else "hierarchy"
         if last + 1 == hierarchy:
             what = "head of the record of the hierarchy"
         if first == 0:
             what = "header, coordinate system, cube and place of the hierarchy"
-        elif nodes:
-            levels = sorted({node.key[0] for node in nodes})
-            points = sum(node.points for node in nodes)
+        elif len(nodes):
+            levels = np.unique(nodes["key"][:, 0])
+            points = nodes["points"].sum()
             of = f"level {levels[0]}" if len(levels) == 1 else f"levels {levels[0]}-{levels[-1]}"
             what = f"{in_number(len(nodes), 'node')} of {of}, {points} points"
         print(f"| {number} | {first}-{last} | {last + 1 - first} | {what} |")
@@ -198,71 +162,10 @@ def ingest_part(file: Path, store: str, footprint: Footprint) -> None:
     ingest(file, store, footprint=footprint)
 
 
-def plant(rounds: int) -> None:
-    """Faults of servers and files, each ``rounds`` times: overcome, refused, or lost silently."""
-    made, patience_s, ground = make_copc(), 3.0, Square(2048 * 0.05**0.5)
-    las = laspy.read(io.BytesIO(made.content))
-    kept = ground.contains(np.stack([las.x, las.y]))
-    truth = np.stack([np.asarray(las[axis])[kept] for axis in "XYZ"])
-    totals = {"right": 0, "refused": 0, "silent": 0, "traceback": 0}
-    longest = 0.0
-    for fault in (*SERVER_FAULTS, *FILE_FAULTS):
-        for seed in range(rounds):
-            rng = np.random.default_rng([seed, len(fault)])
-            in_file = fault in FILE_FAULTS
-            content = damaged(made, fault, rng) if in_file else made.content
-            start = time.perf_counter()
-            with serving(content, "" if in_file else fault, int(rng.integers(0, 6))) as server:
-                opened = partial(open_octree, server.url, patience_s=patience_s)
-                outcome = outcome_of(opened, ground, truth, f"{fault}, round {seed}")
-            longest = max(longest, time.perf_counter() - start)
-            totals[outcome] += 1
-    plant_in_ept(ground, totals)
-    kinds = len(SERVER_FAULTS) + len(FILE_FAULTS) + len(FAULTS)
-    print(f"{sum(totals.values())} faults of {kinds} kinds: {totals}")
-    print(f"longest {longest:.1f} s, patience {patience_s} s for each part of a file")
-
-
-def outcome_of(
-    opened: Callable[[], Octree], ground: Square, truth: NDArray[np.int32], name: str
-) -> str:
-    """What reading a ``ground`` of a damaged octree ends in: right (the points are those of the
-    ``truth`` [3, n]), silent, refused or traceback. Bad ends are printed with the fault's name."""
-    try:
-        octree = opened()
-        records = list(octree.read(octree.plan(ground.touches)))
-        got = np.hstack([np.stack([r.array[axis] for axis in "XYZ"]) for r in records])
-        world = got.T * octree.header.scales + octree.header.offsets
-        right = np.array_equal(got[:, ground.contains(world.T)], truth)
-        outcome = "right" if right else "silent"
-    except InputError:
-        return "refused"
-    except Exception as error:
-        outcome = "traceback"
-        print(f"{name}: {error!r}")
-    if outcome != "right":
-        print(f"{name}: {outcome}")
-    return outcome
-
-
-def plant_in_ept(ground: Square, totals: dict[str, int]) -> None:
-    """Faults of a dataset of Entwine Point Tiles on the disk, added to the ``totals``."""
-    whole = make_ept(Path("set"))
-    las = laspy.read(whole.with_name("all.las"))
-    stored = np.stack([las.X, las.Y, las.Z])
-    truth = stored[:, ground.contains(np.stack([las.x, las.y]))]
-    for fault, plant_it in FAULTS.items():
-        shutil.copytree(whole.parent, "damaged")
-        plant_it(Path("damaged"))
-        totals[outcome_of(partial(open_octree, "damaged/ept.json"), ground, truth, fault)] += 1
-        shutil.rmtree("damaged")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--levels", type=int, default=6)
-    parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--trace", action="store_true", help="the requests of one run, alone")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -271,7 +174,6 @@ def main() -> None:
             trace(options.points, options.levels)
         else:
             measure(options.points, options.levels)
-            plant(options.rounds)
 
 
 if __name__ == "__main__":

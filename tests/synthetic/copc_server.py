@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from pathlib import Path
 from threading import Lock, Thread
 
 import laspy
@@ -32,7 +34,6 @@ class MadeCopc:
     content: bytes
     entries: list[tuple[int, ...]]
     hierarchy_at: int
-    header_count_at: int = 247  # LAS 1.4: number of point records
 
 
 def thinned_surface(
@@ -58,18 +59,21 @@ def thinned_surface(
 
 
 def make_copc(
-    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, paged: bool = True
+    points: int = 20_000, side: float = 2048.0, levels: int = 5, seed: int = 0, form: int = 6
 ) -> MadeCopc:
-    """A :func:`thinned_surface` in an octree of so many levels, with pages below level 1."""
+    """A :func:`thinned_surface` in an octree of so many levels, with pages below level 1.
+
+    ``form``: of its points, 6 to 8. A node without points is in the hierarchy, too.
+    """
     rng = np.random.default_rng(seed)
     key, xyz = thinned_surface(rng, points, side, levels)
-    header = laspy.LasHeader(point_format=6, version="1.4")
+    header = laspy.LasHeader(point_format=form, version="1.4")
     header.scales, header.offsets = [0.01] * 3, CORNER
     header.are_points_compressed, header.point_count = True, points
     header.mins, header.maxs = CORNER + xyz.min(axis=0), CORNER + xyz.max(axis=0)
     header.global_encoding.wkt = True
     header.number_of_points_by_return = np.array([points, *[0] * 14], np.uint32)
-    packing = lazrs.LazVlr.new_for_compression(6, 0, True)
+    packing = lazrs.LazVlr.new_for_compression(form, 0, True)
     wkt = UTM.to_wkt().encode() + b"\0"
     header.vlrs = [
         laspy.VLR("copc", 1, "", bytes(160)),
@@ -86,7 +90,7 @@ def make_copc(
     header.write_to(stream)
     entries = _compressed(stream, packing, record.array, key)
     hierarchy_at = stream.seek(0, 2) + 60
-    pages = _pages(entries, hierarchy_at, paged)
+    pages = _pages(entries, hierarchy_at)
     stream.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(pages[0]), b"") + pages[0])
     content = bytearray(stream.getvalue())
     struct.pack_into("<QI", content, 235, hierarchy_at - 60, 1)
@@ -121,11 +125,10 @@ def _compressed(stream, packing, array, key) -> list[tuple[int, ...]]:
     return entries
 
 
-def _pages(entries, at, paged) -> tuple[bytes, int]:
+def _pages(entries, at) -> tuple[bytes, int]:
     """The hierarchy, and the bytes of its first page."""
-    root = [e for e in entries if e[0] < 2 or not paged]
-    if not paged:
-        return b"".join(ENTRY.pack(*e) for e in root), ENTRY.size * len(root)
+    root = [e for e in entries if e[0] < 2]
+    root.append((9, 0, 0, 0, 0, 0, 0))
     below: dict[tuple, list] = {}
     for e in entries:
         if e[0] >= 2:
@@ -140,45 +143,47 @@ def _pages(entries, at, paged) -> tuple[bytes, int]:
     return first + later, len(first)
 
 
-# What a server does wrong, and whether asking again gets the points all the same.
-SERVER_FAULTS = {
-    "short body": True,
-    "short range": True,
-    "shifted range": True,
-    "longer body": True,
-    "no Content-Range": True,
-    "garbled Content-Range": True,
-    "429 with seconds": True,
-    "429 with a date": True,
-    "503": True,
-    "500": True,
-    "reset": True,
-    "stall": True,
-    "redirect to itself once": True,
-    "503 for ever": False,
-    "429 for an hour": False,
-    "stall for ever": False,
-    "drip": False,
-    "drip of the head": False,
-    "no ranges": False,
-    "replaced: ETag": False,
-    "replaced: size": False,
-    "gone": False,
-    "forbidden": False,
-    "unsatisfiable": False,
-    "encoded": False,
-    "redirect loop": False,
-    "redirect to file:": False,
-    "redirect to another host": False,
-    "redirect to another port": False,
+def _status(status: int, **headers: str) -> Callable[[Server], tuple[int, dict[str, str]]]:
+    return lambda server: (status, {n.replace("_", "-"): v for n, v in headers.items()})
+
+
+# What a server does wrong, at one request or from then on: whether a client gets over it, and the
+# status and headers of the answer. Those without are parts of a file that Answer spoils.
+SERVER_FAULTS: dict[str, tuple[bool, Callable[[Server], tuple[int, dict[str, str]]] | None]] = {
+    "429 with seconds": (True, _status(429, Retry_After="1")),
+    "429 with a date": (True, lambda s: (429, {"Retry-After": formatdate(time.time() + 1)})),
+    "503": (True, _status(503)),
+    "redirect to itself once": (True, lambda s: (302, {"Location": s.url})),
+    "reset": (True, None),
+    "short body": (True, None),
+    "no Content-Range": (True, None),
+    "shifted range": (True, None),
+    "stall": (True, None),
+    "503 for ever": (False, _status(503)),
+    "429 for an hour": (False, _status(429, Retry_After="3600")),
+    "gone": (False, _status(410)),
+    "forbidden": (False, _status(403)),
+    "redirect loop": (False, lambda s: (302, {"Location": s.url + "?signature=verysecret"})),
+    "redirect to file:": (False, _status(302, Location="file:///etc/passwd")),
+    "redirect to another host": (False, lambda s: (302, {"Location": s.target})),
+    "redirect to another port": (False, _status(302, Location="http://127.0.0.1:9/x?sig=secret")),
+    "drip": (False, None),
+    "drip of the head": (False, None),
+    "no ranges": (False, None),
+    "encoded": (False, None),
+    "replaced: size": (False, None),
+    "replaced: ETag": (False, None),
 }
 
 
 @dataclass
 class Server:
-    """What a server holds and does wrong: ``fault`` at request ``when`` (from 0), or from then."""
+    """A server of a file at ``url``, or of a folder's files; ``requests`` and bytes ``sent``.
 
-    content: bytes
+    It does wrong by ``fault`` at request ``when`` (from 0), or from then on.
+    """
+
+    content: bytes | Path
     fault: str = ""
     when: int = 0
     sent: int = 0
@@ -187,98 +192,101 @@ class Server:
     target: str = "http://other.invalid/x?sig=secret"  # of redirects to another host
     lock: Lock = field(default_factory=Lock)
 
+    def stand_in(self, name: str = "", content: str = '"one"', hosts: Sequence[str] = ()) -> Path:
+        """What a plan writes in the place of the file, or of one of the folder's."""
+        held = (
+            self.content if isinstance(self.content, bytes) else (self.content / name).read_bytes()
+        )
+        url = f"{self.url}{name}"
+        place = Path("results", "remote", *url.replace("://", "/").split("/"))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        state = {"size": len(held), "content": content, "hosts": list(hosts)}
+        place.write_text(json.dumps(state) + "\n")
+        return place
+
+
+class Answer(BaseHTTPRequestHandler):
+    """Answers of a :class:`Server`, the ``state`` of the class."""
+
+    protocol_version = "HTTP/1.1"
+    state: Server
+
+    def do_GET(self) -> None:
+        state = self.state
+        with state.lock:
+            number = len(state.requests)
+            state.requests.append(f"{self.path} {self.headers.get('Range')}")
+        lasting = not SERVER_FAULTS.get(state.fault, (True, None))[0]
+        faulty = number >= state.when if lasting else number == state.when
+        with suppress(OSError):  # a client that has lost its patience
+            self.answer(state.fault if faulty else "")
+
+    do_HEAD = do_GET
+
+    def answer(self, fault: str) -> None:
+        content, span, wanted = self.state.content, {}, self.headers.get("Range")
+        if isinstance(content, Path):
+            file = content / self.path.strip("/")
+            if not file.is_file():
+                return self.send(404, {})
+            content = file.read_bytes()
+        if fault and (status := SERVER_FAULTS[fault][1]):
+            return self.send(*status(self.state))
+        if fault in ("reset", "drip of the head"):
+            self.close_connection = True
+            return (
+                self.drip(b"HTTP/1.1 206 Partial Content\r\nX-Long: ") if "drip" in fault else None
+            )
+        if fault == "stall":
+            time.sleep(1.0)
+        tag = '"two"' if fault == "replaced: ETag" else '"one"'
+        if wanted is None or fault == "no ranges":
+            return self.send(200, {"ETag": tag}, content)
+        first, last = map(int, wanted.removeprefix("bytes=").split("-"))
+        last = min(last, len(content) - 1)
+        shift = int(fault == "shifted range" and first > 0)
+        if fault != "no Content-Range":
+            size = len(content) + (fault == "replaced: size")
+            span = {"Content-Range": f"bytes {first - shift}-{last - shift}/{size}"}
+        if fault == "encoded":
+            span["Content-Encoding"] = "gzip"
+        body = content[first - shift : last + 1 - shift]
+        self.send(206, span | {"ETag": tag}, body, fault)
+
+    def send(self, status: int, headers: dict, body: bytes = b"", fault: str = "") -> None:
+        self.send_response(status)
+        for name, value in (headers | {"Content-Length": str(len(body))}).items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        if fault == "drip":
+            return self.drip(body[:1])
+        body = body[: len(body) // 2] if fault == "short body" else body
+        self.close_connection = self.close_connection or fault == "short body"
+        self.wfile.write(body)
+        with self.state.lock:
+            self.state.sent += len(body)
+
+    def drip(self, first: bytes) -> None:
+        """A byte each tenth of a second, a minute at most."""
+        self.wfile.write(first)
+        for _ in range(600):
+            self.wfile.write(b"x")
+            time.sleep(0.1)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
 
 @contextmanager
-def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
+def serving(content: bytes | Path, fault: str = "", when: int = 0) -> Iterator[Server]:
     """A server on the loopback."""
     state = Server(content, fault, when)
-
-    class Answer(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self):
-            with state.lock:
-                number = len(state.requests)
-                state.requests.append(f"{self.path} {self.headers.get('Range')}")
-            lasting = not SERVER_FAULTS.get(state.fault, True)
-            faulty = number >= state.when if lasting else number == state.when
-            try:
-                self.answer(state.fault if faulty else "")
-            except OSError:
-                self.close_connection = True
-
-        def answer(self, fault):
-            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
-            size = len(state.content)
-            last = min(last, size - 1)
-            if fault in STATUS:
-                return self.plain(*STATUS[fault](state))
-            if fault == "reset":
-                self.close_connection = True
-                return None
-            if fault == "drip of the head":
-                return self.drip_head()
-            if fault.startswith("stall"):
-                time.sleep(0.6)
-            if fault == "no ranges":
-                return self.plain(200, {}, state.content)
-            shift = 1 if fault == "shifted range" and first > 0 else 0
-            if fault == "short range":
-                last = (first + last) // 2
-            body = state.content[first - shift : last + 1 - shift]
-            length = len(body)
-            if fault == "longer body":
-                body += b"more"
-                length += 4
-            if fault == "short body":
-                body = body[: length // 2]
-            told = size + 1 if fault == "replaced: size" else size
-            span = f"bytes {first - shift}-{last - shift}/{told}"
-            headers = {
-                "ETag": '"two"' if fault == "replaced: ETag" and state.when else '"one"',
-                "Content-Range": "bytes x-y/z" if fault == "garbled Content-Range" else span,
-                "Content-Length": str(length),
-            }
-            if fault == "no Content-Range":
-                del headers["Content-Range"]
-            if fault == "encoded":
-                headers["Content-Encoding"] = "gzip"
-            return self.plain(206, headers, body, drip=fault == "drip")
-
-        def drip_head(self):
-            """A line that goes on for as long as anybody listens, a minute at most."""
-            self.close_connection = True
-            self.wfile.write(b"HTTP/1.1 206 Partial Content\r\nX-Long: ")
-            for _ in range(600):
-                self.wfile.write(b"x")
-                time.sleep(0.1)
-
-        def plain(self, status, headers, body=b"", drip=False):
-            self.send_response(status)
-            for name, value in ({"Content-Length": str(len(body))} | headers).items():
-                self.send_header(name, value)
-            self.end_headers()
-            step = 1 if drip else 1 << 16
-            for at in range(0, len(body), step):
-                self.wfile.write(body[at : at + step])
-                with state.lock:
-                    state.sent += len(body[at : at + step])
-                if drip:
-                    time.sleep(0.05)
-            if int(headers.get("Content-Length", len(body))) != len(body):
-                self.close_connection = True
-
-        def log_message(self, *_):
-            pass
-
-    class Quiet(ThreadingHTTPServer):
-        daemon_threads = True
-
-        def handle_error(self, *_):
-            pass  # a client that has lost its patience
-
-    server = Quiet(("127.0.0.1", 0), Answer)
-    state.url = f"http://127.0.0.1:{server.server_port}/tile.copc.laz"
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Answers", (Answer,), {"state": state}))
+    server.daemon_threads, server.block_on_close = True, False
+    name = "tile.copc.laz" if isinstance(content, bytes) else ""
+    state.url = f"http://127.0.0.1:{server.server_port}/{name}"
     Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     try:
         yield state
@@ -287,148 +295,94 @@ def serving(content: bytes, fault: str = "", when: int = 0) -> Iterator[Server]:
         server.server_close()
 
 
-STATUS = {
-    "429 with seconds": lambda s: (429, {"Retry-After": "1"}),
-    "429 with a date": lambda s: (429, {"Retry-After": formatdate(time.time() + 1, usegmt=True)}),
-    "503": lambda s: (503, {}),
-    "500": lambda s: (500, {}),
-    "503 for ever": lambda s: (503, {}),
-    "429 for an hour": lambda s: (429, {"Retry-After": "3600"}),
-    "gone": lambda s: (404, {}),
-    "forbidden": lambda s: (403, {}),
-    "unsatisfiable": lambda s: (416, {}),
-    "redirect to itself once": lambda s: (302, {"Location": s.url}),
-    "redirect loop": lambda s: (302, {"Location": s.url + "?signature=verysecret"}),
-    "redirect to file:": lambda s: (302, {"Location": "file:///etc/passwd"}),
-    "redirect to another host": lambda s: (302, {"Location": s.target}),
-    "redirect to another port": lambda s: (302, {"Location": "http://127.0.0.1:9/x?sig=secret"}),
+@dataclass
+class Damaged:
+    """A copy of a made file to be damaged; ``info``: cube's centre and half side, spacing, place
+    and bytes of the first page."""
+
+    made: MadeCopc
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        self.content = bytearray(self.made.content)
+        self.info = list(struct.unpack_from("<5d2Q", self.content, INFO_AT))
+
+    def entry(self, but: Sequence[int] = ()) -> tuple[int, list]:
+        """Place and values of a random node's entry, of another one than ``but``."""
+        at, values = 0, list(but)
+        while values == list(but) or values[6] <= 0:
+            span = (len(self.made.content) - self.made.hierarchy_at) // ENTRY.size
+            at = self.made.hierarchy_at + ENTRY.size * int(self.rng.integers(span))
+            values = list(ENTRY.unpack_from(self.content, at))
+        return at, values
+
+    def change_entry(self, change: Callable[[list], list]) -> None:
+        at, values = self.entry()
+        ENTRY.pack_into(self.content, at, *change(values))
+
+    def set_info(self, which: int, value: float) -> None:
+        self.info[which] = value
+
+    def pack(self, form: str, at: int, *values: float) -> None:
+        struct.pack_into(form, self.content, at, *values)
+
+    def copy_entry(self, swap: bool) -> None:
+        """One node in the place of another one, or two nodes swapped."""
+        at, one = self.entry()
+        other_at, other = self.entry(but=one)
+        ENTRY.pack_into(self.content, at, *(one[:4] + other[4:] if swap else other))
+        if swap:
+            ENTRY.pack_into(self.content, other_at, *other[:4], *one[4:])
+
+    def add_pages(self, overlapping: bool) -> None:
+        """A root of many pages, each most of the file; or pages of which each names the next."""
+        start, size = len(self.content), ENTRY.size
+        for k in range(5000):
+            to = (start, size * (5000 - k)) if overlapping else (start + size * (k + 1), size)
+            self.content += ENTRY.pack(1, 0, 0, 0, *to, -1)
+        self.content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
+        self.info[5:] = start, size * 5000 if overlapping else size
+
+
+# What is wrong with a file, whether all points come all the same (None: they do, or it is refused),
+# and how it is planted.
+FILE_FAULTS: dict[str, tuple[bool | None, Callable[[Damaged], object]]] = {
+    "header bounds": (True, lambda f: f.pack("<4d", 179, *f.rng.uniform(4e5, 5e5, 4))),
+    "header bounds in z": (True, lambda f: f.pack("<2d", 211, 9e3, 8e3)),
+    "header bounds not filled in": (True, lambda f: f.pack("<6d", 179, *[0.0] * 6)),
+    "header count": (False, lambda f: f.pack("<Q", 247, int(f.rng.integers(1, 10**6)))),
+    "count of a node": (False, lambda f: f.change_entry(lambda e: [*e[:6], e[6] + 3])),
+    "place of a node": (False, lambda f: f.change_entry(lambda e: [*e[:4], e[4] + 7, *e[5:]])),
+    "key of a node": (False, lambda f: f.change_entry(lambda e: [e[0], 2 ** e[0] + 1, *e[2:]])),
+    "node left out": (False, lambda f: f.change_entry(lambda e: [3, 0, 0, 7, 0, 0, 0])),
+    "node made empty": (False, lambda f: f.change_entry(lambda e: [*e[:4], 0, 0, 0])),
+    "node doubled": (False, lambda f: f.copy_entry(swap=False)),
+    "two nodes swapped": (None, lambda f: f.copy_entry(swap=True)),
+    "page loop": (False, lambda f: f.change_entry(lambda e: [*e[:4], *f.info[5:], -1])),
+    "pages that overlap": (False, lambda f: f.add_pages(overlapping=True)),
+    "pages nested without end": (False, lambda f: f.add_pages(overlapping=False)),
+    "records without end": (False, lambda f: f.pack("<I", 243, 4_000_000_000)),
+    "root page cut": (False, lambda f: f.set_info(6, f.info[6] - 9)),
+    "hierarchy out of the file": (False, lambda f: f.set_info(5, len(f.content) - 20)),
+    "cube too small": (False, lambda f: f.set_info(3, f.info[3] * f.rng.uniform(0.3, 0.9))),
+    "cube too large": (False, lambda f: f.set_info(3, f.info[3] * f.rng.uniform(1.1, 3))),
+    "cube shifted": (False, lambda f: f.set_info(0, f.info[0] + f.rng.uniform(50, 900))),
+    "cube not a number": (
+        False,
+        lambda f: f.set_info(3, np.nan),
+    ),
+    "file cut": (False, lambda f: f.content.__delitem__(slice(len(f.content) // 2, None))),
+    "chunk table": (False, lambda f: f.content.__setitem__(f.made.hierarchy_at - 70, 0xA5)),
+    "points of a chunk": (False, lambda f: f.pack("<I", f.made.entries[0][4] + 30, 2**30)),
+    "layers of a chunk": (False, lambda f: f.pack("<I", f.made.entries[0][4] + 34, 2**30)),
+    "no info record": (False, lambda f: f.pack("<4s", INFO_AT - 52, b"none")),
 }
-
-
-def _entry(made: MadeCopc, content: bytearray, rng: np.random.Generator) -> tuple[int, list]:
-    """A random entry of a node in the hierarchy: its place, its values."""
-    while True:
-        span = (len(content) - made.hierarchy_at) // ENTRY.size
-        at = made.hierarchy_at + ENTRY.size * int(rng.integers(span))
-        values = list(ENTRY.unpack_from(content, at))
-        if values[6] > 0:
-            return at, values
-
-
-# What is wrong with a file, and whether all points come all the same; None: they do, or it is
-# refused.
-FILE_FAULTS = {
-    "header bounds": True,
-    "header bounds in z": True,
-    "header bounds not filled in": True,
-    "header count": False,
-    "count of a node": False,
-    "place of a node": False,
-    "key of a node": False,
-    "node left out": False,
-    "node made empty": False,
-    "node doubled": False,
-    "page loop": False,
-    "pages that overlap": False,
-    "pages nested without end": False,
-    "records without end": False,
-    "root page cut": False,
-    "hierarchy out of the file": False,
-    "cube too small": False,
-    "cube too large": False,
-    "cube shifted": False,
-    "cube not a number": False,
-    "file cut": False,
-    "chunk table": False,
-    "points of a chunk": False,
-    "layers of a chunk": False,
-    "two nodes swapped": None,
-    "no info record": False,
-}
-
-
-def _overlap(made: MadeCopc, content: bytearray, info: list) -> None:
-    """A root of many pages, each of them most of the file."""
-    start, size = len(content), ENTRY.size
-    pages = [ENTRY.pack(1, 0, 0, 0, start, size * (5000 - k), -1) for k in range(5000)]
-    content += b"".join(pages)
-    info[5], info[6] = start, size * 5000
-
-
-def _nest(content: bytearray, info: list) -> None:
-    """Pages of which each names the next alone."""
-    start, size, n = len(content), ENTRY.size, 20_000
-    for k in range(n):
-        content += ENTRY.pack(1, 0, 0, 0, start + size * (k + 1), size, -1)
-    content += ENTRY.pack(0, 0, 0, 0, start, 0, 0)
-    info[5], info[6] = start, size
 
 
 def damaged(made: MadeCopc, fault: str, rng: np.random.Generator) -> bytes:
     """The content of a file with a fault."""
-    content = bytearray(made.content)
-    at, entry = _entry(made, content, rng)
-    info = list(struct.unpack_from("<5d2Q", content, INFO_AT))
-    if fault == "header bounds":
-        struct.pack_into("<4d", content, 179, *rng.uniform(4e5, 5e5, 4))
-    elif fault == "header bounds in z":
-        struct.pack_into("<2d", content, 211, 9e3, 8e3)
-    elif fault == "header bounds not filled in":
-        struct.pack_into("<6d", content, 179, *[0.0] * 6)
-    elif fault == "header count":
-        struct.pack_into("<Q", content, made.header_count_at, int(rng.integers(1, 10**6)))
-    elif fault in ("count of a node", "place of a node", "key of a node", "node made empty"):
-        if fault == "count of a node":
-            entry[6] += int(rng.integers(1, 9))
-        elif fault == "place of a node":
-            entry[4] += int(rng.integers(1, 99))
-        elif fault == "node made empty":
-            entry[4:] = 0, 0, 0
-        else:
-            entry[1] = 2 ** entry[0] + int(rng.integers(0, 9))
-        ENTRY.pack_into(content, at, *entry)
-    elif fault in ("node left out", "node doubled"):
-        other = _entry(made, content, rng)[1]
-        while other == entry:
-            other = _entry(made, content, rng)[1]
-        ENTRY.pack_into(content, at, *(other if fault == "node doubled" else [3, 0, 0, 7, 0, 0, 0]))
-    elif fault == "page loop":
-        ENTRY.pack_into(content, at, *entry[:4], info[5], info[6], -1)
-    elif fault == "pages that overlap":
-        _overlap(made, content, info)
-    elif fault == "pages nested without end":
-        _nest(content, info)
-    elif fault == "records without end":
-        struct.pack_into("<I", content, 243, 4_000_000_000)
-        content += bytes(10**6)
-    elif fault == "root page cut":
-        info[6] -= int(rng.integers(1, info[6]))
-    elif fault == "hierarchy out of the file":
-        info[5] = len(content) - int(rng.integers(0, 30))
-    elif fault == "cube too small":
-        info[3] *= rng.uniform(0.3, 0.9)
-    elif fault == "cube too large":
-        info[3] *= rng.uniform(1.1, 3)
-    elif fault == "cube shifted":
-        info[int(rng.integers(2))] += float(rng.choice([-1, 1]) * rng.uniform(50, 900))
-    elif fault == "cube not a number":
-        info[3] = float(rng.choice([np.nan, np.inf, -1, 0]))
-    elif fault == "file cut":
-        del content[int(rng.integers(600, len(content))) :]
-    elif fault == "chunk table":
-        content[made.hierarchy_at - 60 - int(rng.integers(1, 20))] ^= 1 << int(rng.integers(8))
-    elif fault == "points of a chunk":
-        struct.pack_into("<I", content, made.entries[0][4] + 30, int(rng.integers(1, 2**31)))
-    elif fault == "layers of a chunk":
-        struct.pack_into("<I", content, made.entries[0][4] + 34, int(rng.integers(1, 2**31)))
-    elif fault == "two nodes swapped":
-        other_at, other = _entry(made, content, rng)
-        while other == entry:
-            other_at, other = _entry(made, content, rng)
-        ENTRY.pack_into(content, at, *entry[:4], *other[4:])
-        ENTRY.pack_into(content, other_at, *other[:4], *entry[4:])
-    elif fault == "no info record":
-        content[INFO_AT - 52 : INFO_AT - 48] = b"none"
-    if not fault.startswith("file cut"):
-        struct.pack_into("<5d2Q", content, INFO_AT, *info)
-    return bytes(content)
+    file = Damaged(made, rng)
+    FILE_FAULTS[fault][1](file)
+    if fault != "file cut":
+        file.pack("<5d2Q", INFO_AT, *file.info)
+    return bytes(file.content)

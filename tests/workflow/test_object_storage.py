@@ -17,6 +17,7 @@ import pytest
 
 from stereotruth.errors import InputError
 from stereotruth.products import remote_files
+from stereotruth.products.file_parts import open_stream
 from stereotruth.products.grids import open_grid
 from stereotruth.products.records import BEGUN
 from stereotruth.products.ungeoreferenced import open_raster
@@ -249,8 +250,8 @@ def test_only_what_the_sheet_names_is_read(server, data, tmp_path, monkeypatch):
         open_raster(f"/vsis3/{BUCKET}/in/left.tif")
     lidar = remote_files.bring_files(f"s3://{BUCKET}/in/lidar", (".laz",))
     file = lidar / "Tiny-1_0_1.laz"
-    with remote_files.open_file(file) as stream:
+    with open_stream(file) as stream:
         assert stream.read(4) == b"LASF"
     server.put("in/lidar/Tiny-1_0_1.laz", b"LASF another")
-    with pytest.raises(InputError, match="changed on its server"), remote_files.open_file(file):
-        pass
+    with pytest.raises(InputError, match="changed on its server"):
+        open_stream(file, keep=False).read(4)

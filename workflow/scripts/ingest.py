@@ -4,8 +4,8 @@ from stereotruth.job import in_own_process, job
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.range_copies import prune
 from stereotruth.products.atomic_outputs import atomic_outputs
+from stereotruth.products.file_parts import prune
 from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":

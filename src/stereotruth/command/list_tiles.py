@@ -15,7 +15,7 @@ from .. import sheets
 from ..alignment.pair_ground import footprint_of
 from ..config.configuration import Configuration
 from ..config.labels import Ingest
-from ..errors import InputError, in_number
+from ..errors import InputError, in_number, without_secrets
 from ..lidar.catalogue import read_catalogue, resolved
 from ..lidar.catalogue_ground import Cover, cover_of
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
@@ -23,7 +23,6 @@ from ..lidar.catalogue_tiles import Tile
 from ..lidar.declared_crs import LidarCRS, interpret
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..products.remote_files import bring_image, is_remote, state_of
-from ..products.web_requests import shown
 from ..project import configured, read_images, sheet
 from .check import chosen
 
@@ -110,7 +109,7 @@ def list_tiles(
     places = [resolved(tile.href, catalogue, hosts) for tile in taken]
     crs = _system_of(taken, catalogue)
     listed = TileList(
-        shown(catalogue),
+        without_secrets(catalogue),
         read.sha256,
         read.bytes,
         tuple(sorted(hosts)),
@@ -131,7 +130,7 @@ def _asked(
     tiles, files = list(compress(taken, first)), list(compress(places, first))
     with ThreadPoolExecutor(ASKED_AT_ONCE) as pool:
         states = list(pool.map(lambda file: _state(file, hosts), files))
-    if missing := [shown(file) for file, state in zip(files, states) if state is None]:
+    if missing := [without_secrets(file) for file, state in zip(files, states) if state is None]:
         more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
         raise InputError(
             f"{len(missing)} of {in_number(len(files), 'tile')} on the ground of the images "
@@ -222,7 +221,7 @@ def _lines(listed: TileList, every: int, places: Sequence[str], cover: Cover) ->
         at = ", ".join(f"{value:.4f}" for value in cover.hole_at)
         lines.append(f"{listed.hole_text}; most of it about {at}")
     for one, other in cover.doubled[:NAMED]:
-        a, b = (shown(places[cover.taken.index(k)]) for k in (one, other))
+        a, b = (without_secrets(places[cover.taken.index(k)]) for k in (one, other))
         lines.append(
             f"listed twice: {a}" if a == b else f"two tiles cover the same ground: {a}, {b}"
         )

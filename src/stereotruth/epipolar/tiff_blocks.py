@@ -16,7 +16,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..products.remote_files import open_file, size_of
+from ..products.file_parts import open_stream
+from ..products.remote_files import size_of
 
 OFFSETS, COUNTS = (273, 324), (279, 325)  # of strips, of tiles
 WIDTH, HEIGHT, BITS, COMPRESSION, SAMPLES, STRIP_ROWS = 256, 257, 258, 259, 277, 278
@@ -124,7 +125,7 @@ def damaged_block(path: Path, workers: int = 1, *, whole: bool = True) -> str:
     ``whole``: checksums too, for which all of the file is read.
     """
     size = size_of(path)
-    with open_file(path) as stream:
+    with open_stream(path, keep=False) as stream:
         if stream.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
             return ""
         stream.seek(0)

@@ -2,184 +2,135 @@
 
 A COPC file is a LAZ file whose chunks are the nodes of an octree. Its chunk table and its hierarchy
 tell the same by different ways, so that a node that one of them lacks is found without reading it.
-Source: COPC 1.0 (Hobu), "info VLR", "hierarchy VLR"; LAZ specification 1.4 R1, "Chunk Table".
+laspy reads the header and the records, lazrs decodes the chunk of a node. ``CopcReader.query`` is
+not used: its answer is cut by a box, so that it cannot tell whether a node keeps to its cube, and
+comes as one array, whatever its size. Source: COPC 1.0 (Hobu), "info VLR", "hierarchy VLR".
 """
 
 from __future__ import annotations
 
-import io
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
 
 import laspy
 import lazrs
 import numpy as np
-from laspy.compression import DecompressionSelection
+from laspy.copc import CopcInfoVlr
 from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
+from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..products.ranges import Range, Ranges
+from ..products.file_parts import GLANCE_BYTES, LocalParts, open_parts, open_stream
 from .las_files import _decoding
-from .las_layout import LASZIP, LAYERED, Layout, _Packing, _records, _require
-from .octree_nodes import MOST_LEVELS, MOST_NODES, Node, Octree, good_key
+from .las_layout import LAYERED, Layout, Packing, _records, _require, check_layout
+from .octree import BATCH_BYTES, FIELDS, MOST_LEVELS, MOST_NODES, NODE, Octree
 
-INFO = (b"copc", 1)
-INFO_PLACE = 375 + 54  # right behind the header of LAS 1.4, and its own
-ENTRY = struct.Struct("<4iQii")
-EVLR = struct.Struct("<H16sHQ32s")
-MOST_HEAD_BYTES = 16 << 20  # of header and VLRs
+ENTRY = np.dtype([("key", "<i4", 4), ("start", "<u8"), ("bytes", "<i4"), ("points", "<i4")])
+PAGE = -1  # in the place of a node's points: its entry stands in another page
+MOST_HEAD_BYTES = 16 << 20  # of header and records
 MOST_EVLRS = 1000  # each of which is a request
 MOST_RAW_BYTES = 1 << 30  # of the decoded points of a node
-FIELDS = (
-    DecompressionSelection.XY_RETURNS_CHANNEL
-    | DecompressionSelection.Z
-    | DecompressionSelection.CLASSIFICATION
-    | DecompressionSelection.FLAGS
-    | DecompressionSelection.POINT_SOURCE_ID
-    | DecompressionSelection.GPS_TIME
-)
 
 
 class Copc(Octree):
     """A COPC file of which parts are read; its hierarchy is read here, and proven complete."""
 
-    def __init__(self, ranges: Ranges) -> None:
-        self.name, self._ranges = ranges.name, ranges
+    def __init__(self, path: Path) -> None:
+        self._parts = open_parts(path)
+        self.name = self._parts.name
+        layout = check_layout(path, layers=False)
         with _decoding(lambda error: self._refusal(str(error))):
-            layout, head = self._layout()
-            records = _records(
-                io.BytesIO(head), layout.header_bytes, layout.first_point, layout.vlrs, False
+            _require(layout.minor == 4 and layout.format in (6, 7, 8), "COPC is LAS 1.4, 6 to 8")
+            packing, chunks = layout.packing, layout.chunks
+            if packing is None or chunks is None or packing.kind != LAYERED:
+                raise self._refusal("its points are not compressed in layers")
+            _require(
+                layout.first_point <= MOST_HEAD_BYTES and layout.evlrs <= MOST_EVLRS,
+                f"points from byte {layout.first_point} on, {layout.evlrs} records behind them",
             )
-            packings = [r for r in records if r[:2] == LASZIP]
-            _require(len(packings) == 1, f"it has {len(packings)} LASzip records instead of one")
-            _, _, at, length = packings[0]
-            self._packing = _Packing.of(head[at : at + length], layout.record_bytes)
-            _require(self._packing.kind == LAYERED, "its points are not compressed in layers")
-            self.header = laspy.LasHeader.read_from(io.BytesIO(head), read_evlrs=False)
-            self.header.vlrs.extend(self._systems_behind(layout))
-            first = next((r for r in records if r[2] == INFO_PLACE), None)
-            if first is None or first[:2] != INFO or first[3] < 160:
+            self._packing: Packing = packing
+            with open_stream(path, GLANCE_BYTES) as stream:
+                self.header = laspy.LasHeader.read_from(stream)
+                self.header.vlrs.extend(self._systems_behind(stream, layout))
+            info = self.header.vlrs[0]
+            if not isinstance(info, CopcInfoVlr):
                 raise InputError(
                     "no COPC: its first record is another one",
                     file=self.name,
                     remedy="name it .laz without .copc, to read it whole",
                 )
-            *middle, half, _ = struct.unpack_from("<5d", head, INFO_PLACE)
-            start, length = struct.unpack_from("<2Q", head, INFO_PLACE + 40)
             _require(
-                bool(np.isfinite(middle).all() and np.isfinite(half) and half > 0),
-                f"the octree's cube has its centre at {middle} and half a side of {half}",
+                bool(np.isfinite([*info.center, info.halfsize]).all() and info.halfsize > 0),
+                f"the octree's cube has its centre at {info.center} and half a side of "
+                f"{info.halfsize}",
             )
-            self.low, self.side = np.array(middle) - half, 2 * half
-            self.nodes = self._hierarchy((start, start + length))
+            self.low, self.side = info.center - info.halfsize, 2 * info.halfsize
+            root = info.hierarchy_root_offset, info.hierarchy_root_size
+            self.nodes = self._hierarchy((root[0], sum(root)))
             by_return = sum(map(int, self.header.number_of_points_by_return))
-            _require(by_return <= self.points, f"its counts by return add up to {by_return}")
-            self._complete()
-            most = max(node.points for node in self.nodes) * layout.record_bytes
+            _require(by_return <= layout.points, f"its counts by return add up to {by_return}")
+            self._refuse_incomplete()
+            most = int(self.nodes["points"].max()) * layout.record_bytes
             _require(most <= MOST_RAW_BYTES, f"a node has {most} bytes of points")
-            self._compare_chunks(layout)
-            self._look_at_first_points()
+            starts = layout.first_point + 8 + np.cumsum(chunks[:, 1]) - chunks[:, 1]
+            told = np.column_stack([self.nodes[field] for field in ("points", "bytes", "start")])
+            _require(
+                np.array_equal(np.column_stack([chunks, starts]), told),
+                f"its chunk table has other chunks ({len(chunks)}) than its hierarchy has nodes "
+                f"({len(told)})",
+            )
+            if isinstance(self._parts, LocalParts):  # a server would be asked for each of them
+                self._refuse_first_points_outside()
 
-    def _layout(self) -> tuple[Layout, bytes]:
-        """What the header says, and the bytes before the first point."""
-        size = self._ranges.size
-        layout = Layout.of(io.BytesIO(self._ranges.get(0, min(size, 393))), size)
-        _require(layout.minor == 4 and layout.format in (6, 7, 8), "COPC is LAS 1.4, formats 6-8")
-        _require(layout.compressed and layout.points > 0, "it has no compressed points")
-        _require(
-            layout.first_point <= MOST_HEAD_BYTES, f"points begin at byte {layout.first_point}"
-        )
-        return layout, self._ranges.get(0, layout.first_point)
-
-    def _systems_behind(self, layout: Layout) -> list[laspy.VLR]:
+    def _systems_behind(self, stream: BinaryIO, layout: Layout) -> list[laspy.VLR]:
         """The records behind the points that declare a coordinate system."""
-        found, at = [], layout.first_evlr
-        _require(layout.evlrs <= MOST_EVLRS, f"it has {layout.evlrs} records behind its points")
-        for _ in range(layout.evlrs):
-            head = self._ranges.get(at, at + EVLR.size)
-            _, user, number, length, _ = EVLR.unpack(head)
-            if user.rstrip(b"\0") == b"LASF_Projection":
-                _require(length <= MOST_HEAD_BYTES, f"a record of {length} bytes behind its points")
-                content = self._ranges.get(at + EVLR.size, at + EVLR.size + length)
-                found.append(laspy.VLR("LASF_Projection", number, "", content))
-            at += EVLR.size + length
-        return found
+        records = _records(stream, layout.first_evlr, layout.size, layout.evlrs, extended=True)
+        systems = [record for record in records if record[0] == b"LASF_Projection"]
+        _require(sum(s[3] for s in systems) <= MOST_HEAD_BYTES, "a system of too many bytes")
+        contents = self._parts.get([(at, at + length) for _, _, at, length in systems])
+        return [
+            laspy.VLR("LASF_Projection", number, "", content)
+            for (_, number, _, _), content in zip(systems, contents)
+        ]
 
-    def _hierarchy(self, root: Range) -> tuple[Node, ...]:
+    def _hierarchy(self, root: tuple[int, int]) -> np.ndarray:
         """The nodes with points of all pages, in the order of the file."""
-        nodes: dict[tuple[int, int, int, int], Node] = {}
-        empty, asked, pages = set(), {root}, [root]
-        depth = 0
+        found, entries, asked, pages, depth = [], 0, {root}, [root], 0
         while pages:
             depth += 1
             held = sum(end - start for start, end in asked)
-            _require(held <= self._ranges.size, "pages of its hierarchy overlap")
+            _require(held <= self._parts.size, "pages of its hierarchy overlap")
             _require(depth <= MOST_LEVELS + 1, "pages of its hierarchy are nested without end")
-            contents, pages = list(self._ranges.parts(sorted(pages))), []
+            contents, pages = self._parts.get(sorted(pages)), []
             for content in contents:
                 _require(
-                    len(content) > 0 and len(content) % ENTRY.size == 0,
+                    len(content) > 0 and len(content) % ENTRY.itemsize == 0,
                     f"a page of its hierarchy has {len(content)} bytes",
                 )
-                for *place, start, size, points in ENTRY.iter_unpack(content):
-                    key = tuple(place)
-                    _require(good_key(key), f"its hierarchy has a node {key}")
-                    if points == -1:
-                        page = (start, start + size)
-                        _require(size > 0, f"a page of its hierarchy has {size} bytes")
-                        _require(page not in asked, "two places name one page of its hierarchy")
-                        asked.add(page)
-                        pages.append(page)
-                        continue
-                    _require(
-                        points >= 0 and size >= 0 and key not in nodes and key not in empty,
-                        f"node {key} stands twice in its hierarchy, or has {points} points",
-                    )
-                    if points == 0:
-                        empty.add(key)
-                    else:
-                        nodes[key] = Node(key, points, start, size)
-                held = len(nodes) + len(empty) + len(asked)
-                _require(held <= MOST_NODES, "its hierarchy is too large")
-        _require((0, 0, 0, 0) in nodes.keys() | empty, "its hierarchy has no root")
-        _require(bool(nodes), "no node of its hierarchy has points")
-        return tuple(sorted(nodes.values(), key=lambda node: node.start))
+                page = np.frombuffer(content, ENTRY)
+                for entry in page[page["points"] == PAGE]:
+                    below = (int(entry["start"]), int(entry["start"]) + int(entry["bytes"]))
+                    _require(below not in asked, "two places name one page of its hierarchy")
+                    _require(below[1] > below[0], "a page of its hierarchy is empty")
+                    asked.add(below)
+                    pages.append(below)
+                found.append(page[page["points"] != PAGE])
+                entries += len(page)
+            _require(entries <= MOST_NODES, "its hierarchy is too large")
+        every = np.concatenate(found)
+        _require(len(np.unique(every["key"], axis=0)) == len(every), "a node stands in it twice")
+        _require(not every["key"][:, 0].min(), "its hierarchy has no root")
+        _require(bool((every["points"] >= 0).all()), "a node has less than no points")
+        nodes = every[every["points"] > 0].astype(NODE)
+        return nodes[np.argsort(nodes["start"], kind="stable")]
 
-    def _compare_chunks(self, layout: Layout) -> None:
-        """The chunks of the file, in their order, are the nodes of the hierarchy: none is missing.
-
-        One for one, by place, bytes and points.
-        """
-        first = layout.first_point + 8
-        (table,) = struct.unpack("<q", self._ranges.get(layout.first_point, first))
-        ends = [e for e in (layout.first_evlr, layout.size) if e > table]
-        _require(first <= table <= layout.size - 8, f"its chunk table is at byte {table}")
-        content = self._ranges.get(table, min(ends))
-        version, count = struct.unpack_from("<II", content)
-        _require(
-            version == 0 and count == len(self.nodes),
-            f"its chunk table has {count} chunks, its hierarchy {len(self.nodes)} nodes",
-        )
-        stream = io.BytesIO(content)
-        chunks = lazrs.read_chunk_table_only(stream, lazrs.LazVlr(self._packing.record))
-        held = np.array(chunks, np.int64).reshape(-1, 2)
-        starts = first + np.cumsum(held[:, 1]) - held[:, 1]
-        told = np.array([(n.points, n.bytes, n.start) for n in self.nodes])
-        _require(
-            np.array_equal(np.column_stack([held, starts]), told),
-            "its chunk table has other chunks than its hierarchy has nodes",
-        )
-        _require(first + int(held[:, 1].sum()) == table, "chunks do not end at their table")
-
-    def _look_at_first_points(self) -> None:
+    def _refuse_first_points_outside(self) -> None:
         """The first point of each node, which a chunk begins with, lies in its cube.
 
-        So that a node whose key is another one's is found though it is not read. Of a file on the
-        disk; a server would be asked for each of them.
+        So that a node whose key is another one's is found though it is not read.
         """
-        first = self._ranges.peek([node.start for node in self.nodes], 12)
-        if not first:
-            return
+        first = self._parts.get([(at, at + 12) for at in self.nodes["start"].tolist()])
         stored = np.frombuffer(b"".join(first), "<i4").reshape(-1, 3)
         xyz = stored * np.asarray(self.header.scales) + np.asarray(self.header.offsets)
         low, high = self.boxes(self.nodes)
@@ -187,22 +138,26 @@ class Copc(Octree):
         if outside.any():
             raise self._outside(int(outside.sum()), self.nodes[int(np.argmax(outside))])
 
-    def _decoded(self, nodes: Sequence[Node]) -> Iterator[ScaleAwarePointRecord]:
-        ranges = [(node.start, node.start + node.bytes) for node in nodes]
-        for node, content in zip(nodes, self._ranges.parts(ranges), strict=True):
-            with _decoding(lambda error, n=node: self._refusal(f"node {n.key}: {error}")):
-                points = self._points(node, content)
-            yield points
+    def _decoded(self, numbers: NDArray[np.intp]) -> Iterator[ScaleAwarePointRecord]:
+        ends = np.cumsum(self.nodes["bytes"][numbers])
+        for batch in np.split(numbers, np.flatnonzero(np.diff(ends // BATCH_BYTES)) + 1):
+            nodes = self.nodes[batch]
+            ranges = list(zip(nodes["start"].tolist(), (nodes["start"] + nodes["bytes"]).tolist()))
+            for node, content in zip(nodes, self._parts.get(ranges)):
+                with _decoding(lambda error, n=node: self._refusal(f"node {n['key']}: {error}")):
+                    points = self._points(int(node["points"]), content)
+                yield points
 
-    def _points(self, node: Node, content: bytes) -> ScaleAwarePointRecord:
+    def _points(self, count: int, content: bytes) -> ScaleAwarePointRecord:
+        """The points of a chunk, whose layers are held against its bytes first."""
         form = self.header.point_format
         layers = np.frombuffer(content, "<u4", 1 + self._packing.layers, form.size).astype(np.int64)
         head = form.size + 4 * layers.size
         _require(head + int(layers[1:].sum()) == len(content), "its layers do not fill it")
-        _require(int(layers[0]) == node.points, f"it holds {layers[0]} points, not {node.points}")
-        raw = np.zeros(node.points * form.size, np.uint8)
+        _require(int(layers[0]) == count, f"it holds {layers[0]} points, not {count}")
+        raw = np.zeros(count * form.size, np.uint8)
         lazrs.decompress_points_with_chunk_table(
-            content, self._packing.record, raw, [(node.points, len(content))], FIELDS.to_lazrs()
+            content, self._packing.record, raw, [(count, len(content))], FIELDS.to_lazrs()
         )
         array = PackedPointRecord.from_buffer(raw, form).array
         return ScaleAwarePointRecord(array, form, self.header.scales, self.header.offsets)

@@ -37,7 +37,7 @@ from .frames import Epochs
 from .gps_times import BY_CATALOGUE, CODES, not_told_apart
 from .las_files import PointTally
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
-from .octree_nodes import Touches
+from .octree import Touches
 from .point_files import Part, PointFile, open_points
 from .point_store import ARRAYS, ATTRIBUTES, FORMAT
 from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84

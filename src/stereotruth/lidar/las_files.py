@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import inner, kernel
+from ..products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
 from ..products.remote_files import size_of
 from .gps_times import GpsDays
 from .las_layout import check_layout, wrong_count
-from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 from .strip_codes import StripCodes
 
 Floats = NDArray[np.float64]

@@ -9,16 +9,17 @@ specification 1.4 R1 (ASPRS), "LASzip VLR", "Chunk Table", "Layered Chunks".
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 import lazrs
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
 from ..products.remote_files import size_of
-from .range_copies import GLANCE_BYTES, STREAM_BYTES, open_stream
 
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point data record format
@@ -51,7 +52,10 @@ def wrong_count(file: Path, announced: int, held: str, error: object = "") -> In
 
 @dataclass(frozen=True)
 class Layout:
-    """What a header says about the file: counts, and places in bytes from the start."""
+    """What a header says about the file: counts, and places in bytes from the start.
+
+    ``packing`` and ``chunks`` are found by :func:`check_layout`.
+    """
 
     size: int
     minor: int
@@ -64,6 +68,8 @@ class Layout:
     points: int
     first_evlr: int
     evlrs: int
+    packing: Packing | None = None  # of LAZ
+    chunks: NDArray[np.int64] | None = None  # of LAZ: points and bytes [n, 2]
 
     @classmethod
     def of(cls, stream: BinaryIO, size: int) -> Layout:
@@ -135,7 +141,7 @@ def _records(
 
 
 @dataclass(frozen=True)
-class _Packing:
+class Packing:
     """A LASzip record: kind of compression, points of a chunk, (type, bytes) of the items."""
 
     kind: int
@@ -144,7 +150,8 @@ class _Packing:
     record: bytes
 
     @classmethod
-    def of(cls, record: bytes, record_bytes: int) -> _Packing:
+    def of(cls, record: bytes, record_bytes: int) -> Packing:
+        """Of the bytes of a LASzip record. Raises ValueError if they cannot be."""
         _require(len(record) >= 34, "its LASzip record is cut short")
         (kind,) = struct.unpack_from("<H", record)
         (chunk_points,) = struct.unpack_from("<I", record, 12)
@@ -168,9 +175,12 @@ class _Packing:
 
 
 def _check_chunks(
-    stream: BinaryIO, layout: Layout, packing: _Packing, file: Path, layers: bool
-) -> None:
-    """Hold the chunk table against the file, and each layered chunk against the table."""
+    stream: BinaryIO, layout: Layout, packing: Packing, file: Path, layers: bool
+) -> NDArray[np.int64]:
+    """Points and bytes of the chunks [n, 2], each of which fits into the file.
+
+    The chunk table is held against the file; with ``layers`` each layered chunk against the table.
+    """
     first = layout.first_point + 8
     stream.seek(layout.first_point)
     place = stream.read(8)
@@ -203,10 +213,11 @@ def _check_chunks(
         and bytes_of.sum() == room,
         f"the chunks of its chunk table do not fill the {room} bytes before it",
     )
-    if variable and (held := sum(number for number, _ in chunks)) != points:
-        raise wrong_count(file, points, f"its chunks hold {held}")
+    if variable and (total := sum(number for number, _ in chunks)) != points:
+        raise wrong_count(file, points, f"its chunks hold {total}")
+    held = np.array(chunks, np.int64).reshape(-1, 2)
     if packing.kind != LAYERED or not layers:
-        return
+        return held
     head, at = layout.record_bytes + 4 + 4 * packing.layers, first
     for k, (number, size) in enumerate(chunks):
         stream.seek(at + layout.record_bytes)
@@ -218,9 +229,10 @@ def _check_chunks(
         last = not variable and k == count - 1
         wanted = points - k * per_chunk if last else number
         if numbers[0] != wanted:
-            held = points + int(numbers[0]) - wanted
-            raise wrong_count(file, points, f"its chunks hold {held}")
+            total = points + int(numbers[0]) - wanted
+            raise wrong_count(file, points, f"its chunks hold {total}")
         at += size
+    return held
 
 
 def check_layout(file: Path, layers: bool = True) -> Layout:
@@ -249,8 +261,9 @@ def check_layout(file: Path, layers: bool = True) -> Layout:
                 found = [r for r in records if r[:2] == LASZIP]
                 _require(len(found) == 1, f"it has {len(found)} LASzip records instead of one")
                 stream.seek(found[0][2])
-                packing = _Packing.of(stream.read(found[0][3]), layout.record_bytes)
-                _check_chunks(stream, layout, packing, file, layers)
+                packing = Packing.of(stream.read(found[0][3]), layout.record_bytes)
+                chunks = _check_chunks(stream, layout, packing, file, layers)
+                layout = replace(layout, packing=packing, chunks=chunks)
             elif room // layout.record_bytes < layout.points:
                 held = f"the file holds {room // layout.record_bytes}"
                 raise wrong_count(file, layout.points, held)

@@ -16,11 +16,11 @@ from pathlib import Path
 import laspy
 import numpy as np
 
+from ..products.file_parts import open_stream
 from ..products.remote_files import size_of
 from . import las_files
-from .octree import open_octree
-from .octree_nodes import Touches
-from .range_copies import open_stream
+from .copc import Copc
+from .octree import Octree, Touches
 
 OCTREE, EPT = ".copc.laz", "ept.json"
 FIRST_BYTES = 1 << 14  # that servers are asked for at once
@@ -106,7 +106,7 @@ class PointFile:
 
 
 class OctreeFile(PointFile):
-    """A COPC file, or EPT, of which nodes are read; see :mod:`.octree_nodes`."""
+    """A COPC file, or EPT, of which nodes are read; see :mod:`.octree`."""
 
     def _header(self, layers: bool) -> laspy.LasHeader:
         self.octree = open_octree(self.path)
@@ -119,8 +119,7 @@ class OctreeFile(PointFile):
     @property
     def bytes(self) -> int:
         """Of the file, or of all nodes of EPT."""
-        every = sum(node.bytes for node in self.octree.nodes)
-        return max(every, size_of(self.path))
+        return max(int(self.octree.nodes["bytes"].sum()), size_of(self.path))
 
     def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
         """All points node by node, whatever the size."""
@@ -129,8 +128,23 @@ class OctreeFile(PointFile):
     def part(self, touches: Touches | None) -> Part:
         """The nodes that touch a footprint."""
         plan = self.octree.plan(touches)
-        nodes = len(plan.nodes), len(self.octree.nodes)
-        return Part(plan.points, plan.bytes, lambda _: self.octree.read(plan), nodes)
+        nodes = self.octree.nodes[plan]
+        points, size = int(nodes["points"].sum()), int(nodes["bytes"].sum())
+        counts = len(plan), len(self.octree.nodes)
+        return Part(points, size, lambda _: self.octree.read(plan), counts)
+
+
+def open_octree(path: str | Path) -> Octree:
+    """A COPC file (``.copc.laz``) or EPT (``ept.json``), by path or stand-in.
+
+    Raises InputError: missing, neither of both, damaged, or of a hierarchy that is not complete;
+    what a server fails with.
+    """
+    if Path(path).name.lower() == EPT:
+        from .ept import Ept  # which few scenes have
+
+        return Ept(Path(path))
+    return Copc(Path(path))
 
 
 class RasterFile(PointFile):

@@ -23,12 +23,12 @@ import rasterio
 from rasterio.errors import RasterioError
 
 from ..errors import InputError
+from ..products.file_parts import open_stream
 from ..products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
 from ..products.remote_files import url_of
 from ..products.ungeoreferenced import open_raster
 from .geokeys import epoch_of_tiff
 from .height_raster import refuse_grid, system_of
-from .range_copies import open_stream
 
 FORMATS = ("GTiff",)
 PARTS = 64  # of a cell, that the points' coordinates are stored in: exact, as a power of two

@@ -4,8 +4,8 @@ A file that a scene's row names by its URL is never fetched as a whole. A stand-
 in the working directory, ``results/remote/<scheme>/<host or bucket>/<path>``: its size and what the
 server calls its content (ETag; where there is none, the time of its last change). The stages get
 the stand-in's path, so that digests, records and reruns follow from what stands in it, and open
-what it stands for: images through GDAL's ``/vsis3`` and ``/vsicurl``, LiDAR of buckets through
-fsspec, of web servers by :mod:`.web_requests`. Small files (RPCs, control points) are fetched.
+what it stands for: images through GDAL's ``/vsis3`` and ``/vsicurl``, LiDAR through fsspec, with
+the rules of :mod:`.web_files` for web servers. Small files (RPCs, control points) are fetched.
 
 Nothing but what stands in that folder is read from a network, whatever a file contains; the hosts
 that a web server may redirect to beside its own stand there, too.
@@ -13,27 +13,40 @@ that a web server may redirect to beside its own stand there, too.
 
 from __future__ import annotations
 
-import io
 import json
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from ..errors import InputError, install_extra
-from .ranges import Ranges, RangeStream, WebRanges, changed
-from .web_requests import WEB, info_of, read_whole, too_large
+from .web_files import (
+    AGAIN,
+    MOST_REDIRECTS,
+    WEB,
+    Absent,
+    Again,
+    changed,
+    read_whole,
+    refusal,
+    too_large,
+    web_files,
+)
+
+Answer = TypeVar("Answer")
+Ranges = Sequence[tuple[int, int]]  # first byte, and the one behind the last
 
 FOLDER = Path("results", "remote")
 SCHEMES = ("s3", *WEB)
 MAX_COPY_BYTES = 10_000_000  # of a file that is fetched; RPCs and control points have some kB
 LONGEST_PART = 200  # bytes between slashes, of which stand-ins have their names
-CLIENTS = ("aiobotocore", "botocore", "fsspec", "s3fs")  # whose errors are a server's
-READ_BYTES = 4 << 20  # of a LiDAR file at once
+PATIENCE_S = 300.0  # with one question, or a batch of parts, all tries together
+TRIES, WAIT_S = 6, 0.5  # of a question, and before the second of them; doubled for each other
+AT_ONCE = 4  # requests
 _WAYS = "s3://bucket/path and https://host/path can be read"
 
 
@@ -91,25 +104,18 @@ _COPIED = {".rpb", ".txt", ".csv"}  # files that are fetched
 RPC_ENDINGS = (".RPB", ".rpb", "_RPC.TXT", "_rpc.txt", "_RPC.txt")
 
 
-@cache
-def _file_system(scheme: str) -> Any:
-    try:
-        import fsspec
+def bucket(url: str) -> tuple[Any, str]:
+    """The file system (fsspec) that holds an object of a bucket, and its name there."""
+    import fsspec
 
-        # listings are asked for each time: files come and go
-        how = {"use_listings_cache": False} if scheme == "s3" else {}
-        return fsspec.filesystem(scheme, **how)
+    scheme = urlsplit(url).scheme
+    try:  # listings are asked for each time: files come and go
+        storage = fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError as error:
         raise InputError(
             f"{scheme}:// cannot be read here ({error})",
             remedy=install_extra("storage"),
         ) from error
-
-
-def bucket(url: str) -> tuple[Any, str]:
-    """The file system (fsspec) that holds a URL, and its name there."""
-    scheme = urlsplit(url).scheme
-    storage = _file_system(scheme)
     return storage, storage._strip_protocol(url)
 
 
@@ -128,39 +134,56 @@ def _state(info: dict[str, Any], url: str, hosts: frozenset[str] = frozenset()) 
 
 def _look(url: str, hosts: frozenset[str] = frozenset()) -> str | None:
     """The state of a file; None if there is none. Raises InputError if nobody answers."""
-    if urlsplit(url).scheme in WEB:
-        info = info_of(url, hosts)
-        return None if info is None else _state(info, url, hosts)
-    storage, name = bucket(url)
-    with answering(url):
-        try:
-            info = storage.info(name)
-        except FileNotFoundError:
-            return None
-        return None if info.get("type") == "directory" else _state(info, url)
+    storage, name = (web_files(url, hosts), url) if _is_web(url) else bucket(url)
+    try:
+        info = ask_patiently(url, lambda: storage.info(name))
+    except FileNotFoundError:
+        return None
+    return None if info.get("type") == "directory" else _state(info, url, hosts)
 
 
-# What clients fail with, by the names of their exceptions: the problem, and the remedy.
+def _is_web(url: str) -> bool:
+    return urlsplit(url).scheme in WEB
+
+
+# What clients fail with, by the names of their exceptions: the problem, the remedy, and whether
+# asking again may help. Clients of buckets ask again themselves.
 FAILURES = (
     (
         ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"),
         "no credentials for it",
         "export AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or name a profile by AWS_PROFILE",
+        False,
     ),
     (
         ("gaierror", "ClientConnectorDNSError"),
         "its host is unknown",
         "correct the URL or AWS_ENDPOINT_URL, and check the network",
+        False,
     ),
     (
-        ("EndpointConnectionError", "ClientConnectorError", "ConnectTimeoutError", "TimeoutError"),
+        ("TooManyRedirects",),
+        f"its server redirects more than {MOST_REDIRECTS} times",
+        "check the URL",
+        False,
+    ),
+    (
+        ("EndpointConnectionError", "ConnectTimeoutError"),
         "nobody answers there",
         "check AWS_ENDPOINT_URL and the network, or try again later",
+        False,
+    ),
+    (
+        ("ClientConnectionError", "ClientPayloadError", "ClientResponseError", "TimeoutError"),
+        "nobody answers there, or not to the end",
+        "check the URL (or AWS_ENDPOINT_URL) and the network, or try again later",
+        True,
     ),
     (
         ("PermissionError",),
         "the server refuses access",
         "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, which need the right to read and list",
+        False,
     ),
 )
 
@@ -172,24 +195,64 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def _failure(error: Exception, url: str) -> tuple[Exception, bool, float | None]:
+    """What to raise for what a server or its client fails with, whether asking again may help, and
+    what pause the server asks for. FileNotFoundError if there is no such file."""
+    chain = list(_chain(error))
+    for link in chain:
+        if isinstance(link, InputError):
+            return link, False, None
+        if isinstance(link, Again):
+            return refusal(url, str(link), AGAIN), True, link.wait_s
+        if isinstance(link, Absent):
+            return FileNotFoundError(url), False, None
+    names = {kind.__name__ for link in chain for kind in type(link).__mro__}
+    for kinds, problem, remedy, again in FAILURES:
+        if names & set(kinds):
+            what = f"{problem} ({type(chain[-1]).__name__})" if again else problem
+            return InputError(what, file=url, remedy=remedy), again and _is_web(url), None
+    if isinstance(error, FileNotFoundError):
+        return error, False, None
+    said = "" if _is_web(url) else f": {error}"  # which may hold what a server redirects to
+    problem = f"its server does not answer as it should ({type(error).__name__}{said})"
+    remedy = (
+        "try again later; check the URL, the credentials (AWS_ACCESS_KEY_ID …, with "
+        "the right to list) and AWS_ENDPOINT_URL"
+    )
+    return InputError(problem, file=url, remedy=remedy), False, None
+
+
 @contextmanager
 def answering(url: str) -> Iterator[None]:
     """In the block, what a server or its client fails with is an InputError."""
     try:
         yield
-    except InputError:
-        raise
     except Exception as error:  # clients raise what they like
-        names = {kind.__name__ for link in _chain(error) for kind in type(link).__mro__}
-        for kinds, problem, remedy in FAILURES:
-            if names & set(kinds):
-                raise InputError(problem, file=url, remedy=remedy) from None
-        raise InputError(
-            f"its server does not answer as it should ({type(error).__name__}: {error})",
-            file=url,
-            remedy="try again later; check the URL, the credentials (AWS_ACCESS_KEY_ID …, with "
-            "the right to list) and AWS_ENDPOINT_URL",
-        ) from None
+        failure = _failure(error, url)[0]
+        if isinstance(failure, FileNotFoundError):
+            failure = InputError(
+                "no such bucket or object", file=url, remedy="check the URL and AWS_ENDPOINT_URL"
+            )
+        raise failure from None
+
+
+def ask_patiently(url: str, ask: Callable[[], Answer]) -> Answer:
+    """What ``ask()`` returns, which is called again where that may help, in the server's pace.
+
+    Raises FileNotFoundError if there is no such file; InputError for all else, and no later than
+    one request after :data:`PATIENCE_S`.
+    """
+    until = time.monotonic() + PATIENCE_S
+    for number in range(TRIES):
+        try:
+            return ask()
+        except Exception as error:  # clients raise what they like
+            failure, again, asked_s = _failure(error, url)
+        pause_s = WAIT_S * 2**number if asked_s is None else asked_s
+        if not again or time.monotonic() + pause_s > until:
+            break
+        time.sleep(pause_s)
+    raise failure
 
 
 def _put(place: Path, content: bytes) -> None:
@@ -242,38 +305,71 @@ def fetch(url: str) -> Path | None:
     Raises InputError if it is larger than :data:`MAX_COPY_BYTES`.
     """
     place = place_of(url)
-    if (state := _look(url)) is None:
+    try:
+        _put(place, _read(url, MAX_COPY_BYTES, frozenset()))
+    except FileNotFoundError:
         place.unlink(missing_ok=True)
         return None
-    content = read_bytes(url, MAX_COPY_BYTES, size=json.loads(state)["size"])
-    if len(content) != json.loads(state)["size"]:
-        raise InputError(
-            f"{len(content)} bytes came of {json.loads(state)['size']}",
-            file=url,
-            remedy="run again, and leave it alone until the run has ended",
-        )
-    _put(place, content)
     return place
 
 
-def read_bytes(
-    url: str, most_bytes: int, *, size: int | None = None, hosts: frozenset[str] = frozenset()
-) -> bytes:
-    """A file as a whole. Raises InputError if it has more than so many bytes, which are not read.
+def read_bytes(url: str, most_bytes: int, *, hosts: frozenset[str] = frozenset()) -> bytes:
+    """A file as a whole. Raises InputError if there is none, or one of more than so many bytes.
 
-    ``size``: what is known of it already. ``hosts``: see :mod:`.web_requests`.
+    ``hosts`` that may be redirected to.
     """
-    if size is not None and size > most_bytes:
-        raise too_large(url, most_bytes)
-    if urlsplit(url).scheme in WEB:
-        return read_whole(url, most_bytes, hosts)
-    if size is None:
-        if (state := _look(url)) is None:
-            raise _missing(url)
-        return read_bytes(url, most_bytes, size=json.loads(state)["size"])
+    try:
+        return _read(url, most_bytes, hosts)
+    except FileNotFoundError:
+        raise _missing(url) from None
+
+
+def _read(url: str, most_bytes: int, hosts: frozenset[str]) -> bytes:
+    """The same; raises FileNotFoundError if there is none."""
+    if _is_web(url):
+        return ask_patiently(url, lambda: read_whole(url, most_bytes, hosts))
     storage, name = bucket(url)
-    with answering(url):
-        return storage.cat_file(name)
+    if ask_patiently(url, lambda: storage.size(name)) > most_bytes:
+        raise too_large(url, most_bytes)
+    return ask_patiently(url, lambda: storage.cat_file(name))
+
+
+def ranges_reader(path: str | Path) -> Callable[[Ranges], list[bytes]]:
+    """What reads ranges of bytes of what a path stands for, :data:`AT_ONCE` requests at a time.
+
+    It raises InputError if the file is another one by now than the stand-in says.
+    """
+    url = url_of(path) or ""
+    known = state_held(path)
+    storage, name = (web_files(url, hosts_of(path), *known), url) if _is_web(url) else bucket(url)
+
+    def ask(ranges: Ranges, held: dict[tuple[int, int], bytes]) -> None:
+        """Add to ``held`` the ranges that it lacks. Raises the failure of one of them."""
+        wanted = [part for part in ranges if part not in held]
+        names, starts, ends = [name] * len(wanted), *map(list, zip(*wanted))
+        failure = None
+        answers = storage.cat_ranges(names, starts, ends, batch_size=AT_ONCE)
+        for part, content in zip(wanted, answers):
+            if isinstance(content, BaseException):
+                failure = content
+            elif len(content) != part[1] - part[0]:
+                failure = Again(f"{len(content)} bytes came of {part[1] - part[0]}")
+            else:
+                held[part] = content
+        if failure is not None:
+            raise failure
+
+    def read(ranges: Ranges) -> list[bytes]:
+        if not _is_web(url):  # where each answer is compared
+            refuse_changed(path)
+        held: dict[tuple[int, int], bytes] = {}
+        try:
+            ask_patiently(url, lambda: ask(ranges, held))
+        except FileNotFoundError:
+            raise _missing(url) from None
+        return [held[part] for part in ranges]
+
+    return read
 
 
 def bring_image(url: str) -> Path:
@@ -301,7 +397,7 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
     place = place_of(url)
     if url.lower().endswith(suffixes) and "*" not in url:
         return stand_in(url)
-    if urlsplit(url).scheme in WEB:
+    if _is_web(url):
         raise InputError(
             "web servers list no folders", file=url, remedy="name one file, or use object storage"
         )
@@ -323,23 +419,28 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
 def _listed(url: str) -> dict[str, dict[str, Any]]:
     """What object storage has in a folder, or by a glob, by name; nothing if there is no such."""
     storage, name = bucket(url)
-    with answering(url):
+    try:
         if "*" in name:
-            return storage.glob(name, detail=True)
-        try:
-            listed = storage.ls(name.rstrip("/"), detail=True)
-        except FileNotFoundError:
-            return {}
-        return {info["name"]: info for info in listed}
+            return ask_patiently(url, lambda: storage.glob(name, detail=True))
+        listed = ask_patiently(url, lambda: storage.ls(name.rstrip("/"), detail=True))
+    except FileNotFoundError:
+        return {}
+    return {info["name"]: info for info in listed}
 
 
-def _held(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text())
+def _held(path: str | Path) -> dict[str, Any]:
+    return json.loads(Path(path).read_text())
+
+
+def state_held(path: str | Path) -> tuple[int, str]:
+    """Bytes of what a path stands for, and what its server calls its content."""
+    held = _held(path)
+    return int(held["size"]), str(held["content"])
 
 
 def hosts_of(path: str | Path) -> frozenset[str]:
     """The hosts, beside its own, that the server of what a path stands for may redirect to."""
-    return frozenset(_held(Path(path)).get("hosts", ())) if url_of(path) else frozenset()
+    return frozenset(_held(path).get("hosts", ())) if url_of(path) else frozenset()
 
 
 def size_of(path: str | Path) -> int:
@@ -348,54 +449,11 @@ def size_of(path: str | Path) -> int:
     return _held(path)["size"] if url_of(path) else path.stat().st_size
 
 
-@contextmanager
-def open_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to read from, or what it stands for, of which the parts asked for are fetched.
-
-    Raises InputError if that is no longer what the stand-in says.
-    """
-    path = Path(path)
-    if (url := url_of(path)) is None:
-        with path.open("rb") as stream:
-            yield stream
-        return
-    refuse_changed(path)
-    held = _held(path)
-    size = held["size"]
-    if urlsplit(url).scheme in WEB:
-        ranges = WebRanges(url, allow_hosts=hosts_of(path))
-        same_as_stand_in(ranges, size, held["content"])
-        with io.BufferedReader(RangeStream(ranges, READ_BYTES)) as file:
-            yield file
-        return
-    storage, name = bucket(url)
-    how = {"block_size": READ_BYTES, "cache_type": "readahead", "size": size}
-    try:
-        with storage.open(name, "rb", **how) as file:
-            yield file
-    except Exception as error:
-        if type(error).__module__.partition(".")[0] not in CLIENTS:
-            raise
-        with answering(url):
-            raise
-
-
 def refuse_changed(path: str | Path) -> None:
     """Raise InputError if the file that a path stands for is another one by now."""
     url = url_of(path)
     if url is not None and _look(url, hosts_of(path)) != Path(path).read_text():
         raise changed(url)
-
-
-def same_as_stand_in(ranges: Ranges, size: int, content: str) -> Ranges:
-    """What a server gives, if that is what a stand-in says. Raises InputError if it is not.
-
-    Some servers name no content, or not with every answer.
-    """
-    other = ranges.content and content and ranges.content != content
-    if ranges.size != size or other:
-        raise changed(ranges.name)
-    return ranges
 
 
 def gdal_name(path: str | Path) -> tuple[str, dict[str, str]]:

@@ -22,8 +22,9 @@ from stereotruth.command.list_tiles import list_of_scenes
 from stereotruth.errors import InputError
 from stereotruth.lidar.catalogue_list import read_list
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products import web_requests
-from stereotruth.products.remote_files import open_file, url_of
+from stereotruth.products import remote_files, web_files
+from stereotruth.products.file_parts import open_stream
+from stereotruth.products.remote_files import url_of
 from stereotruth.project import configured, lidar_of, read_scenes
 
 from ...synthetic.broken_scenes import write_sheet
@@ -313,12 +314,12 @@ def test_tiles_of_a_server_are_listed_and_read_as_they_were(folder):
         assert site.asked == []  # a plan asks nobody
         for file in files:
             name = url_of(file).rpartition("/")[2]
-            with open_file(file) as stream:
+            with open_stream(file, keep=False) as stream:
                 assert stream.read() == (folder / "tiles" / name).read_bytes()
         name = url_of(files[0]).rpartition("/")[2]
         site.answers[f"/lidar/{name}"] += b"more"
-        with pytest.raises(InputError, match="changed on its server"), open_file(files[0]):
-            pass
+        with pytest.raises(InputError, match="changed on its server"):
+            open_stream(files[0], keep=False).read(4)
 
 
 def listed(url, hosts=()):
@@ -382,7 +383,7 @@ def test_a_redirect_to_an_allowed_host_is_followed_when_listed_and_when_read(fol
         _, scenes = read_scenes(configured()[0])
         for file in scenes["Good-1"].lidar.split(";"):
             assert "verysecret" not in Path(file).read_text()
-            with open_file(file) as stream:
+            with open_stream(file, keep=False) as stream:
                 assert stream.read(4) == b"LASF"
 
 
@@ -426,7 +427,7 @@ def test_a_tile_that_a_server_lacks_is_named(folder):
 
 @pytest.mark.parametrize("status", [403, 500, 503])
 def test_a_tile_that_a_server_refuses_is_not_taken_for_a_missing_one(folder, monkeypatch, status):
-    monkeypatch.setattr(web_requests, "WAIT_S", 0.01)
+    monkeypatch.setattr(remote_files, "WAIT_S", 0.01)
     with serving() as site:
         url = with_catalogue(site, folder)
         site.answers["/lidar/t0.laz"] = (status, {}, b"")
@@ -435,8 +436,8 @@ def test_a_tile_that_a_server_refuses_is_not_taken_for_a_missing_one(folder, mon
 
 
 def test_a_server_that_stalls_is_left(folder, monkeypatch):
-    monkeypatch.setattr(web_requests, "WAIT_S", 0.01)
-    monkeypatch.setattr(web_requests, "STALL_S", 0.2)
+    monkeypatch.setattr(remote_files, "WAIT_S", 0.01)
+    monkeypatch.setattr(web_files, "STALL_S", 0.2)
     with serving() as site:
         site.answers["/a.json"] = (200, {"Content-Length": "900"}, b"{")
         with pytest.raises(InputError, match=r"nobody answers|came of"):

@@ -454,7 +454,7 @@ def test_a_list_is_read_as_it_was_written(tmp_path, monkeypatch):
 
 def test_the_files_of_a_list_are_known_without_a_network(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(remote_files, "info_of", None)  # nobody is asked
+    monkeypatch.setattr(remote_files, "ask_patiently", None)  # nobody is asked
     write_list(made_list(), "a.tsv")
     local, stand_in = files_of_list("a.tsv")
     assert local == "lidar/a.laz"

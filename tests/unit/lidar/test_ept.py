@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import laspy
 import numpy as np
@@ -20,11 +16,11 @@ from stereotruth.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs, interpret
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.octree import open_octree
+from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
 
-from ...synthetic.copc_server import CORNER, UTM
+from ...synthetic.copc_server import CORNER, UTM, serving
 from ...synthetic.ept import FAULTS, _about, make_ept, write
 from ...synthetic.las import everything, write_gtx
 
@@ -80,14 +76,6 @@ def test_the_system_is_that_of_ept_json(dataset):
         assert system == interpret(pyproj.CRS(wanted))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_damaged_dataset_is_refused(dataset, tmp_path, fault):
-    FAULTS[fault](dataset.parent)
-    with pytest.raises(InputError):
-        ingest(dataset, tmp_path / "s.points")
-    assert not (tmp_path / "s.points").exists()
-
-
 @pytest.fixture(scope="module")
 def good(whole, tmp_path_factory) -> Path:
     store = tmp_path_factory.mktemp("good") / "good.points"
@@ -95,10 +83,12 @@ def good(whole, tmp_path_factory) -> Path:
     return store
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_footprint_of_a_damaged_dataset_is_whole_or_refused(dataset, tmp_path, good, fault):
+def test_a_damaged_dataset_is_refused_and_a_footprint_of_it_whole(dataset, tmp_path, good, fault):
     FAULTS[fault](dataset.parent)
+    with pytest.raises(InputError):
+        ingest(dataset, tmp_path / "all.points")
+    assert not (tmp_path / "all.points").exists()
     try:
         ingest(dataset, tmp_path / "s.points", footprint=ground())
     except InputError:
@@ -106,92 +96,31 @@ def test_a_footprint_of_a_damaged_dataset_is_whole_or_refused(dataset, tmp_path,
     assert same(tmp_path / "s.points", good)
 
 
-@contextmanager
-def serving(folder: Path):
-    """A server of a folder, whose ranges are those of one request; what it was asked for."""
-    asked = []
-
-    class Answer(SimpleHTTPRequestHandler):
-        def do_GET(self):
-            asked.append(self.path)
-            file = Path(self.translate_path(self.path))
-            if "away" in self.path or not file.is_file():
-                self.send_response(302 if "away" in self.path else 404)
-                self.send_header("Location", "http://localhost:1/x")
-                self.send_header("Content-Length", "0")
-                self.end_headers()
-                return
-            content = file.read_bytes()
-            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
-            last = min(last, len(content) - 1)
-            self.send_response(206)
-            self.send_header("Content-Range", f"bytes {first}-{last}/{len(content)}")
-            self.send_header("Content-Length", str(last + 1 - first))
-            self.end_headers()
-            self.wfile.write(content[first : last + 1])
-
-        def log_message(self, *_):
-            pass
-
-    handler = partial(Answer, directory=str(folder))
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}", asked
-    finally:
-        server.shutdown()
-        server.server_close()
+def test_nodes_of_a_server_are_those_of_the_disk_and_asked_for_once(dataset, monkeypatch):
+    monkeypatch.chdir(dataset.parents[1])
+    ingest(dataset, "disk.points", footprint=ground())
+    with serving(dataset.parent) as server:
+        place = server.stand_in("ept.json", "Tue, 24 Nov 2026 10:00:00 GMT")
+        with pytest.raises(InputError, match="changed on its server"):
+            open_octree(place)
+        place = server.stand_in("ept.json")
+        server.requests.clear()
+        ingest(place, "web.points", footprint=ground())
+        nodes = [one for one in server.requests if "ept-data" in one]
+        assert len(nodes) == len(set(nodes)) == PointStore("web.points").attrs["nodes"][0]
+        server.requests.clear()
+        ingest(place, "again.points", footprint=ground())
+        assert server.requests == []
+    assert same(Path("disk.points"), Path("web.points"))
+    assert same(Path("disk.points"), Path("again.points"))
 
 
-def test_nodes_of_a_server_are_those_of_the_disk_and_asked_for_once(dataset):
-    with serving(dataset.parent) as (url, asked):
-        there, here = open_octree(f"{url}/ept.json"), open_octree(dataset)
-        assert there.nodes == here.nodes
-
-        def touches(low, high):
-            return (low[:, 0] <= CORNER[0] + 400) & (low[:, 1] <= CORNER[1] + 400)
-
-        asked.clear()
-        plan = there.plan(touches)
-        points = [part.array["X"].copy() for part in there.read(plan)]
-        wanted = [part.array["X"].copy() for part in here.read(here.plan(touches))]
-        assert all(map(np.array_equal, points, wanted)) and len(points) == len(wanted)
-        assert len(asked) == len(set(asked)) == len(plan.nodes) < len(there.nodes)
-
-
-def test_a_node_that_leads_to_another_host_is_refused(dataset):
-    dataset.parent.joinpath("away").mkdir()
-    with serving(dataset.parent) as (url, _), pytest.raises(InputError, match="another host"):
-        open_octree(f"{url}/away/ept.json")
-
-
-def test_nodes_have_the_scales_of_all(whole):
-    about = json.loads(whole.read_text())
-    header = open_octree(whole).header
-    assert header.point_count == about["points"]
-    assert np.allclose(header.mins, about["boundsConforming"][:3])
-    assert isinstance(header, laspy.LasHeader) and header.scales[0] == 0.01
-
-
-def stand_in(url: str, file: Path, content: str) -> Path:
-    place = Path("results", "remote", *url.replace("://", "/").split("/"))
-    place.parent.mkdir(parents=True)
-    place.write_text(json.dumps({"size": file.stat().st_size, "content": content}) + "\n")
-    return place
-
-
-def test_a_second_run_asks_for_nothing(dataset, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with serving(dataset.parent) as (url, asked):
-        place = stand_in(f"{url}/ept.json", dataset, "Tue, 24 Nov 2026 10:00:00 GMT")
-        ingest(place, tmp_path / "a.points", footprint=ground())
-        assert asked
-        asked.clear()
-        ingest(place, tmp_path / "b.points", footprint=ground())
-        assert asked == []
-    ingest(dataset, tmp_path / "c.points", footprint=ground())
-    assert same(tmp_path / "a.points", tmp_path / "b.points")
-    assert same(tmp_path / "a.points", tmp_path / "c.points")
+def test_a_node_that_leads_to_another_host_is_refused(dataset, monkeypatch):
+    monkeypatch.chdir(dataset.parents[1])
+    with serving(dataset.parent, "redirect to another host", when=2) as server:
+        with pytest.raises(InputError, match="another host"):
+            open_octree(server.stand_in("ept.json"))
+        assert len(server.requests) > 2
 
 
 def test_bytes_are_estimated_before_they_are_read(dataset, tmp_path):

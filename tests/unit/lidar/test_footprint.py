@@ -193,7 +193,7 @@ def test_a_file_whose_points_are_all_dropped_is_refused_still(tmp_path):
 
 
 def test_chunks_leave_no_trace(tmp_path):
-    (tmp_path / "a.copc.laz").write_bytes(make_copc(30_000, paged=False).content)
+    (tmp_path / "a.copc.laz").write_bytes(make_copc(30_000).content)
     footprint = Footprint.around([square(LON + 0.006, LAT + 0.006, 300)], 50.0)
     digests = set()
     for k, how in enumerate(({}, {"chunk_points": 333})):

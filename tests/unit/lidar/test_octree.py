@@ -1,33 +1,45 @@
-"""Octrees by footprint: all points of it, each server's and file's fault found or overcome."""
+"""Octrees by footprint: the points of the whole file that lie in it, or a refusal; never less."""
 
 from __future__ import annotations
 
 import io
 import os
 import struct
-import time
 import zlib
 from dataclasses import dataclass
+from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.octree import open_octree
-from tests.synthetic.copc_server import (
+from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_files import open_octree
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.survey import survey
+from stereotruth.products.file_parts import FOLDER
+from stereotruth.products.remote_files import bring_files
+
+from ...synthetic import object_storage
+from ...synthetic.copc_server import (
     CORNER,
     ENTRY,
     FILE_FAULTS,
-    SERVER_FAULTS,
+    UTM,
     damaged,
     make_copc,
     points_of,
     serving,
 )
-from tests.synthetic.real_data import SHARED
+from ...synthetic.ept import make_ept
+from ...synthetic.las import write_las
+from ...synthetic.real_data import SHARED
+from ...synthetic.stores import content_of, part_of
+from ...synthetic.surface_rasters import write_raster
 
-PATIENCE_S = 3.0  # of one range; stalls of 0.3 s are given up
+AREA = Footprint.around([np.array([[117.006, 117.009, 117.006], [29.836, 29.836, 29.839]])], 50.0)
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,11 @@ class Ground:
 GROUND = Ground(CORNER[:2] + np.array([610, 640]), CORNER[:2] + np.array([1180, 1190]))
 
 
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def made():
     return make_copc()
@@ -60,90 +77,26 @@ def cropped(content: bytes, ground: Ground) -> np.ndarray:
     return points_of([las.points[inside]])
 
 
-def read(location: str, ground: Ground | None, patience_s: float = PATIENCE_S) -> np.ndarray:
+def read(path: str | Path, ground: Ground | None) -> np.ndarray:
     """The points of a ground, by the nodes that touch it."""
-    octree = open_octree(location, patience_s=patience_s)
+    octree = open_octree(path)
     records = list(octree.read(octree.plan(None if ground is None else ground.touches)))
     if not records:
         return np.empty((7, 0))
-    scales, offsets = octree.header.scales, octree.header.offsets
     got = points_of(records)
-    return got if ground is None else got[:, ground.contains((got[:3].T * scales + offsets).T)]
+    xyz = got[:3].T * octree.header.scales + octree.header.offsets
+    return got if ground is None else got[:, ground.contains(xyz.T)]
 
 
-@pytest.mark.slow
 def test_a_footprint_has_the_points_of_the_whole_file(made):
+    """On a server, for boxes anywhere; with few bytes beside those of the nodes."""
     rng = np.random.default_rng(5)
     with serving(made.content) as server:
-        for _ in range(20):
+        place = server.stand_in(content="")
+        for _ in range(5):
             low = CORNER[:2] + rng.uniform(-300, 2048, 2)
             ground = Ground(low, low + rng.uniform(1, 500, 2))
-            truth = cropped(made.content, ground)
-            assert np.array_equal(read(server.url, ground), truth)
-
-
-def test_bytes_are_those_of_the_touched_nodes():
-    made = make_copc(400_000, levels=4)
-    with serving(made.content) as server:
-        octree = open_octree(server.url)
-        plan = octree.plan(GROUND.touches)
-        assert plan.touched <= len(plan.nodes) <= plan.touched + 2
-        points = sum(map(len, octree.read(plan)))
-    assert 0 < points == plan.points < 0.4 * octree.points
-    assert server.sent <= 1.2 * plan.bytes < 0.5 * len(made.content)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", SERVER_FAULTS)
-def test_a_server_that_fails_is_overcome_or_named(made, fault):
-    truth = cropped(made.content, GROUND)
-    when = 1 + zlib.crc32(fault.encode()) % 5
-    start = time.monotonic()
-    with serving(made.content, fault, when) as server:
-        try:
-            assert np.array_equal(read(server.url, GROUND), truth)
-            assert SERVER_FAULTS[fault]
-        except InputError as error:
-            assert not SERVER_FAULTS[fault], error
-            assert server.url in str(error) and "secret" not in str(error)
-    assert time.monotonic() - start < 2 * PATIENCE_S + 1
-    assert len(server.requests) > when  # the fault was met
-
-
-@pytest.mark.parametrize("fault", FILE_FAULTS)
-def test_a_damaged_file_loses_nothing_silently(made, fault, tmp_path):
-    file = tmp_path / "tile.copc.laz"
-    for seed in range(3):
-        rng = np.random.default_rng([zlib.crc32(fault.encode()), seed])
-        file.write_bytes(damaged(made, fault, rng))
-        try:
-            got = read(str(file), GROUND)
-        except InputError as error:
-            assert not FILE_FAULTS[fault] and "tile.copc.laz: " in str(error)
-            continue
-        assert FILE_FAULTS[fault] is not False
-        assert np.array_equal(got, cropped(made.content, GROUND))
-
-
-def test_a_redirect_is_followed_to_hosts_that_are_allowed(made):
-    with serving(made.content) as other, serving(made.content, "redirect to another host") as first:
-        first.target = other.url.replace("127.0.0.1", "localhost") + "?sig=secret"
-        with pytest.raises(InputError, match="another host, localhost") as refused:
-            open_octree(first.url)
-        assert "--allow-host localhost" in str(refused.value) and "sig" not in str(refused.value)
-        assert not other.requests
-        assert open_octree(first.url, allow_hosts=frozenset({"localhost"})).points == 20_000
-
-
-def test_secrets_of_a_url_are_in_no_message(made):
-    for fault in ("forbidden", "503 for ever", "no ranges", "reset"):
-        with serving(made.content, fault) as server:
-            url = server.url.replace("http://", "http://user:word@") + "?X-Signature=abcdef"
-            try:
-                read(url, GROUND, patience_s=1.0)
-                assert fault == "reset"
-            except InputError as error:
-                assert "abcdef" not in str(error) and "word" not in str(error)
+            assert np.array_equal(read(place, ground), cropped(made.content, ground))
 
 
 @pytest.mark.parametrize("name", ["simple_with_page.copc.laz", "autzen.copc.laz"])
@@ -152,82 +105,59 @@ def test_files_of_other_software_are_read_whole(name):
     if not file.is_file():
         pytest.skip("needs ../shared")
     las = laspy.read(file)
-    assert np.array_equal(read(str(file), None), points_of([las.points]))
+    assert np.array_equal(read(file, None), points_of([las.points]))
     middle = np.median(np.stack([las.x, las.y]), axis=1)
     ground = Ground(middle - 300, middle + 300)
     truth = cropped(file.read_bytes(), ground)
-    assert truth.shape[1] > 0
-    assert np.array_equal(read(str(file), ground), truth)
+    assert truth.shape[1] > 0 and np.array_equal(read(file, ground), truth)
 
 
-@pytest.mark.parametrize("how", ["replaced", "written over", "cut"])
-def test_a_file_on_the_disk_that_changes_while_it_is_read_is_refused(made, tmp_path, how):
-    file = tmp_path / "tile.copc.laz"
-    file.write_bytes(made.content)
-    octree = open_octree(file)
-    records = octree.read(octree.plan(GROUND.touches))
-    if how == "replaced":
-        (tmp_path / "other").write_bytes(made.content)
-        (tmp_path / "other").replace(file)
-    else:
-        content = made.content if how == "written over" else made.content[:-100]
-        file.write_bytes(content)
-    os.utime(file, ns=(1, 1))
-    with pytest.raises(InputError, match="changed while it was read"):
-        list(records)
+@pytest.mark.parametrize("form", [6, 7, 8])
+def test_stores_of_footprints_are_those_of_the_whole_cropped(form):
+    file, rng = Path("tile.copc.laz"), np.random.default_rng(form)
+    file.write_bytes(make_copc(12_000, form=form).content)
+    assert np.array_equal(read(file, None), points_of([laspy.read(file).points]))
+    ingest(file, "whole.points")
+    whole = PointStore("whole.points")
+    west, south, east, north = whole.bounds[:4]
+    for k in range(3):
+        corners = rng.uniform([[west], [south]], [[east], [north]], (2, 3))
+        footprint = Footprint.around([corners], 20.0)
+        ingest(file, f"{k}.points", footprint=footprint)
+        assert content_of(PointStore(f"{k}.points")) == part_of(whole, footprint)
+        assert 0 < PointStore(f"{k}.points").count < whole.count
 
 
-def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made, tmp_path):
-    """A hierarchy with two nodes of one line of descent exchanged: refused, or nothing is lost."""
-    file, nodes = tmp_path / "tile.copc.laz", made.entries
-    content = bytearray(made.content)
-    places = {}
-    for at in range(made.hierarchy_at, len(content) - ENTRY.size + 1, ENTRY.size):
-        *key, _, _, n = ENTRY.unpack_from(content, at)
-        if n > 0:
-            places[tuple(key)] = at
-    by_key = {entry[:4]: entry[4:] for entry in nodes}
-    assert by_key.keys() == places.keys()
-    lines = [
-        (above, below)
-        for above in by_key
-        for below in by_key
-        if above[0] < below[0]
-        and tuple(v >> (below[0] - above[0]) for v in below[1:]) == above[1:]
-        and not GROUND.touches(*boxes_of(below)).any()
-        and GROUND.touches(*boxes_of(above)).all()
-    ]
-    assert len(lines) > 20
-    truth, refused = cropped(made.content, GROUND), 0
-    for above, below in lines[:: max(len(lines) // 40, 1)]:
-        changed = bytearray(content)
-        ENTRY.pack_into(changed, places[above], *above, *by_key[below])
-        ENTRY.pack_into(changed, places[below], *below, *by_key[above])
-        file.write_bytes(changed)
+def test_few_bytes_of_a_server_are_read_and_a_second_run_asks_for_nothing():
+    made = make_copc(400_000, levels=4)
+    Path("tile.copc.laz").write_bytes(made.content)
+    ingest("tile.copc.laz", "disk.points", footprint=AREA)
+    with serving(made.content) as server:
+        place = server.stand_in()
+        ingest(place, "web.points", footprint=AREA)
+        nodes, every = PointStore("web.points").attrs["bytes"]
+        assert server.sent < 1.1 * nodes + 130_000 < 0.4 * every
+        server.requests.clear()
+        ingest(place, "again.points", footprint=AREA)
+        assert server.requests == []
+    disk = content_of(PointStore("disk.points"))
+    assert disk == content_of(PointStore("web.points")) == content_of(PointStore("again.points"))
+    assert PointStore("disk.points").count > 0
+
+
+@pytest.mark.parametrize("fault", FILE_FAULTS)
+def test_a_damaged_file_loses_nothing_silently(made, fault):
+    file, (comes, _) = Path("tile.copc.laz"), FILE_FAULTS[fault]
+    for seed in range(2):
+        rng = np.random.default_rng([zlib.crc32(fault.encode()), seed])
+        file.write_bytes(damaged(made, fault, rng))
         try:
-            assert np.array_equal(read(str(file), GROUND), truth)
+            got = read(file, GROUND)
         except InputError as error:
-            assert "outside of its cube" in str(error)
-            refused += 1
-    assert refused > 10
-
-
-def test_a_node_that_stands_elsewhere_in_the_hierarchy_is_found_though_it_is_not_read(
-    made, tmp_path
-):
-    """On the disk: a leaf of the ground has the key of a place where no node is."""
-    file, keys = tmp_path / "tile.copc.laz", {entry[:4] for entry in made.entries}
-    leaves = [e for e in made.entries if e[0] == 4 and GROUND.touches(*boxes_of(e[:4])).all()]
-    free = [(4, x, y, z) for x in range(16) for y in range(16) for z in (7, 8)]
-    free = [key for key in free if key not in keys and not GROUND.touches(*boxes_of(key)).any()]
-    assert len(leaves) > 5 and len(free) > 100
-    for leaf, key in zip(leaves, free):
-        content = bytearray(made.content)
-        at = content.index(ENTRY.pack(*leaf), made.hierarchy_at)
-        ENTRY.pack_into(content, at, *key, *leaf[4:])
-        file.write_bytes(content)
-        with pytest.raises(InputError, match="outside of its cube"):
-            read(str(file), GROUND)
+            assert not comes and "tile.copc.laz: " in str(error)
+            continue
+        assert comes is not False
+        assert np.array_equal(got, cropped(made.content, GROUND))
 
 
 def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -237,16 +167,139 @@ def boxes_of(key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return low, low + side
 
 
-def test_a_system_behind_the_points_is_read(made, tmp_path):
+@pytest.mark.slow
+def test_nodes_that_are_exchanged_are_never_taken_for_each_other(made):
+    """Two nodes of one line of descent, on a server: refused, or nothing is lost."""
+    entries = [e for e in made.entries if GROUND.touches(*boxes_of(e[:4])).any()]
+    others = [e for e in made.entries if not GROUND.touches(*boxes_of(e[:4])).any()]
+    lines = [
+        (above, below)
+        for above in entries
+        for below in others
+        if above[0] < below[0]
+        and tuple(v >> (below[0] - above[0]) for v in below[1:4]) == above[1:4]
+    ]
+    assert len(lines) > 20
+    truth, refused = cropped(made.content, GROUND), 0
+    for above, below in lines[:: len(lines) // 15]:
+        content = bytearray(made.content)
+        for one, other in ((above, below), (below, above)):
+            at = made.content.index(ENTRY.pack(*one), made.hierarchy_at)
+            ENTRY.pack_into(content, at, *one[:4], *other[4:])
+        with serving(bytes(content)) as server:
+            try:
+                assert np.array_equal(read(server.stand_in(), GROUND), truth)
+            except InputError as error:
+                assert "outside of its cube" in str(error)
+                refused += 1
+    assert refused > 5
+
+
+def test_a_node_that_stands_elsewhere_is_found_though_it_is_not_read(made):
+    """On the disk: a leaf of the ground has the key of a place where no node is."""
+    keys = {entry[:4] for entry in made.entries}
+    leaves = [e for e in made.entries if e[0] == 4 and GROUND.touches(*boxes_of(e[:4])).all()]
+    free = [(4, x, y, z) for x in range(16) for y in range(16) for z in (7, 8)]
+    free = [key for key in free if key not in keys and not GROUND.touches(*boxes_of(key)).any()]
+    for leaf, key in zip(leaves[:5], free, strict=False):
+        content = bytearray(made.content)
+        ENTRY.pack_into(content, content.index(ENTRY.pack(*leaf)), *key, *leaf[4:])
+        Path("tile.copc.laz").write_bytes(content)
+        with pytest.raises(InputError, match="outside of its cube"):
+            read("tile.copc.laz", GROUND)
+
+
+@pytest.mark.parametrize("how", ["replaced", "written over", "cut"])
+def test_a_file_on_the_disk_that_changes_while_it_is_read_is_refused(made, how):
+    file = Path("tile.copc.laz")
+    file.write_bytes(made.content)
+    octree = open_octree(file)
+    if how == "replaced":
+        Path("other").write_bytes(made.content)
+        Path("other").replace(file)
+    else:
+        file.write_bytes(made.content if how == "written over" else made.content[:-100])
+    os.utime(file, ns=(1, 1))
+    with pytest.raises(InputError, match="changed while it was read"):
+        list(octree.read(octree.plan(GROUND.touches)))
+
+
+def test_a_system_behind_the_points_is_read(made):
     """Some software writes the coordinate system into a record behind the points."""
     content = bytearray(made.content)
     at = content.index(b"LASF_Projection")
     content[at : at + 15] = b"some_other_user"
     wkt = content[at + 52 : content.index(b"\0", at + 52) + 1]
-    count = struct.unpack_from("<I", content, 243)[0]
+    (count,) = struct.unpack_from("<I", content, 243)
     struct.pack_into("<I", content, 243, count + 1)
     content += struct.pack("<H16sHQ32s", 0, b"LASF_Projection", 2112, len(wkt), b"") + wkt
-    file = tmp_path / "tile.copc.laz"
-    file.write_bytes(content)
-    record = open_octree(file).header.vlrs[-1]
+    Path("tile.copc.laz").write_bytes(content)
+    record = open_octree("tile.copc.laz").header.vlrs[-1]
     assert (record.record_id, record.record_data_bytes()) == (2112, wkt)
+
+
+def test_a_laz_of_a_server_is_surveyed_by_few_of_its_bytes():
+    """Of which its header, its chunk table and some points are read, not each chunk's head."""
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [0.01] * 3
+    header.add_crs(UTM)
+    las = laspy.LasData(header)
+    las.x, las.y = CORNER[:2, None] + np.random.default_rng(0).uniform(0, 900, (2, 400_000))
+    las.z = np.full(400_000, 40.0)
+    las.return_number = las.number_of_returns = np.ones(400_000, np.uint8)
+    las.write("whole.laz")
+    content = Path("whole.laz").read_bytes()
+    with serving(content) as server:
+        server.url = server.url.replace(".copc.laz", ".laz")
+        place = server.stand_in()
+        assert survey(place).box == survey("whole.laz").box
+        assert server.sent < 0.2 * len(content)
+        beside = Footprint.around([np.array([[118, 118.01, 118], [30, 30, 30.01]])], 50.0)
+        assert survey(place, footprint=beside).read == (0, 0)
+
+
+@pytest.fixture(scope="module")
+def bucket(tmp_path_factory):
+    s3fs = pytest.importorskip("s3fs")
+    pytest.importorskip("moto")
+    folder = tmp_path_factory.mktemp("bucket")
+    with object_storage.serving(folder) as server:
+        s3fs.S3FileSystem.clear_instance_cache()
+        files = folder / "files"
+        files.mkdir()
+        (files / "tile.copc.laz").write_bytes(make_copc(40_000).content)
+        write_las(files / "tile.laz", 20_000, side=1500.0)
+        heights = np.random.default_rng(0).uniform(20, 60, (400, 500)).astype(np.float32)
+        write_raster(files / "tile.tif", heights, 2.0, tiled=True, blockxsize=128, blockysize=128)
+        make_ept(files / "set")
+        server.put_folder(files, "lidar")
+        yield server, files
+
+
+@pytest.mark.parametrize("kind", ["tile.copc.laz", "tile.laz", "tile.tif", "set/ept.json"])
+def test_the_store_of_a_bucket_is_that_of_the_disk_and_asked_for_once(bucket, monkeypatch, kind):
+    _, files = bucket
+    corners = np.array([[117.004, 117.007, 117.004], [29.829, 29.829, 29.837]])
+    ground = Footprint.around([corners], 50.0)
+    place = bring_files(f"s3://bucket/lidar/{kind}", (".laz", ".tif", "ept.json"))
+    surveyed = survey(place, footprint=ground)
+    ingest(place, "there.points", footprint=ground)
+    ingest(files / kind, "here.points", footprint=ground)
+    there, disk = PointStore("there.points"), PointStore("here.points")
+    assert content_of(there) == content_of(disk) and disk.count > 0
+    assert surveyed.read[0] == disk.attrs["points"]["read"]
+    assert any(FOLDER.glob("*/*"))
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # nobody is asked
+    monkeypatch.setattr("stereotruth.products.remote_files.bucket", None)
+    ingest(place, "again.points", footprint=ground)
+    assert content_of(PointStore("again.points")) == content_of(disk)
+
+
+def test_an_object_that_has_changed_is_refused(bucket):
+    server, files = bucket
+    content = (files / "tile.copc.laz").read_bytes()
+    server.put("lidar/other.copc.laz", content)
+    place = bring_files("s3://bucket/lidar/other.copc.laz", (".laz",))
+    server.put("lidar/other.copc.laz", content[:-1] + b"x")
+    with pytest.raises(InputError, match="changed on its server"):
+        ingest(place, Path("a.points"), footprint=AREA)

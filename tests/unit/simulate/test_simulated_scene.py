@@ -70,9 +70,8 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.locks",
         "products.provenance",
         "products.atomic_outputs",
-        "products.ranges",
         "products.records",
         "products.remote_files",
-        "products.web_requests",
+        "products.web_files",
         "products.runs",
     }
