@@ -497,14 +497,6 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
         project_with(*plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr")
 
 
-def test_settings_are_checked(plane) -> None:
-    for options in ({"recipe": "guess"}, {"window": 8}, {"min_points": 0}):
-        with pytest.raises(InputError, match="Remedy"):
-            plane.project(**options)
-    with pytest.raises(InputError, match="no point store"):
-        project_with(*plane.images, [], plane.folder / "x.zarr")
-
-
 def test_store_bounds_and_density_are_kept(plane) -> None:
     """Points every 0.4 m over 230 m, in cells of 117 m."""
     grid = plane.project()
