@@ -487,6 +487,11 @@ def refused(scene: Scene, store: Path, match: str) -> None:
     assert not list(scene.folder.glob("refused*"))
 
 
+def test_no_point_store_is_refused(plane) -> None:
+    with pytest.raises(InputError, match="no point store"):
+        project_with(*plane.images, [], plane.folder / "x.zarr")
+
+
 def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     """The message tells a survey of another place from a wrong coordinate system."""
     near = plane.points[:2000] + np.array([0.1, 0, 0])
