@@ -102,8 +102,11 @@ class Block:
         alignment = self.pair.alignment(self.rectified)
         job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)
         share = min((points_per_m2 or self.density) / self.density, 1.0)
-        job.__dict__["stores"] = tuple(Thinned(path, share) for path in self.pair.points)
-        return job.with_surface(self.rectified / f"surface_{share:.9f}", workers=2)
+        stores = tuple(Thinned(path, share) for path in self.pair.points)
+        job.__dict__["stores"] = stores  # the surface is made of these
+        job = job.with_surface(self.rectified / f"surface_{share:.9f}", workers=2)
+        job.__dict__["stores"] = stores  # and so are the labels: a copy has opened none
+        return job
 
     def compile(self, job: SceneInputs) -> None:
         """Label a corner, so that what follows is compiled."""

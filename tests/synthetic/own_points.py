@@ -26,11 +26,11 @@ NOISES_M, DENSITIES = (0.03, 0.08), (12.0, 6.0, 1.0)
 WRONG_SURFACE_PX = 1.0  # labels that are off by more are no matter of noise
 
 
-def of_facets(visible, own, window, see_through):
+def of_facets(seen, own, *rest):
     """Labels of which no pixel's own points are the surer ones."""
     unsure = np.full_like(own.labels.variance, np.inf)
     own = replace(own, labels=replace(own.labels, variance=unsure))
-    return facet_labels(visible, own, window, see_through)
+    return facet_labels(seen, own, *rest)
 
 
 def row(scene: Scene, name: str, how) -> str:

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from ..epipolar.alike_correlation import alike_correlation, brightness_of_pair
 from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
+from ..numerics.box_max import box_max
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .seen_surface import box_max
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
 from .surface_means import apart_from_steps, left_and_warped, surface_mean, surface_means
 from .young_crowns import beside_young_crowns

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..surface.region import SQUARE_BITS, Region, greatest_around
+from ..numerics.box_max import box_max
+from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import PART_BITS
 from ..surface.surface_store import Block
 from ..surface.vertices import Vertices
@@ -82,7 +83,7 @@ def ground_in_view(
     low, high = np.full(grid, far), np.full(grid, -far)
     _ranges(vertices.x, vertices.y, vertices.h_q, low, high)
     around = (int(reach) >> SQUARE_BITS) + 1
-    low, high = -greatest_around(-low, around), greatest_around(high, around)
+    low, high = -box_max(-low, around), box_max(high, around)
     squares = high >= low
     if squares.any():
         row, col = np.nonzero(squares)

@@ -30,29 +30,22 @@ from ..errors import InputError
 from ..job import progress
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..lidar.point_store import VEGETATION_CLASSES, PointStore, open_stores
+from ..numerics.box_max import box_max
 from ..numerics.degrees import DEGREE_M
 from ..products.grids import Layer, atomic_store, blocks, create_grid
 from ..products.provenance import digest
+from ..surface.facet_values import PixelValues
+from ..surface.raster import PRISM_IN_LEFT, VISIBLE, ProjectedSurface, SeenSurface
 from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import BASE_OVER_HEIGHT, PART
-from ..surface.surface import GroundSurface
 from ..surface.surface_store import Box, SurfaceStore
 from ..surface.vertices import Vertices
-from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops, vertices_of_tops
-from .facet_raster import (
-    OCCLUSION_TOLERANCE_PX,
-    FacetValues,
-    PixelValues,
-    Prisms,
-    interpolate,
-    raster_facets,
-    raster_prisms,
-)
+from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
 from .pixel_scale import PixelScale
-from .seen_surface import box_max
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 IMAGE_CHUNK, IMAGE_SHARD = 256, 1024
 NO_POINTS, MEASURED, UNDECIDED, CROWN = range(4)
@@ -172,8 +165,17 @@ class ImageInputs:
         """By which a crown's contour may lie beyond its last points: the diagonal of a spacing."""
         return int(np.sqrt(2) * self.scale.spacing_px)
 
-    def project(self, lon_q: NDArray, lat_q: NDArray, h_q: NDArray) -> Floats:
-        """[4, n] (col, row, col - disparity, row) of lattice points, see the module."""
+    def with_rise(
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, lifted: NDArray[np.bool_]
+    ) -> tuple[Floats, NDArray[np.float32]]:
+        """See :class:`stereotruth.surface.raster.Projection`: (col, row, col - disparity, row)."""
+        xy = self._project(lon_q, lat_q, h_q)
+        rise = np.empty(xy.shape, np.float32)
+        higher = self._project(lon_q[lifted], lat_q[lifted], h_q[lifted] + _RISE)
+        rise[:, lifted] = (higher - xy[:, lifted]) / _RISE
+        return xy, rise
+
+    def _project(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
         height = h_q * LATTICE_M
         col, row = self.sensor.project(lon_q * LATTICE_DEG, lat_q * LATTICE_DEG, height)
         disparity = (height - self.reference_m) * self.scale.px_per_m
@@ -201,32 +203,17 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     if not surface.vertices.x.size:
         return None
     shape, first = (rows.stop - rows.start, cols.stop - cols.start), (rows.start, cols.start)
-    every = surface.vertices
-    xy = inputs.project(every.lon_q, every.lat_q, every.h_q)
-    above, index = np.full(shape, -np.inf), np.full(shape, -1, np.int32)
-    raster_facets(xy, surface.facet, first, above, index)
-    higher = inputs.project(every.lon_q, every.lat_q, every.h_q + _RISE)
-    rise = ((higher - xy) / _RISE).astype(np.float32)
-    strips, undecided = np.full(shape, -np.inf), np.full(shape, -np.inf)
-    for part, z_buffer in ((surface.strips, strips), (slice(surface.whole), undecided)):
-        corner, heights = surface.undecided[part], surface.height_range[part]
-        raster_prisms(Prisms(corner, heights, xy, rise, every.h_q), first, z_buffer)
-    values = PixelValues.none(shape)
-    facets = FacetValues(
-        xy, surface.facet, every.h_q, every.surface_class, every.day, every.count,
-        surface.variance, surface.bulge,
-    )  # fmt: skip
-    interpolate(facets, index, first, values)
-    facet_disparity = np.where(index >= 0, above, np.nan)
-    tops = NearestTops.of(surface.tops, xy, first, facet_disparity, strips)
-    crowns = _CrownPixels.of(surface, tops, xy, first, inputs.scale)
-    status = np.where(index >= 0, np.uint8(MEASURED), np.uint8(NO_POINTS))
-    status[np.maximum(undecided, strips) > above + OCCLUSION_TOLERANCE_PX] = UNDECIDED
-    on_crown = np.isin(values.surface_class, VEGETATION_CLASSES)
-    covered = crowns.overhang(facet_disparity, inputs.overhang_px) & ~on_crown
+    projected = ProjectedSurface.of(surface, inputs, first)
+    facets = projected.seen(shape, inputs.scale.px_per_m)
+    crowns = _CrownPixels.of(facets, inputs.scale)
+    status = np.full(shape, np.uint8(NO_POINTS))
+    status[facets.visibility == VISIBLE] = MEASURED
+    status[facets.visibility == PRISM_IN_LEFT] = UNDECIDED
+    on_crown = np.isin(facets.surface_class, VEGETATION_CLASSES)
+    covered = crowns.overhang(facets.disparity, inputs.overhang_px) & ~on_crown
     status[(status == MEASURED) & covered] = UNDECIDED
     status[(status != MEASURED) & crowns.is_nearest] = CROWN
-    layers = _layers(inputs, (rows, cols), covariance, status, values, crowns)
+    layers = _layers(inputs, (rows, cols), covariance, status, facets, crowns)
     return {name: np.ascontiguousarray(layer[core]) for name, layer in layers.items()}
 
 
@@ -242,18 +229,15 @@ class _CrownPixels:
     variance: Floats
 
     @classmethod
-    def of(
-        cls, surface: GroundSurface, tops: NearestTops, xy: Floats, first: tuple[int, int],
-        scale: PixelScale,
-    ) -> _CrownPixels:  # fmt: skip
-        """Of a surface's vertices at ``xy``."""
+    def of(cls, facets: SeenSurface, scale: PixelScale) -> _CrownPixels:
+        """In the image in which the ``facets`` are seen."""
+        tops = NearestTops.of(facets)
         there = tops.index >= 0
-        values = tops.values(there, vertices_of_tops(surface.vertices, surface.tops, xy), first)
+        values = tops.values(there, facets.projected)
         there &= np.isin(values.surface_class, CROWN_CLASSES)
-        return cls(
-            there & tops.in_front(), values, np.where(there, tops.disparity, -np.inf),
-            tops.variance(there, surface.tops, scale),
-        )  # fmt: skip
+        disparity = np.where(there, tops.disparity, -np.inf)
+        variance = tops.variance(there, facets.projected.surface.tops, scale)
+        return cls(there & tops.in_front(), values, disparity, variance)
 
     def overhang(self, disparity: Floats, reach: int) -> NDArray[np.bool_]:
         """Where a crown up to ``reach`` px off is much higher than what shows ``disparity``, NaN
@@ -285,21 +269,21 @@ def _layers(
     window: tuple[slice, slice],
     covariance: Floats,
     status: NDArray[np.uint8],
-    facets: PixelValues,
+    facets: SeenSurface,
     crowns: _CrownPixels,
 ) -> dict[str, NDArray]:
     """Layers of a block, from what ``facets`` and ``crowns`` have at its pixels."""
     rows, cols = window
     crown = status == CROWN
     good = crown | (status == MEASURED)
-    height = np.where(crown, crowns.values.height, facets.height + facets.rise) * LATTICE_M
+    height = np.where(crown, crowns.values.height * LATTICE_M, facets.height)
     height[~good] = np.nan
     px_per_m = inputs.scale.px_per_m
     slope = np.where(crown, crowns.values.slope, facets.slope) / px_per_m
     moved = np.einsum("ihw,ij,jhw->hw", slope, covariance, slope)
     roughness = np.nan_to_num(crowns.variance) / px_per_m**2
     on_facet = np.where(np.isin(facets.surface_class, VEGETATION_CLASSES), ON_FACETS, 0.0)
-    of_points = facets.variance * LATTICE_M**2 + on_facet * roughness
+    of_points = facets.variance / px_per_m**2 + on_facet * roughness
     sigma = np.sqrt(np.where(crown, roughness, of_points) + moved)
     surface_class = np.where(crown, crowns.values.surface_class, facets.surface_class)
     col, row = np.meshgrid(np.arange(cols.start, cols.stop), np.arange(rows.start, rows.stop))

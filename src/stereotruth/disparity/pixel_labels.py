@@ -1,7 +1,7 @@
 """The points of each pixel condensed to one, and labels at the pixels' centres from it.
 
 A pixel's points are condensed to one (:func:`condense`), whose position a recipe decides. With the
-recipe surface it is the mean of the points on the surface that the pixel's centre sees. The mean
+recipe surface it is the mean of the points on the facet that the pixel's centre sees. The mean
 lies beside the centre; a plane through the means of the pixel and those of its neighbours on the
 same surface takes the disparity there (:func:`at_centres`). No bias by the largest of several noisy
 heights, by slopes, or by mixture where a roof's edge and the ground share a pixel.
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from ..epipolar.one_surface import SURFACE_PX
 from ..kernels import kernel
 from ..lidar.lattice import PER_M
+from ..surface.raster import PRISM_IN_LEFT, SeenSurface
 from ..surface.scale import HEIGHT_NOISE_M, PRIOR_NOISE_M
 from .local_projection import LocalProjection
 from .pixel_points import PX, PixelPoints
-from .seen_surface import seen_surface
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -313,32 +313,55 @@ class OwnPoints:
 @dataclass(frozen=True, eq=False)
 class OwnLabels:
     """What each pixel's own points say, arrays [h, w]: ``labels`` at the centres, and ``points``
-    that they follow from; ``on_edge``: an edge passes within the margin of the centre;
-    ``in_frames``: number of points in both frames."""
+    that they follow from; ``passed``: two points or more, all lower than the surface that the
+    centre sees; ``in_frames``: number of points in both frames."""
 
     labels: Labels
     points: OwnPoints
-    on_edge: Bools
+    passed: Bools
     in_frames: NDArray[np.int32]
+
+
+@kernel
+def _on_surface(
+    points: Records, start: Ints, disparity: Floats, slope: Floats, use: Bools, passed: Bools
+) -> None:
+    """Which points [n] lie within SURFACE_PX of a surface of the ``disparity`` and ``slope`` at
+    their pixel's centre, by pixel; where the disparity is NaN, of the pixel's highest point.
+
+    ``passed`` [pixels]: two points or more, all of them lower than the surface.
+    """
+    for p in range(start.size - 1):
+        z, gx, gy = disparity[p], slope[0, p], slope[1, p]
+        if np.isnan(z):
+            z, gx, gy = -np.inf, 0.0, 0.0
+            for k in range(start[p], start[p + 1]):
+                z = max(z, points[k].disparity / PX)
+        passed[p] = start[p + 1] - start[p] > 1
+        for k in range(start[p], start[p + 1]):
+            point = points[k]
+            lift = (point.disparity - gx * point.u - gy * point.v) / PX - z
+            use[k] = abs(lift) <= SURFACE_PX
+            passed[p] &= lift < -SURFACE_PX
 
 
 def own_labels(
     points: PixelPoints,
+    seen: SeenSurface,
     projection: LocalProjection,
     px_per_m: float,
-    *,
-    edge_margin_px: float,
     min_points: int,
 ) -> OwnLabels:
-    """Labels by each pixel's points on the surface that its centre sees (recipe surface).
+    """Labels by each pixel's points on the facet that its centre sees (recipe surface).
 
     A pixel of fewer than ``min_points`` has none. ``px_per_m``: disparity of a metre of height.
     """
-    use, on_edge = seen_surface(points, edge_margin_px)
+    level = np.where(seen.visibility == PRISM_IN_LEFT, np.nan, seen.disparity).reshape(-1)
+    use, passed = np.empty(points.points.size, np.bool_), np.empty(level.size, np.bool_)
+    slope = np.ascontiguousarray(seen.slope).reshape(2, -1)
+    _on_surface(points.points, points.start, level, slope, use, passed)
     pixels = condense(points, use, lambda sums, _: projection.at_means(sums))
     labels = at_centres(pixels, pixels.count >= min_points, points.first, px_per_m)
-    if edge_margin_px == 0.0:
-        on_edge = np.zeros(points.shape, np.bool_)
     # copied, so that the sums of all pixels, which the counts are a part of, are freed
     own = OwnPoints(pixels.count.copy(), pixels.highest, pixels.surface_class)
-    return OwnLabels(labels, own, on_edge, points.count)
+    return OwnLabels(labels, own, passed.reshape(points.shape), points.count)

@@ -8,10 +8,11 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
    triangles that are undecided (:mod:`stereotruth.surface.surface`). Those are taken that the
    window may see (:mod:`.ground_in_view`).
 3. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
-   and each pixel's position in the right image is tested against them (:mod:`.visibility`). A pixel
-   has the label of its nearest facet if nothing may hide it in either view; if its own points are
-   the surer ones, theirs (:mod:`.facet_labels`). Rough surfaces, of which no triangle is a facet,
-   get labels of their own (:mod:`.crowns`).
+   and each pixel's position in the right image is tested against them
+   (:mod:`stereotruth.surface.raster`). A pixel has the label of its nearest facet if nothing may
+   hide it in either view; if its own points on this facet are the surer ones, theirs
+   (:mod:`.facet_labels`). Rough surfaces, of which no triangle is a facet, get labels of their own
+   (:mod:`.crowns`).
 4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
    (:mod:`.image_agreement`).
 5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
@@ -23,7 +24,6 @@ The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_r
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from ..epipolar.image_noise import EQUAL
 from ..status import Status
+from ..surface.raster import ProjectedSurface
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
@@ -42,8 +43,6 @@ from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
 from .pixel_labels import OwnPoints, own_labels
 from .scene_inputs import SceneInputs
-from .seen_surface import MAX_COVER_PX
-from .visibility import ProjectedSurface, visible_surface
 from .window_points import WindowPoints, read_window
 
 
@@ -81,32 +80,21 @@ def lidar_labels(scene: SceneInputs, window: PairWindow, points: WindowPoints) -
     settings, scale = scene.settings, scene.scale
     shape, first, projection = window.shape, window.first, points.projection
 
-    # points: what each pixel's own ones say
-    own = own_labels(
-        points.by_pixel,
-        projection,
-        scale.px_per_m,
-        edge_margin_px=scene.edge_margin_px,
-        min_points=settings.min_points,
-    )
-
     # facets: over the ground that the window may see
     reach, cell = scale.surface.height_reach, scale.surface.cell
     around = points.surface
     region = ground_in_view(around.vertices, reach, cell, projection, first, shape)
     surface = around.surface(region)
 
-    # visibility in both views; less than two spacings around a hidden point are searched for what
-    # covers it, so that sparse points are seen through
+    # visibility in both views; what each pixel's own points say
     projected = ProjectedSurface.of(surface, projection, first)
-    visible = visible_surface(projected, shape, scale.px_per_m)
-    see_through = scale.spacing_px > MAX_COVER_PX / 2.0
-    labels = facet_labels(visible, own, window, see_through)
+    seen = projected.seen(shape, scale.px_per_m).from_both_cameras()
+    own = own_labels(points.by_pixel, seen, projection, scale.px_per_m, settings.min_points)
+    labels = facet_labels(seen, own, window, scale, scene.edge_margin_px)
 
     # rough surfaces
-    rough = crowns(visible, scale)
-    labels = without_contours(labels, rough, visible, scale)
-    rough = replace(rough, visible=rough.visible & ~own.on_edge)
+    rough = crowns(seen, scale, scene.edge_margin_px)
+    labels = without_contours(labels, rough, seen, scale)
     return LidarLabels(labels, rough, own.points, window)
 
 

@@ -43,7 +43,6 @@ from .pixel_scale import PixelScale
 from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
-from .seen_surface import OUTER_RINGS
 
 log = logging.getLogger("stereotruth")
 
@@ -180,11 +179,9 @@ class SceneInputs:
         """Pixels around a window whose points have a say in it."""
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
-        # the rings of neighbours of a pixel's own points, and of their plane, its pooled noise and
-        # its support; or what may hide a crown
-        reach = max(OUTER_RINGS + 3, CROWN_REACH_PX)
-        # what the images tell of a pixel, and of those around
-        reach += MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
+        # what may hide a crown, farther off than the plane and the noise of a pixel's own points
+        # reach, and what the images tell of a pixel, and of those around
+        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
         return reach + REASON_PX  # of changes
 
     @property

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from ..epipolar.surface_correlation import BLOCK, correlate, padded_columns, wanted_runs
 from ..epipolar.warping import value_in_row
 from ..kernels import inner, kernel
+from ..numerics.box_max import box_max
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .seen_surface import box_max
 from .surface_means import Voters, apart_from_steps, fill_voters, mean_of_runs, surface_mean
 
 Floats = NDArray[np.float64]

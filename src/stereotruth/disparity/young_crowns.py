@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lidar.point_store import VEGETATION_CLASSES
+from ..numerics.box_max import box_max
 from ..numerics.summed_area import summed_area
-from .seen_surface import box_max
 
 Bools = NDArray[np.bool_]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..kernels import kernel
 from .scale import PART_BITS
 from .vertices import Vertices
 
@@ -17,34 +17,6 @@ Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
 SQUARE_BITS = PART_BITS + 4  # of parts of a cell: squares of 16 cells
-
-
-@inner
-def _greatest_of_rows(values: Ints, reach: int, out: Ints) -> None:
-    """Greatest value of up to ``reach`` rows around each."""
-    rows, cols = values.shape
-    for j in range(rows):
-        for i in range(cols):
-            out[j, i] = values[j, i]
-        for b in range(max(j - reach, 0), min(j + reach + 1, rows)):
-            for i in range(cols):
-                out[j, i] = max(out[j, i], values[b, i])
-
-
-@kernel
-def greatest_around(values: Ints, reach: int) -> Ints:
-    """Greatest value of up to ``reach`` squares around each, along both axes."""
-    out, turned = np.empty_like(values), np.empty((values.shape[1], values.shape[0]), np.int64)
-    _greatest_of_rows(values, reach, out)
-    back = np.empty_like(turned)
-    for j in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            back[i, j] = out[j, i]
-    _greatest_of_rows(back, reach, turned)
-    for j in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            out[j, i] = turned[i, j]
-    return out
 
 
 @kernel

@@ -9,17 +9,20 @@ from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels, OwnLabels, OwnPoints
-from stereotruth.disparity.visibility import VISIBLE, VisibleSurface
+from stereotruth.disparity.pixel_scale import PixelScale
 from stereotruth.status import Status
+from stereotruth.surface.raster import VISIBLE, SeenSurface
+from stereotruth.surface.scale import SurfaceScale, ground_cell
 
 
 @pytest.mark.parametrize("see_through", [True, False])
-def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_through) -> None:
-    """A roof over sparse ground points: these are hidden by it, those before it are not."""
+def test_points_that_passed_are_an_edge_unless_they_show_through(see_through) -> None:
+    """A roof over sparse ground points, which it hides; over dense ones, an edge."""
     shape = (8, 8)
     level, zeros = np.full(shape, 10.0), np.zeros(shape)
-    visible = VisibleSurface(
+    seen = SeenSurface(
         visibility=np.full(shape, VISIBLE, np.uint8),
+        plane=level,
         disparity=level,
         slope=np.zeros((2, *shape)),
         variance=zeros,
@@ -31,17 +34,21 @@ def test_points_behind_the_seen_surface_are_no_edge_where_they_show_through(see_
         projected=None,
     )
     points, nothing = np.full(shape, np.nan), np.zeros(shape, np.uint8)
-    points[2, 2:6] = 10.2, 4.0, 16.0, 10.2  # on the surface, behind, before it; where it bulges
+    points[2, [2, 4, 5]] = 10.2, 10.8, 10.2  # on the surface, before it; where it bulges
+    passed = np.zeros(shape, np.bool_)
+    passed[2, 3] = True
     own = OwnLabels(
         Labels(points, np.zeros((2, *shape)), zeros),
         OwnPoints(zeros, points, nothing),
-        np.zeros(shape, np.bool_),
+        passed,
         np.zeros(shape, np.int32),
     )
     left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
     right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
     window = PairWindow(slice(4, 12), slice(12, 20), 0, left, right)
-    found = facet_labels(visible, own, window, see_through)
+    spacing = 2.0 if see_through else 1.0
+    surface = SurfaceScale.of((spacing * 0.5) ** -2, ground_cell((5e-6, 5e-6)))
+    found = facet_labels(seen, own, window, PixelScale(1.0, 0.5, surface), 0.0)
     labels, status = found.labels, found.status
     assert list(status[2, 2:5]) == [
         Status.LABELLED,
