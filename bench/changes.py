@@ -102,7 +102,8 @@ LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun 
 @dataclass(frozen=True)
 class Case:
     """A kind of change in a drawn city under a condition, at a density of the LiDAR, points/m²,
-    whose points have classes or none; or in the twin of a place."""
+    whose points have classes or none, and whose images have so many px a side; or in the twin of a
+    place."""
 
     kind: str
     condition: str
@@ -110,6 +111,7 @@ class Case:
     density: float
     classed: bool = True
     twin: Place | None = None
+    side_px: int = SIDE_PX
 
     @property
     def apart(self) -> bool:
@@ -122,7 +124,7 @@ class Case:
         number = FIRST_CITY + list(SHARES).index(self.kind)
         if self.twin is not None:
             return self._dated(self.twin.city("Dated", self.seed))
-        drawn = training_city(number, self.seed, SIDE_PX)
+        drawn = training_city(number, self.seed, self.side_px)
         is_open = self.kind in ("crops", "noise")
         water = self.kind == "water"
         character = replace(
@@ -172,6 +174,7 @@ class Case:
         parts = self.kind, self.condition, str(self.seed), str(self.density)
         more = () if self.classed else ("unclassed",)
         more += () if self.twin is None else (self.twin.key,)
+        more += () if self.side_px == SIDE_PX else (f"{self.side_px}px",)
         name = "-".join((*parts, *more)).replace(" ", "_")
         path = folder / name
         if not path.is_dir():

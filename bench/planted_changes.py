@@ -32,7 +32,7 @@ from scipy.ndimage import (
 
 from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import probability_of_change
+from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
@@ -433,7 +433,7 @@ def main() -> None:
 def lost_of(planted: Planted, diachronic: bool) -> Bools:
     """Labels of a window that the images contradict."""
     compared = planted.compared
-    probability = probability_of_change(compared, diachronic)
+    probability = change_probability(compared, diachronic).probability
     return planted.labelled & (probability > least_probability(compared))
 
 

@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import probability_of_change
+from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
+from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.recipe import lidar_labels
+from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL, ROUNDING, NoiseCurve, pair_noise
@@ -48,6 +50,22 @@ def toned(image: NDArray[np.floating], seed: int) -> NDArray[np.float32]:
     return np.where(known, noisy, 0).astype(np.float32)
 
 
+def in_eight_bits(
+    inputs: SceneInputs, window: PairWindow
+) -> tuple[PairWindow, tuple[NoiseCurve, NoiseCurve]]:
+    """A window with such images in place of its own, and their noise."""
+    images = [toned(image[:, :].astype(float), n) for n, image in enumerate(inputs.pair.images)]
+    patches = []
+    for patch, image in zip((window.left, window.right), images):
+        pixels = np.zeros_like(patch.pixels)
+        top, side = max(patch.row, 0), max(patch.col, 0)
+        here = image[top : patch.row + pixels.shape[0], side : patch.col + pixels.shape[1]]
+        pixels[top - patch.row :, side - patch.col :][: here.shape[0], : here.shape[1]] = here
+        patches.append(replace(patch, pixels=pixels))
+    window = replace(window, left=patches[0], right=patches[1])
+    return window, pair_noise(*images, inputs.pair.model)
+
+
 def main() -> None:
     """Draw the figure, and print what is lost by brightness."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -55,21 +73,11 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("results/changes"))
     given = parser.parse_args()
     inputs = inputs_of(Case("nothing", CONDITIONS[0], SEED, 4.0), given.folder)
-    model = inputs.pair.model
-    images = [toned(image[:, :].astype(float), n) for n, image in enumerate(inputs.pair.images)]
-    rows, cols = (slice(0, side) for side in model.shape)
+    rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
     found = lidar_labels(inputs, *read_window(inputs, rows, cols))
     labels = with_crowns(found.labels, found.rough, found.window)
     labelled = is_labelled(labels.status)
-    patches = []
-    for patch, image in zip((found.window.left, found.window.right), images):
-        pixels = np.zeros_like(patch.pixels)
-        top, side = max(patch.row, 0), max(patch.col, 0)
-        here = image[top : patch.row + pixels.shape[0], side : patch.col + pixels.shape[1]]
-        pixels[top - patch.row :, side - patch.col :][: here.shape[0], : here.shape[1]] = here
-        patches.append(replace(patch, pixels=pixels))
-    window = replace(found.window, left=patches[0], right=patches[1])
-    curves = pair_noise(*images, model)
+    window, curves = in_eight_bits(inputs, found.window)
     flat = NoiseCurve((0.0,), (max(min(curves[0].deviation) / 2.2, ROUNDING**0.5),))
     lost = []
     for noise in ((flat, flat), curves):
@@ -77,7 +85,7 @@ def main() -> None:
             window.of_equal_noise(noise), labels.labels, labelled, labels.surface_class, EQUAL
         )
         limit = least_probability(compared)
-        lost.append(labelled & (probability_of_change(compared, diachronic=False) > limit))
+        lost.append(labelled & (change_probability(compared, diachronic=False).probability > limit))
     left, warped = left_and_warped(window, labels.labels.disparity)
     for low, high in ((1, 60), (60, 100), (100, 150), (150, 256)):
         chosen = labelled & (left >= low) & (left < high)

@@ -12,6 +12,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,7 +34,7 @@ from .config.section import (
 )
 from .dates import acquisition_time, epoch_year
 from .errors import InputError
-from .sheet_rows import Mistakes, read_table, require_unique
+from .tables import Mistakes, Table, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
 LIDAR_SUFFIXES = (".las", ".laz")
@@ -162,11 +163,26 @@ class Image:
     no mask of its own"""
 
 
+def _rows(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
+    """Line and cells of each row of a sheet whose columns are the fields of a dataclass.
+
+    Cells of columns that are left out are empty. Raises InputError that names line or column.
+    """
+    columns = [f.name for f in fields(sheet)]
+    needed = [f.name for f in fields(sheet) if f.default is MISSING]
+    optional = " and ".join(c for c in columns if c not in needed)
+    more = f"; {optional} may be left out" if optional else ""
+    expected = f"the columns are {', '.join(columns)}{more}"
+    table = Table.read(path, expected, "\t", ragged=True)
+    table.require(needed, columns, expected)
+    return [(number, dict.fromkeys(columns, "") | cells) for number, cells in table.rows]
+
+
 def read_cities(path: str | Path) -> dict[str, City]:
     """The cities sheet by name of the city. Raises InputError as described in the module."""
     path = Path(path)
     cities, wrong = {}, Mistakes()
-    rows = read_table(path, City)
+    rows = _rows(path, City)
     for number, cells in rows:
         with wrong.collect():
             cities[cells["city"]] = _city(cells, number, path)
@@ -209,7 +225,7 @@ def read_images(
 ) -> dict[str, Image]:
     """The images sheet by name of the image. Raises InputError as described in the module."""
     path = Path(path)
-    rows = read_table(path, Image)
+    rows = _rows(path, Image)
     images: dict[str, Image] = {}
     first: dict[str, tuple[int, str]] = {}
     wrong = Mistakes()
@@ -347,7 +363,7 @@ def read_scenes(
     """
     path = Path(path)
     scenes, wrong = {}, Mistakes()
-    rows = read_table(path, Scene)
+    rows = _rows(path, Scene)
     if len(rows) > MOST_SCENES:
         raise InputError(
             f"{len(rows)} scenes; a project has at most {MOST_SCENES}",

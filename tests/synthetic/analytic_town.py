@@ -100,5 +100,5 @@ class Points:
         dx, dy = model.cell_m
         on = (x >= cols.start * dx) & (x < cols.stop * dx)
         on &= (-y >= rows.start * dy) & (-y < rows.stop * dy)
-        undulation = model.undulation(self.lon[on], self.lat[on])
-        return x[on], y[on], self.z[on] - undulation, self.kind[on]
+        shift = model.to_wgs84.height_shift_m(self.lon[on], self.lat[on])
+        return x[on], y[on], self.z[on] - shift, self.kind[on]

@@ -242,7 +242,7 @@ FAULTS = [
                      write_sheet(f, gcps=""))),
     Fault("GCP column", "column 'left_row' is missing",
           _replaced("gcps.csv", "left_row", "leftrow")),
-    Fault("GCPs separated by semicolons", "not separated by commas",
+    Fault("GCPs separated by semicolons", "separated by commas",
           _replaced("gcps.csv", ",", ";")),
     Fault("GCP no number", "is no number", _gcps(lambda rows: rows[3].update(lon="12°3"))),
     Fault("GCP twice", "both have the id", _gcps(lambda rows: rows[3].update(id="G01"))),

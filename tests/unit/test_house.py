@@ -33,7 +33,7 @@ BANNED_NAMES = {"of", "way", "look", "outline", "STEP_PX", "CELL_PX"}  # as a wh
 ORDER = (
     {"errors", "kernels", "status"},
     {"job", "numerics", "config", "dates"},
-    {"sheet_rows"},
+    {"tables"},
     {"sheets"},
     {"products"},
     {"lidar", "epipolar", "simulate"},

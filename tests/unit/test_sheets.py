@@ -9,7 +9,7 @@ import pytest
 from stereotruth import sheets
 from stereotruth.dates import acquisition_time
 from stereotruth.errors import InputError
-from stereotruth.sheet_rows import SheetError
+from stereotruth.tables import SheetError
 
 ROOT = Path(__file__).parents[2]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"
@@ -64,7 +64,7 @@ def test_a_sheet_is_read_with_crlf_bom_comments_and_short_rows(tmp_path, cities)
         (scenes_text(with_cell("right_image", "l.tif")), ["one image twice"]),
         (scenes_text(ROW, columns=(*COLUMNS[:-1], "gcp")), ["'gcps' is missing", "'gcp' is unkn"]),
         (scenes_text(ROW).replace("\t", ","), ["separated by tabs"]),
-        ("", ["empty sheet"]),
+        ("", ["it is empty"]),
     ],
 )
 def test_a_wrong_scenes_sheet_is_refused_by_name(tmp_path, cities, text, words):
@@ -189,7 +189,10 @@ def test_a_sheet_that_is_cut_short_is_refused(tmp_path, cities):
         if end == -2:
             assert len(sheets.read_scenes(file, cities)) == 1
         else:
-            with pytest.raises(InputError, match=r"scenes\.tsv: line 2 ends after 5 of 8 columns"):
+            with pytest.raises(
+                InputError,
+                match=r"scenes\.tsv: line 2 has 5 cells .*ends",
+            ):
                 sheets.read_scenes(file, cities)
 
 
@@ -198,10 +201,6 @@ def test_more_scenes_than_are_planned_are_refused_by_number(tmp_path, cities):
     file = write(tmp_path / "s.tsv", scenes_text(*rows))
     with pytest.raises(InputError, match="20000 scenes; a project has at most 2000"):
         sheets.read_scenes(file, cities)
-    with pytest.raises(InputError, match="no sheet of text"):
-        sheets.read_scenes(write(tmp_path / "s.tsv", '"' + "x" * 200_000), cities)
-    with pytest.raises(InputError, match="25 MB are no sheet"):
-        sheets.read_scenes(write(tmp_path / "s.tsv", "x" * 25_000_000), cities)
 
 
 # ------------------------------------------------------------------------------------- images

@@ -16,19 +16,20 @@ from ..synthetic.rules import FOLDER, read_rules
 RULES = read_rules()
 WITH_SCRIPT = {name: rule for name, rule in RULES.items() if rule.script}
 # The packages that the digests of each rule reach, all of them: a rule must not grow unseen.
+# ``tables`` reads control points.
 REACH = {
     "simulate_city": {"simulate", "products"},
     "simulate_image": {"simulate", "products"},
     "simulate_lidar": {"simulate", "products"},
     "simulate_truth": {"simulate", "products"},
     "ingest": {"lidar", "products"},
-    "align": {"alignment", "epipolar", "lidar", "products"},
-    "refine": {"alignment", "epipolar", "lidar", "products"},
-    "adjust": {"alignment", "epipolar", "lidar", "products"},
+    "align": {"alignment", "epipolar", "lidar", "products", "tables"},
+    "refine": {"alignment", "epipolar", "lidar", "products", "tables"},
+    "adjust": {"alignment", "epipolar", "lidar", "products", "tables"},
     "adjusted_alignment": {"alignment", "epipolar", "products"},
     "draw_residuals": {"alignment", "epipolar", "products"},
     "draw_refinement": {"alignment", "epipolar", "products"},
-    "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products"},
+    "closure_of_site": {"evaluation", "alignment", "epipolar", "lidar", "products", "tables"},
     "rectify": {"epipolar", "alignment", "products"},
     "rectify_strip": {"epipolar", "alignment", "products"},
     "compare_strips": {"lidar", "products"},
@@ -46,7 +47,7 @@ REACH = {
     "evaluate_truth_city": {"evaluation", "dataset", "products"},
     "evaluate_images": {"evaluation", "dataset", "epipolar", "products"},
     "report_city": {"report", "dataset", "epipolar", "products"},
-    "report_site": {"report", "alignment", "epipolar", "lidar", "products"},
+    "report_site": {"report", "alignment", "epipolar", "lidar", "products", "tables"},
     "audit": {"evaluation", "alignment", "dataset", "epipolar", "products"},
     "training_city": {
         "evaluation",
@@ -56,6 +57,7 @@ REACH = {
         "lidar",
         "simulate",
         "products",
+        "tables",
     },
     "training_cities": {
         "evaluation",
@@ -65,6 +67,7 @@ REACH = {
         "lidar",
         "simulate",
         "products",
+        "tables",
     },
     "train": {"matching", "dataset", "products"},
     "match": {"matching", "dataset", "products"},

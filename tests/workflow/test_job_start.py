@@ -9,9 +9,9 @@ import pytest
 
 from ..synthetic.rules import FOLDER
 
-HEAVY = {"cv2", "dask", "laspy", "matplotlib", "numba", "pandas", "pydantic", "pyproj"} | {
-    "rasterio", "scipy.spatial", "scipy.special", "scipy.stats", "torch", "xarray", "zarr"
-}  # fmt: skip
+HEAVY = {"cv2", "dask", "geopandas", "laspy", "matplotlib", "numba", "pandas", "pydantic"} | {
+    "pyproj", "rasterio", "scipy.spatial", "scipy.special", "scipy.stats", "shapely", "torch",
+} | {"xarray", "zarr"}  # fmt: skip
 # What the job of each script uses in every run; a new one costs each of its jobs its import.
 STARTS = {
     "simulate_image": {"numba", "rasterio"},

@@ -5,7 +5,7 @@ and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each o
 (0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
 see the point.
 
-Lines with ``#`` above the header are remarks. ``# frame: EPSG:6318`` names the geographic system of
+Lines that begin with ``#`` are remarks. ``# frame: EPSG:6318`` names the geographic system of
 the ground coordinates where this is not WGS 84, ``# epoch: 2016.4`` their epoch where the frame is
 dynamic, or WGS 84 (ITRF) at another date than that of the images. Points are brought to ITRF2020 at
 the epoch of the city's images (:mod:`stereotruth.lidar.frames`).
@@ -16,9 +16,6 @@ height,image,col,row``, ``image`` being a name of the images sheet.
 
 from __future__ import annotations
 
-import csv
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,11 +26,12 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..dates import epoch_year
-from ..epipolar.decimal_numbers import decimal_number
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
+from ..numerics.decimal_numbers import decimal_number
 from ..numerics.degrees import continuous
 from ..products.files import of_text
+from ..tables import Table
 
 Floats = NDArray[np.float64]
 
@@ -41,8 +39,6 @@ Floats = NDArray[np.float64]
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
 LONG = ("id", "lon", "lat", "height", "image", "col", "row")  # one line per point and image
 MOST_POINTS = 20_000  # lines; nobody measures as many
-MOST_BYTES = 20_000_000  # of their file
-REMARK = re.compile(r"#\s*(frame|epoch)\s*:\s*(.*?)[\s,]*$", re.IGNORECASE)
 LONGEST_ID = 100  # characters, which figures and tables have room for
 HEIGHT_RANGE = (-1000.0, 9500.0)  # ellipsoidal m: the Dead Sea and Everest, with a margin
 
@@ -95,8 +91,8 @@ def read_gcps(
 ) -> ControlPoints:
     """Read and check the ground control points (or check points) of a scene.
 
-    Takes a byte-order mark, CRLF, blank lines, spaces around cells and columns in any order. Of the
-    long form, the points that the scene's ``images`` (names of the left and the right one) show.
+    Columns may have any order. Of the long form, the points that the scene's ``images`` (names of
+    the left and the right one) show.
     Ground coordinates of another frame than WGS 84, or of another ``epoch``, are brought there.
 
     Raises InputError, naming the file and the line, for anything else that is not as it should be.
@@ -107,8 +103,12 @@ def read_gcps(
     def fail(problem: str, remedy: str, kind: type[InputError] = InputError) -> InputError:
         return kind(problem + of, file=file, remedy=remedy)
 
-    rows, declared = _rows(file, fail)
-    if rows and "image" in rows[0][1]:
+    try:
+        table = _table(file)
+    except InputError as error:
+        raise fail(error.problem, error.remedy) from None
+    rows = table.rows
+    if "image" in table.columns:
         rows = _as_pair(rows, images, fail)
     points: dict[str, tuple[int, list[float]]] = {}
     for line, cells in rows:
@@ -141,7 +141,7 @@ def read_gcps(
         left=values[:, 3:5].copy(),
         right=values[:, 5:7].copy(),
     )
-    return _in_itrf(found, declared, epoch, fail)
+    return _in_itrf(found, table.declared, epoch, fail)
 
 
 def _in_itrf(points: ControlPoints, declared: dict[str, str], epoch: Epoch, fail) -> ControlPoints:
@@ -163,10 +163,7 @@ def _in_itrf(points: ControlPoints, declared: dict[str, str], epoch: Epoch, fail
     try:
         change = frame_change(system, place, epoch, own)
     except InputError as error:
-        raise fail(
-            error.problem,
-            error.remedy.replace("lidar_epoch", "'# epoch:' in it (gcps import: --epoch)"),
-        ) from None
+        raise fail(error.problem, error.remedy) from None
     if change is None:
         record = taken_as_it_is(system, epoch)
         if record["source"]["epoch"] is None:
@@ -191,14 +188,10 @@ def images_measured(file: str | Path) -> dict[str, int]:
 
     Raises InputError as :func:`read_gcps` for what is no table of control points.
     """
-
-    def fail(problem: str, remedy: str) -> InputError:
-        return InputError(problem, file=file, remedy=remedy)
-
+    table = _table(Path(file))
     found: dict[str, int] = {}
-    for line, cells in _rows(Path(file), fail)[0]:
-        if "image" in cells:
-            found.setdefault(of_text(cells["image"]), line)
+    for line, cells in table.rows if "image" in table.columns else ():
+        found.setdefault(of_text(cells["image"]), line)
     return found
 
 
@@ -266,74 +259,20 @@ def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
                 )
 
 
-def _rows(file: Path, fail) -> tuple[list[tuple[int, dict[str, str]]], dict[str, str]]:
-    """(line number, stripped cells by column) of each line that holds anything, and what remarks
-    above the header declare (frame, epoch)."""
-    try:
-        if file.stat().st_size > MOST_BYTES:
-            raise fail(
-                f"{file.stat().st_size / 1e6:.0f} MB are no table of control points",
-                f"name the file of the points; at most {MOST_POINTS} are used",
-            )
-        text = file.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise fail("no such file", "correct the path in column gcps of the scenes sheet") from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise fail(f"cannot be read as text ({error})", "save it as CSV in UTF-8") from None
-    header: list[str] | None = None
-    rows = []
-    lines, declared = text.splitlines(), {}
-    for k, line in enumerate(lines):
-        remark = line.strip().strip('"')
-        if remark and not remark.startswith("#"):
-            break
-        if found := REMARK.match(remark):
-            declared[found[1].lower()] = found[2].strip('"')
-        lines[k] = ""  # counted all the same
-    reader = csv.reader(lines)
+def _table(file: Path) -> Table:
+    """The table of a file, of either form. Raises InputError."""
     expected = f"the header is {','.join(COLUMNS)}, or {','.join(LONG)}"
-    for cells in _readable(reader, fail):
-        cells = [cell.strip() for cell in cells]
-        if not any(cells):
-            continue
-        if header is None:
-            header = [cell.lower() for cell in cells]
-            if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-                raise fail(
-                    "columns are not separated by commas", "save it with commas, and decimal points"
-                )
-            columns = LONG if "image" in header else COLUMNS
-            missing = [c for c in columns if c not in header]
-            unknown = [c for c in header if c not in columns]
-            if missing or unknown or len(header) != len(set(header)):
-                wrong = [f"column {c!r} is missing" for c in missing]
-                wrong += [f"column {c[:40]!r} is unknown" for c in unknown[:8]]
-                raise fail("; ".join(wrong) or "a column occurs twice", expected)
-            continue
-        if len(cells) != len(header):
-            raise fail(
-                f"line {reader.line_num} has {len(cells)} cells for {len(header)} columns",
-                "write one cell per column, empty ones too, and decimal points",
-            )
-        rows.append((reader.line_num, dict(zip(header, cells))))
-        if len(rows) > MOST_POINTS:
-            raise fail(
-                f"more than {MOST_POINTS} points",
-                "give those that are measured in the images; points of LiDAR belong to column "
-                "lidar",
-            )
-    if header is None:
-        raise fail("the file is empty", expected)
-    return rows, declared
-
-
-def _readable(reader, fail) -> Iterator[list[str]]:
-    try:
-        yield from reader
-    except csv.Error as error:
-        raise fail(
-            f"line {reader.line_num + 1} cannot be read ({error})", "save it as CSV in UTF-8"
-        ) from None
+    table = Table.read(file, expected, ",")
+    columns = LONG if "image" in table.columns else COLUMNS
+    table.require(columns, columns, expected)
+    if len(table.rows) > MOST_POINTS:
+        raise InputError(
+            f"more than {MOST_POINTS} points",
+            file=file,
+            remedy="give those that are measured in the images; points of LiDAR belong to column "
+            "lidar",
+        )
+    return table
 
 
 def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ..errors import InputError, told_by_system
-from ..sheet_rows import SheetError
+from ..tables import SheetError
 
 
 class Level(Enum):

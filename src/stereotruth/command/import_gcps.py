@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..alignment.control_points import COLUMNS, read_gcps
-from ..epipolar.decimal_numbers import decimal_number
+from ..dates import epoch_year
 from ..errors import InputError
-from ..lidar.declared_crs import LidarCRS, parse_crs
-from ..lidar.frames import is_known
-from ..lidar.height_raster import HeightRaster
-from ..lidar.to_wgs84 import check_area, transformation
+from ..lidar.declared_crs import parse_crs
+from ..lidar.frames import WGS84_NAME, Epoch, Epochs
+from ..lidar.height_raster import Floats, HeightRaster
+from ..lidar.to_wgs84 import ToWGS84, check_area, transformation
 from ..numerics.degrees import metres_per_degree, turn
 from ..products.files import as_text
+from ..tables import Lines, Table
 
+EPOCHS = Epochs(Epoch(2020.0, "the import"))  # of what is computed, not of what is written
 SAME_PLACE_M = 0.01  # points of two .points files within this are one
 NAMES = {  # column: what others call it
     "id": ("id", "name", "point", "gcp", "label"),
@@ -44,6 +45,7 @@ NAMES = {  # column: what others call it
 
 
 NO_SYSTEM = "EPSG:4326"  # of degrees
+SYSTEM = ("crs", "wkt", "epsg", "frame")  # remarks that declare it, the first before others
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ def import_gcps(
 
     Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
     lines, as ``epoch`` of the coordinates where it is given (:mod:`..alignment.control_points`).
+    Heights of rasters and geoids are brought to that frame.
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -84,7 +87,7 @@ def import_gcps(
         raise InputError("is there already", file=to, remedy="name another file, or remove it")
     kinds = {file.suffix.lower() for file in files}
     if kinds == {".points"}:
-        points, said, lines = from_qgis(files, crs)
+        points, said, lines = from_qgis(files, crs, epoch)
     elif kinds == {".gcp"} and len(files) == 1:
         points, said, lines = from_asp(files[0], crs, left, right)
     elif len(files) == 1:
@@ -95,25 +98,24 @@ def import_gcps(
             file=files[0],
             remedy="give two .points (left, right), one .gcp, or one .csv",
         )
-    crs, epoch, raster = said.get("crs", ""), epoch or said.get("epoch", ""), heights
+    crs, epoch, raster = said["crs"], epoch or said["epoch"], heights
     if heights is not None and heights.suffix.lower() in TABLES:
-        ground, _ = to_wgs84(points, crs, None, files[0], places_only=True)
-        points, raster = with_heights(points, ground, heights), None
-    points, notes = to_wgs84(points, crs, geoid, files[0])
-    frame = _own_frame(parse_crs(crs)) if crs else ""
+        placed = to_itrf(points, crs, None, files[0], epoch, places_only=True)
+        points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
+    points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
-        lon, lat = (np.array([getattr(p, axis) for p in without]) for axis in "xy")
-        surface = HeightRaster.open(raster, geoid, whole=False)
-        found = dict(zip((p.id for p in without), surface.heights_at(lon, lat)))
+        surface = HeightRaster.open(raster, geoid, epochs=EPOCHS, whole=False)
+        found = dict(zip((p.id for p in without), surface.heights_at(*_places(without)[:2])))
         points = [replace(p, height=float(found.get(p.id, p.height))) for p in points]
         notes += [f"{raster.name}: {note}" for note in surface.to_wgs84.notes]
+    points = _in_own_frame(points, transform)
     if unknown := [point.id for point in points if math.isnan(point.height)]:
         raise InputError(
             f"no height for {len(unknown)} of {len(points)} points ({', '.join(unknown[:6])})",
             file=files[0],
             remedy="give --heights: a CSV with id and height (or lon, lat, height), or a raster",
         )
-    _write(points, to, frame, epoch)
+    _write(points, to, _name_of_frame(transform), epoch)
     try:
         read = read_gcps(to)
     except InputError:
@@ -123,19 +125,26 @@ def import_gcps(
     return [*lines, *notes, f"{to}: {len(read.ids)} points, {both} of them in both views"]
 
 
-def to_wgs84(
-    points: Sequence[Point], crs: str, geoid: Path | None, file: Path, *, places_only: bool = False
-) -> tuple[list[Point], list[str]]:
-    """Points in longitude, latitude and ellipsoidal m, and remarks.
+def to_itrf(
+    points: Sequence[Point],
+    crs: str,
+    geoid: Path | None,
+    file: Path,
+    epoch: str = "",
+    *,
+    places_only: bool = False,
+) -> tuple[list[Point], ToWGS84 | None, list[str]]:
+    """Points in longitude, latitude and ellipsoidal m, how they got there, and remarks.
 
-    In their own frame where that is known to centimetres, else in WGS 84.
+    In ITRF2020 at EPOCHS where their frame is known to centimetres, else in WGS 84.
 
-    ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``places_only``: heights are
-    left as they are. Raises InputError as for LiDAR: see :func:`.to_wgs84.transformation`.
+    ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``epoch`` of the coordinates.
+    ``places_only``: heights are left as they are. Raises InputError as for LiDAR: see
+    :func:`.to_wgs84.transformation`.
     """
     if not points:
-        return [], []
-    x, y, height = (np.array([getattr(p, name) for p in points]) for name in ("x", "y", "height"))
+        return [], None, []
+    x, y, height = _places(points)
     if not crs and ((np.abs(x) > 360).any() or (np.abs(y) > 90).any()):
         raise InputError(
             f"ground coordinates such as {x[0]:g}, {y[0]:g} are no degrees, and the file "
@@ -151,8 +160,11 @@ def to_wgs84(
     elif not crs and geoid is None:  # as control points of a project have them
         system = replace(system, ellipsoidal=True)
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
-    keep_frame = bool(_own_frame(system))
-    transform = transformation(system, file, ends, geoid=geoid, keep_frame=keep_frame)
+    try:
+        epochs = EPOCHS._replace(own=epoch_year(epoch))
+    except ValueError as error:
+        raise InputError(f"its epoch {epoch!r} {error}", file=file, remedy="as 2016.4") from None
+    transform = transformation(system, file, ends, geoid=geoid, epochs=epochs)
     lon, lat, lifted = transform(x, y, np.where(known, height, 0.0))
     bad = ~(np.isfinite(lon) & np.isfinite(lat))
     if bad.any():
@@ -167,21 +179,40 @@ def to_wgs84(
         *(f"{file.name}: {note}" for note in transform.notes),
         check_area(system, *spans, file),
     ]
-    if transform.is_orthometric:
+    if geoid is not None and not system.ellipsoidal:
         notes.append(f"heights brought to the ellipsoid by {geoid.name}")
     height = height if places_only else np.where(known, lifted, np.nan)
-    placed = zip(points, lon, lat, height)
-    found = [replace(p, x=float(a), y=float(b), height=float(h)) for p, a, b, h in placed]
-    return found, [note for note in notes if note]
+    return _placed(points, lon, lat, height), transform, [note for note in notes if note]
 
 
-def _own_frame(system: LidarCRS) -> str:
-    """EPSG code of the geographic system that points keep; empty: WGS 84."""
-    geodetic = system.horizontal.geodetic_crs
-    if geodetic is None or not is_known(geodetic):
+def _places(points: Sequence[Point]) -> Floats:
+    """x, y, height [3, n] of points."""
+    return np.array([(p.x, p.y, p.height) for p in points]).reshape(-1, 3).T
+
+
+def _placed(points: Sequence[Point], x: Floats, y: Floats, height: Floats) -> list[Point]:
+    """The points at other places."""
+    places = np.stack([x, y, height], axis=1).tolist()
+    return [replace(p, x=x, y=y, height=height) for p, (x, y, height) in zip(points, places)]
+
+
+def _in_own_frame(points: Sequence[Point], transform: ToWGS84 | None) -> list[Point]:
+    """Points where they were before a change of frame; so what is written depends on no epoch."""
+    if transform is None or transform.change is None:
+        return list(points)
+    lon, lat, height = _places(points)
+    x, y, known = transform.change.inverse(lon, lat, np.nan_to_num(height))
+    return _placed(points, x, y, np.where(np.isnan(height), np.nan, known))
+
+
+def _name_of_frame(transform: ToWGS84 | None) -> str:
+    """The geographic system of the written points by its EPSG code, or WKT; empty: WGS 84."""
+    change = None if transform is None else transform.change
+    if change is None or change.frame == WGS84_NAME:
         return ""
-    code = geodetic.to_2d().to_epsg(min_confidence=20)
-    return f"EPSG:{code}" if code else ""
+    system = transform.system.horizontal.geodetic_crs.to_2d()
+    code = system.to_epsg(min_confidence=20)
+    return f"EPSG:{code}" if code else system.to_wkt()
 
 
 def _write(points: Sequence[Point], to: Path, frame: str, epoch: str) -> None:
@@ -199,67 +230,10 @@ def _write(points: Sequence[Point], to: Path, frame: str, epoch: str) -> None:
             )
 
 
-@dataclass
-class _Text:
-    """Lines [(number, text)] of a file that hold anything, and what its comments declare."""
-
-    file: Path
-    lines: list[tuple[int, str]] = field(default_factory=list)
-    declared: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, file: Path) -> _Text:
-        """Raises InputError if it is missing or no text."""
-        try:
-            text = file.read_text(encoding="utf-8-sig")
-        except FileNotFoundError:
-            raise InputError("no such file", file=file, remedy="correct the path") from None
-        except (UnicodeDecodeError, OSError) as error:
-            raise InputError(
-                f"cannot be read as text ({error})", file=file, remedy="save it in UTF-8"
-            ) from None
-        found = cls(file)
-        for number, line in enumerate(text.splitlines(), 1):
-            if said := re.match(
-                r"#\s*(CRS|WKT|EPSG|frame|epoch)\s*[:=]\s*(.+)", line, re.IGNORECASE
-            ):
-                key = "epoch" if said[1].lower() == "epoch" else "crs"
-                found.declared.setdefault(key, said[2].strip())
-            elif line.strip() and not line.startswith("#"):
-                found.lines.append((number, line))
-        return found
-
-    def said(self, crs: str) -> dict[str, str]:
-        """``crs`` and ``epoch`` of the coordinates; ``crs`` that is given goes before."""
-        return self.declared | ({"crs": crs} if crs else {})
-
-    def number(self, text: str, what: str, line: int) -> float:
-        """A decimal number, NaN for an empty cell. Raises InputError that names the line."""
-        if not text.strip():
-            return math.nan
-        try:
-            return decimal_number(text.strip())
-        except ValueError:
-            raise InputError(
-                f"line {line}: {what} {text[:40]!r} is no number",
-                file=self.file,
-                remedy="write a decimal number",
-            ) from None
-
-    def table(self) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-        """Names of columns, in small letters, and (line, cells by column); any usual separator."""
-        if not self.lines:
-            raise InputError(
-                "there are no points in it", file=self.file, remedy="write a line a point"
-            )
-        separator = max(",;\t", key=self.lines[0][1].count)
-        parsed = csv.reader([line for _, line in self.lines], delimiter=separator)
-        header, *rows = [[cell.strip() for cell in cells] for cells in parsed]
-        header = [name.lower() for name in header]
-        if separator != ",":
-            rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
-        of = [dict(zip(header, [*cells, *[""] * len(header)])) for cells in rows]
-        return header, [(number, cells) for (number, _), cells in zip(self.lines[1:], of)]
+def _declared(read: Lines, crs: str = "") -> dict[str, str]:
+    """``crs`` and ``epoch`` that remarks of a file declare; ``crs`` that is given goes before."""
+    systems = [crs, *(read.declared.get(key, "") for key in SYSTEM)]
+    return {"crs": next(filter(None, systems), ""), "epoch": read.declared.get("epoch", "")}
 
 
 def _called(header: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
@@ -270,9 +244,11 @@ def _called(header: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
 
 # ------------------------------------------------------------------------------------------- QGIS
 
+QGIS = "save the points by QGIS: mapX,mapY,sourceX,sourceY,enable"
+
 
 def from_qgis(
-    files: Sequence[Path], crs: str = ""
+    files: Sequence[Path], crs: str = "", epoch: str = ""
 ) -> tuple[list[Point], dict[str, str], list[str]]:
     """Points of the georeferencer, one file a view; without a column id joined by their place.
 
@@ -284,16 +260,18 @@ def from_qgis(
             file=files[0],
             remedy="give two, that of the left image first",
         )
-    texts = [_Text.read(file) for file in files]
-    views = [_qgis_view(text) for text in texts]
+    tables = [Table.read(file, QGIS) for file in files]
+    views = [_qgis_view(table) for table in tables]
     every = [point for view in views for point in view]
-    systems = [crs or text.declared.get("crs", "") for text in texts]
+    declared = [_declared(table, crs) for table in tables]
     placed = [
         point
-        for text, view, system in zip(texts, views, systems)
-        for point in to_wgs84(view, system, None, text.file, places_only=True)[0]
+        for file, view, said in zip(files, views, declared)
+        for point in to_itrf(
+            view, said["crs"], None, file, epoch or said["epoch"], places_only=True
+        )[0]
     ]
-    if len(set(systems)) > 1:
+    if declared[0]["crs"] != declared[1]["crs"]:
         raise InputError(
             "names another coordinate system than the other file",
             file=files[1],
@@ -320,7 +298,7 @@ def from_qgis(
     ]
     how = "their ids" if named else "their map coordinates"
     counts = f"{len(views[0])} points of {files[0].name}, {len(views[1])} of {files[1].name}"
-    return points, texts[0].declared | {"crs": systems[0]}, [f"{counts}, joined by {how}"]
+    return points, declared[0], [f"{counts}, joined by {how}"]
 
 
 def _same_place(at: dict, lon: float, lat: float) -> object:
@@ -332,29 +310,22 @@ def _same_place(at: dict, lon: float, lat: float) -> object:
     return len(at)
 
 
-def _qgis_view(text: _Text) -> list[Point]:
+def _qgis_view(table: Table) -> list[Point]:
     """Each point that is switched on, its pixel (col, row) in ``left``."""
-    header, rows = text.table()
-    axes = ("sourcex", "sourcey") if "sourcex" in header else ("pixelx", "pixely")
-    for column in ("mapx", "mapy", *axes):
-        if column not in header:
-            raise InputError(
-                f"column {column!r} is missing",
-                file=text.file,
-                remedy="save the points by QGIS: mapX,mapY,sourceX,sourceY,enable",
-            )
-    called = _called(header, ("id", "height"))
+    axes = ("sourcex", "sourcey") if "sourcex" in table.columns else ("pixelx", "pixely")
+    needed = ("mapx", "mapy", *axes)
+    table.require(needed, None, QGIS)
+    called = _called(table.columns, ("id", "height"))
     points = []
-    for line, cells in rows:
+    for line, cells in table.rows:
         if cells.get("enable", "1") == "0":
             continue
-        x, y, col, row = (text.number(cells[c] or "-", c, line) for c in ("mapx", "mapy", *axes))
-        height = text.number(cells[called["height"]], "height", line) if "height" in called else 0
-        height = height if "height" in called else math.nan
+        x, y, col, row = (table.number_of(cells if cells[c] else {c: "-"}, c, line) for c in needed)
+        height = table.number_of(cells, called["height"], line) if "height" in called else math.nan
         if row > 0:
             raise InputError(
                 f"line {line}: sourceY is {row:g}, above the image's first row",
-                file=text.file,
+                file=table.file,
                 remedy="georeference the image without a world file or a coordinate system of its "
                 "own: QGIS then counts rows as 0, -1, -2 …",
             )
@@ -374,23 +345,19 @@ def from_asp(
     ``left``, ``right`` name the images, whole or by a part that only one has; else there have to be
     two, in the order in which they first appear.
     """
-    text, rows, images = _Text.read(file), [], {}
-    for number, line in text.lines:
+    expected = "write id lat lon height, three sigmas, and image col row sigma sigma of each image"
+    read, rows, images = Lines.read(file, expected), [], {}
+    for number, line in enumerate(read.lines, 1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
         if len(words) < 12 or (len(words) - 7) % 5:
-            raise InputError(
-                f"line {number} has {len(words)} fields",
-                file=file,
-                remedy="write id lat lon height, three sigmas, and image col row sigma sigma of "
-                "each image",
-            )
-        ground = [text.number(words[k], "coordinate", number) for k in (1, 2, 3)]
+            raise InputError(f"line {number} has {len(words)} fields", file=file, remedy=expected)
+        ground = [read.number(words[k], "coordinate", number) for k in (1, 2, 3)]
         seen = {}
         for k in range(7, len(words), 5):
             images.setdefault(words[k], len(images))
-            seen[words[k]] = tuple(text.number(words[k + j], "pixel", number) for j in (1, 2))
+            seen[words[k]] = tuple(read.number(words[k + j], "pixel", number) for j in (1, 2))
         rows.append((words[0], ground, seen))
     views = _views_of(file, list(images), left, right)
     points = []
@@ -400,7 +367,7 @@ def from_asp(
             points.append(Point(name, lon, lat, height, **pixels))
     said = ", ".join(f"{view}: {image}" for view, image in views.items())
     done = [f"{len(points)} of {len(rows)} points; {said}"]
-    return points, text.said(crs), done
+    return points, _declared(read, crs), done
 
 
 def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str, str]:
@@ -434,23 +401,23 @@ def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str,
 
 def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], list[str]]:
     """A table with a header, of any of the names and separators that are common; its system."""
-    text = _Text.read(file)
-    header, rows = text.table()
-    called = _called(header, COLUMNS)
+    expected = f"call the columns {','.join(COLUMNS)}"
+    table = Table.read(file, expected, ragged=True)
+    called = _called(table.columns, COLUMNS)
     missing = [column for column in COLUMNS if column not in called and column != "height"]
     if missing:
         raise InputError(
-            f"no column for {', '.join(missing)} among {', '.join(header)}",
+            f"no column for {', '.join(missing)} among {', '.join(table.columns)}",
             file=file,
-            remedy=f"call them {','.join(COLUMNS)}",
+            remedy=expected,
         )
     points = []
-    for line, cells in rows:
-        value = {c: text.number(cells[n], c, line) for c, n in called.items() if c != "id"}
+    for line, cells in table.rows:
+        value = {c: table.number_of(cells, n, line) for c, n in called.items() if c != "id"}
         pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
-    return points, text.said(crs), [f"{len(points)} points of {file.name}"]
+    return points, _declared(table, crs), [f"{len(points)} points of {file.name}"]
 
 
 TABLES = (".csv", ".txt", ".tsv")
@@ -461,24 +428,22 @@ def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path)
 
     Heights are in the points' own system. Points that have one keep it.
     """
-    text = _Text.read(source)
-    header, rows = text.table()
-    called = _called(header, ("id", "lon", "lat", "height"))
+    expected = "write id,height or lon,lat,height"
+    table = Table.read(source, expected, ragged=True)
+    called = _called(table.columns, ("id", "lon", "lat", "height"))
     if "height" not in called or not ("id" in called or {"lon", "lat"} <= set(called)):
         raise InputError(
-            f"columns {', '.join(header)} are no heights of points",
+            f"columns {', '.join(table.columns)} are no heights of points",
             file=source,
-            remedy="write id,height or lon,lat,height",
+            remedy=expected,
         )
     by_id, at, height_at = {}, {}, {}
-    for line, cells in rows:
-        height = text.number(cells[called["height"]], "height", line)
+    for line, cells in table.rows:
+        height = table.number_of(cells, called["height"], line)
         if "id" in called:
             by_id[cells[called["id"]]] = height
         if {"lon", "lat"} <= set(called):
-            at[line] = tuple(
-                text.number(cells[called[axis]], axis, line) for axis in ("lon", "lat")
-            )
+            at[line] = tuple(table.number_of(cells, called[a], line) for a in ("lon", "lat"))
             height_at[line] = height
     found = []
     for point, place in zip(points, ground):

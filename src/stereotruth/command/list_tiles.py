@@ -16,10 +16,8 @@ from ..alignment.pair_ground import footprint_of
 from ..config.configuration import Configuration
 from ..config.labels import Ingest
 from ..errors import InputError, in_number, without_secrets
-from ..lidar.catalogue import read_catalogue, resolved
-from ..lidar.catalogue_ground import Cover, cover_of
+from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
-from ..lidar.catalogue_tiles import Tile
 from ..lidar.declared_crs import LidarCRS, interpret
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..products.remote_files import bring_image, is_remote, state_of

@@ -434,6 +434,10 @@ def score_surface_model(
     reference_classes: Annotated[
         Path | None, typer.Option(help="LAS classes on the grid of the reference raster.")
     ] = None,
+    epoch: Annotated[
+        str,
+        typer.Option(help="Epoch of the model's images, 2016.4 or a date."),
+    ] = "",
 ) -> None:
     """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
     from .score_dsm import score_dsm
@@ -448,6 +452,7 @@ def score_surface_model(
             lidar_crs=lidar_crs,
             reference_geoid=reference_geoid,
             reference_classes=reference_classes,
+            epoch=epoch,
         )
     )
 

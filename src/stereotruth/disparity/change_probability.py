@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from ..epipolar.alike_means import alike_mean
 from ..epipolar.surface_correlation import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
-from .change_evidence import Evidence, LabelledWindow, change_evidence
-from .learned_evidence import as_learned, beyond_learned
+from .change_evidence import LabelledWindow, change_evidence
+from .learned_evidence import beyond_learned
 from .surface_means import surface_mean
 
 Floats = NDArray[np.float64]
@@ -69,25 +70,32 @@ def trees(diachronic: bool) -> list[DecisionTrees]:
     return DecisionTrees.load(TREES)[diachronic::2]
 
 
-def by_itself(evidence: Evidence, doubtful: Bools, diachronic: bool) -> Floats:
-    """Probability [h, w] that a pixel has changed, by its own evidence alone; UNCHANGED where it is
-    not ``doubtful``. ``diachronic``: whether the images share no light."""
-    out = np.full(doubtful.shape, UNCHANGED)
-    out[doubtful] = probability_by(trees(diachronic)[0], np.stack(evidence))
-    return out
+class ChangeProbability(NamedTuple):
+    """What the images of a window tell of its pixels [h, w]: the ``probability`` that what a
+    labelled one shows has changed, and which figures of the evidence lie ``beyond`` what was
+    learned, see :func:`.beyond_learned`, 0 where the images agree closely."""
+
+    probability: Floats
+    beyond: NDArray[np.uint32]
 
 
-def probability_of_change(compared: LabelledWindow, diachronic: bool) -> Floats:
-    """That what labelled pixels [h, w] show has changed; anything at other pixels.
-
-    ``diachronic``: whether the images share no light.
-    """
+def change_probability(compared: LabelledWindow, diachronic: bool) -> ChangeProbability:
+    """Of a window; ``diachronic``: whether the images share no light."""
     doubtful, evidence = change_evidence(compared)
-    out = by_itself(evidence, doubtful, diachronic)
-    others = with_surroundings(out, doubtful, compared)
-    figures = np.stack(evidence)
-    by_trees = probability_by(trees(diachronic)[1], np.concatenate([figures, others]))
-    out[doubtful] = as_learned(by_trees, beyond_learned(figures, diachronic))
+    return probability_by_evidence(compared, doubtful, np.stack(evidence), diachronic)
+
+
+def probability_by_evidence(
+    compared: LabelledWindow, doubtful: Bools, evidence: Singles, diachronic: bool
+) -> ChangeProbability:
+    """The same, by the ``evidence`` [k, n] of the ``doubtful`` pixels [h, w]."""
+    by_own, with_others = trees(diachronic)
+    out = ChangeProbability(np.full(doubtful.shape, UNCHANGED), np.zeros(doubtful.shape, np.uint32))
+    out.probability[doubtful] = probability_by(by_own, evidence)
+    others = with_surroundings(out.probability, doubtful, compared)
+    by_trees = probability_by(with_others, np.concatenate([evidence, others]))
+    out.probability[doubtful] = by_trees
+    out.beyond[doubtful] = beyond_learned(evidence, diachronic)
     return out
 
 

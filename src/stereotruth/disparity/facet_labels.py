@@ -74,4 +74,5 @@ def facet_labels(
         point_count=np.where(measured, points.count, 0),
         correlation=np.full(status.shape, np.nan),
         change=np.zeros(status.shape, np.uint8),
+        beyond=np.zeros(status.shape, np.uint32),
     )

@@ -23,7 +23,7 @@ from ..epipolar.one_surface import SURFACE_PX
 from ..lidar.point_store import WATER_CLASS
 from ..status import Status, is_labelled
 from .change_evidence import LabelledWindow
-from .change_probability import CHANGED, CROWN_CHANGED, YOUNG_CHANGED, probability_of_change
+from .change_probability import CHANGED, CROWN_CHANGED, YOUNG_CHANGED, change_probability
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 
@@ -47,11 +47,12 @@ class Contradicted(NamedTuple):
     """What the images of a window say of its labels; arrays [h, w].
 
     ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
-    contradict, though these may have changed.
+    contradict, though these may have changed; ``beyond``: see :class:`.ChangeProbability`.
     """
 
     changed: Bools
     variance: Floats | float
+    beyond: NDArray[np.uint32]
 
 
 def least_probability(compared: LabelledWindow) -> Floats:
@@ -73,10 +74,10 @@ def contradicted(
     as right where these do not contradict them.
     """
     compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
-    probability = probability_of_change(compared, comparison.diachronic)
+    probability, beyond = change_probability(compared, comparison.diachronic)
     changed = labelled & (probability > least_probability(compared))
     variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
-    return Contradicted(changed, variance)
+    return Contradicted(changed, variance, beyond)
 
 
 def without_changes(
@@ -95,4 +96,5 @@ def without_changes(
     status = labels.status.copy()
     status[changed] = Status.CHANGED
     with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
-    return replace(labels, status=status, labels=with_unseen, correlation=correlation)
+    by_both = {"correlation": correlation, "beyond": by_images.beyond}
+    return replace(labels, status=status, labels=with_unseen, **by_both)

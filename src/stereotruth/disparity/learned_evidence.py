@@ -1,7 +1,8 @@
 """How far what both images tell lies outside of what the probabilities were learned from.
 
 Decision trees answer as surely where nothing like it was ever learned. So the range of each figure
-of the evidence lies beside them (bench/change_probability.py), and a pixel beyond it is asked less.
+of the evidence lies beside them (bench/change_probability.py), and a scene's summary says how many
+of its pixels lie beyond.
 """
 
 from __future__ import annotations
@@ -14,30 +15,29 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bits = NDArray[np.uint32]
 
-UNKNOWN = 0.05  # share that has changed of pixels of which nothing is known
-LESS = 1.25  # by which the difference of log odds is divided beyond what has been learned
+ASKED = np.uint32(1)
 LEARNED = Path(__file__).with_suffix(".tsv")
 
 
 @cache
 def learned(diachronic: bool) -> Floats:
     """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
-    for one in two thousand at either end."""
+    for one in a hundred at either end."""
     rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
     return rows[rows[:, 0] == diachronic, 1:].T
 
 
-def beyond_learned(evidence: Singles, diachronic: bool) -> NDArray[np.int64]:
-    """How many of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]."""
+def beyond_learned(evidence: Singles, diachronic: bool) -> Bits:
+    """Which of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]: the bit
+    ASKED, and from the next one on a bit for each figure."""
     low, high = learned(diachronic)[..., None]
-    return ((evidence < low) | (evidence > high)).sum(axis=0)  # false for NaN
+    is_beyond = (evidence < low) | (evidence > high)  # false for NaN
+    return ASKED + (np.uint32(2) << np.arange(len(evidence), dtype=np.uint32)) @ is_beyond
 
 
-def as_learned(probability: Floats, beyond: NDArray[np.int64]) -> Floats:
-    """The probability [n], nearer to UNKNOWN where figures lie ``beyond`` what has been learned:
-    the difference of the log odds is divided by LESS."""
-    odds, unknown = (
-        np.log(p / (1.0 - p)) for p in (np.clip(probability, 1e-9, 1.0 - 1e-9), UNKNOWN)
-    )
-    return 1.0 / (1.0 + np.exp(-(unknown + (odds - unknown) / np.where(beyond > 0, LESS, 1.0))))
+def beyond_counts(beyond: Bits) -> NDArray[np.int64]:
+    """Of pixels [h, w]: how many were asked, and how many lie beyond by each figure [1 + k]."""
+    figures = learned(False).shape[1]
+    return np.array([(beyond >> bit & 1).sum(dtype=np.int64) for bit in range(1 + figures)])

@@ -100,7 +100,9 @@ class WindowLabels:
     ``status`` (:class:`.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
     1970-01-01, 0 for not known; ``point_count``: points used; ``correlation``: coefficient of both
-    images; ``change``: why a pixel has changed (:class:`.reason.Reason`).
+    images; ``change``: why a pixel has changed (:class:`.reason.Reason`); ``beyond``: which figures
+    of what the images tell lie beyond what was learned, as :func:`.learned_evidence.beyond_learned`
+    has it.
     """
 
     status: Bytes
@@ -111,6 +113,7 @@ class WindowLabels:
     point_count: Ints
     correlation: NDArray[np.floating]
     change: Bytes
+    beyond: NDArray[np.uint32]
 
     def within(self, part: tuple[slice, slice]) -> WindowLabels:
         """A part of the window."""
@@ -126,6 +129,7 @@ class WindowLabels:
             point_count=self.point_count[part],
             correlation=self.correlation[part],
             change=self.change[part],
+            beyond=self.beyond[part],
         )
 
     def around(self, part: tuple[slice, slice]) -> WindowLabels:

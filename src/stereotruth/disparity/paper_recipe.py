@@ -77,4 +77,5 @@ def paper_labels(
         point_count=pixels.count,
         correlation=pixels.correlation,
         change=np.zeros(status.shape, np.uint8),
+        beyond=np.zeros(status.shape, np.uint32),
     )

@@ -32,6 +32,7 @@ from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
 from ..status import Status, carries_label, is_labelled
+from .change_evidence import Evidence
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
@@ -47,6 +48,11 @@ MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
 
 
 LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
+# Of a block, see :func:`.recipe.label_window`.
+COUNTED = "in_grid", "in_frame", "used", "asked", *Evidence._fields
+# Share of the pixels that are asked which lies beyond what was learned by a figure of the evidence:
+# no simulated city and no real scene of those that trees are fitted to has more than 11 %.
+FAR_BEYOND = 0.15
 ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have more labels
 
 
@@ -82,7 +88,7 @@ class _Blocks:
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
-        """Label one block and write it, with its pixels by status and counts of points.
+        """Label one block and write it, with its pixels by status and what is COUNTED.
 
         Nothing, if it is there: a Dask worker that is lost takes with it that it had written it.
         """
@@ -92,7 +98,7 @@ class _Blocks:
         shape = rows.stop - rows.start, cols.stop - cols.start
         fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)
         arrays: dict[str, NDArray] = {}
-        points = np.zeros(3, dtype=np.int64)
+        counted = np.zeros(len(COUNTED), dtype=np.int64)
         for r, c in self.scene.windows.parts(rows, here, self.max_points):
             labelled = label_window(self.scene, r, c)
             if labelled is None:
@@ -106,7 +112,7 @@ class _Blocks:
                 if name not in arrays:
                     arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
                 arrays[name][part] = layer
-            points += counts
+            counted += counts
         image = self.scene.pair.images[0]
         if isinstance(image, MaskedImage) and (masked := image.mask[rows, here] != 0).any():
             arrays.setdefault("status", np.full(shape, fill["status"].fill, np.uint8))
@@ -115,7 +121,7 @@ class _Blocks:
         arrays = self.scene.pair.arrays(arrays)
         status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
         pixels = np.bincount(status.reshape(-1), minlength=len(Status))
-        out.write((rows, cols), key, arrays, [*pixels.tolist(), *points.tolist()])
+        out.write((rows, cols), key, arrays, [*pixels.tolist(), *counted.tolist()])
 
 
 def _identity(attrs: Mapping[str, Any]) -> str:
@@ -235,7 +241,9 @@ def project_scene(
     ``epipolar`` (the model), ``view``, ``summary``, ``points_bounds``, ``alignment_sigma_px``
     (standard uncertainty of a ground point's disparity, x and y: medians), ``provenance``. Summary:
     ``pixels`` by status, ``points`` (in the grid, in both frames, used), ``labelled_share`` of the
-    pixels that have points.
+    pixels that have points. Of the recipe surface also how many pixels were ``asked`` whether they
+    have changed, and the share of these that lies ``beyond_learned``, by each figure of
+    :class:`.change_evidence.Evidence`.
 
     Raises InputError if no point falls into both images.
     """
@@ -283,17 +291,22 @@ def project_scene(
 
 
 def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
-    """Of pixels by status and points (see :meth:`_Blocks.make`)."""
+    """Of pixels by status and what is counted (see :meth:`_Blocks.make`)."""
     pixels = {status.label: counts[status] for status in inputs.statuses}
-    in_grid, in_frame, used = counts[len(Status) :]
+    counted = dict(zip(COUNTED, counts[len(Status) :]))
     beyond = "no_points", "out_of_frame", "masked"
     reached = sum(n for name, n in pixels.items() if name not in beyond)
     labelled = sum(counts[status] for status in inputs.statuses if is_labelled(status))
-    return {
+    out = {
         "pixels": pixels,
-        "points": {"in_grid": in_grid, "in_frame": in_frame, "used": used},
+        "points": {name: counted[name] for name in COUNTED[:3]},
         "labelled_share": round(labelled / max(reached, 1), 6),
     }
+    if inputs.settings.on_surface:
+        asked = max(counted["asked"], 1)
+        out["asked"] = counted["asked"]
+        out["beyond_learned"] = {n: round(counted[n] / asked, 4) for n in Evidence._fields}
+    return out
 
 
 def _log_summary(recipe: str, summary: Mapping[str, Any]) -> None:
@@ -311,4 +324,12 @@ def _log_summary(recipe: str, summary: Mapping[str, Any]) -> None:
             "only %.0f %% of the pixels with points are seen alike in both images: check the "
             "vertical datum of the LiDAR (geoid in scenes.tsv), its CRS and the GCP residuals",
             100.0 * share,
+        )
+    beyond = {n: v for n, v in summary.get("beyond_learned", {}).items() if v > FAR_BEYOND}
+    if beyond:
+        log.warning(
+            "what the images show differs from what changes were learned from: %s of the %d pixels "
+            "that do not agree closely. Look at what is `changed`, and at what is not",
+            ", ".join(f"{name} at {100.0 * share:.0f} %" for name, share in beyond.items()),
+            summary["asked"],
         )

@@ -39,6 +39,7 @@ from .facet_labels import facet_labels
 from .ground_in_view import ground_in_view
 from .image_agreement import Comparison, without_changes
 from .layers import layers_of
+from .learned_evidence import beyond_counts
 from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
 from .pixel_labels import OwnPoints, own_labels
@@ -51,7 +52,8 @@ def label_window(
 ) -> tuple[dict[str, NDArray], NDArray[np.int64]] | None:
     """All layers of a window and its point counts; None if it has no points.
 
-    Counts: points in the window, in both frames, used.
+    Counts: points in the window, in both frames, used; pixels of which the images were asked, and
+    of these the ones beyond what was learned by each figure of the evidence.
     """
     inputs = read_window(scene, rows, cols)
     if inputs is None:
@@ -62,7 +64,8 @@ def label_window(
     layers = layers_of(labels, scene.pair, window)
     in_frames = points.by_pixel.count[window.inner]
     outside = points.by_pixel.outside.reshape(window.shape)[window.inner]
-    return layers, labels.counts(in_frames, outside)
+    of_points = labels.counts(in_frames, outside)
+    return layers, np.concatenate([of_points, beyond_counts(labels.beyond)])
 
 
 class LidarLabels(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Any
 from rasterio.errors import RasterioError
 
 from ..errors import InputError
+from ..numerics.decimal_numbers import decimal_number
 from ..products.ungeoreferenced import open_raster
-from .decimal_numbers import decimal_number
 from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")

@@ -11,27 +11,59 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 from urllib.parse import urljoin, urlsplit
 
 import numpy as np
+import pyproj
+import shapely
 from pyproj import CRS
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
+from shapely import Geometry
+from shapely.geometry import shape
 
 from ..errors import InputError
+from ..numerics.degrees import continuous
 from ..products.remote_files import SCHEMES, is_remote, read_bytes
 from ..sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
-from .catalogue_tiles import MOST_TILES, Floats, Row, Tile, in_degrees
+from .declared_crs import interpret
+from .footprint import CELL_DEG, Footprint
 
 MOST_BYTES = 200_000_000  # of a catalogue
+MOST_TILES = 1_000_000
 TILE_SUFFIXES = (*LIDAR_SUFFIXES, *RASTER_SUFFIXES, EPT)
 ELSEWHERE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:|//|\\\\")  # a scheme, or another host
 NO_DATA_ROLES = {"overview", "thumbnail", "metadata", "visual"}
+KINDS = "give a VPC, STAC items, GeoJSON or GeoPackage; see that the file is whole"
+FARTHEST = 1e9  # coordinate, in metres or feet
+SIDE_PARTS = 8  # of an outline in a projection, whose sides are not straight in degrees
+JOINT_DEG = 1e-5  # by which outlines of neighbours may miss each other: a metre
+DOUBLED_SHARE = 0.5  # of the smaller one of two tiles that cover the same ground
+
+Row = tuple[Mapping[str, Any], Geometry | None]  # of a tile index: columns, outline in degrees
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile as a catalogue has it.
+
+    ``href``: location as it stands there; ``outline`` in degrees, longitudes without a jump at the
+    line of 180°; ``crs``: what the catalogue says of its coordinates (WKT), or empty; ``start``,
+    ``end``: dates of its acquisition (ISO), or empty; ``points``: how many it has, or None.
+    """
+
+    href: str
+    outline: Geometry
+    crs: str = ""
+    start: str = ""
+    end: str = ""
+    points: int | None = None
 
 
 @dataclass(frozen=True)
@@ -59,12 +91,18 @@ def read_catalogue(
     """
     if is_remote(location):
         content = read_bytes(location, MOST_BYTES, hosts=hosts)
+    elif not (file := Path(location)).is_file():
+        raise InputError("no such catalogue", file=file, remedy="correct its path")
+    elif file.stat().st_size > MOST_BYTES:
+        raise InputError(
+            f"a catalogue larger than {MOST_BYTES / 1e6:g} MB",
+            file=file,
+            remedy="cut it to the region",
+        )
     else:
-        content = _local(Path(location))
+        content = file.read_bytes()
     if content[:15] == b"SQLite format 3":
-        from .catalogue_geopackage import rows_of
-
-        tiles = _indexed(rows_of(content, location), column, dates, location)
+        tiles = _indexed(_rows_of_geopackage(content, location), column, dates, location)
     else:
         tiles = _of_json(content, location, column, dates)
     if not tiles:
@@ -76,18 +114,6 @@ def read_catalogue(
     return Catalogue(location, len(content), hashlib.sha256(content).hexdigest(), tuple(tiles))
 
 
-def _local(file: Path) -> bytes:
-    if not file.is_file():
-        raise InputError("no such catalogue", file=file, remedy="correct its path")
-    if file.stat().st_size > MOST_BYTES:
-        raise InputError(
-            f"a catalogue larger than {MOST_BYTES / 1e6:g} MB",
-            file=file,
-            remedy="cut it to the region",
-        )
-    return file.read_bytes()
-
-
 def _of_json(
     content: bytes, location: str, column: str, dates: tuple[str, str] | None
 ) -> list[Tile]:
@@ -95,9 +121,7 @@ def _of_json(
         read = json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"no catalogue that can be read ({type(error).__name__})",
-            file=location,
-            remedy="give a VPC, STAC items, GeoJSON or GeoPackage; see that the file is whole",
+            f"no catalogue that can be read ({type(error).__name__})", file=location, remedy=KINDS
         ) from None
     kind = read.get("type") if isinstance(read, Mapping) else None
     if kind in ("Catalog", "Collection"):
@@ -108,33 +132,38 @@ def _of_json(
         )
     features = read.get("features") if kind == "FeatureCollection" else [read]
     if kind not in ("FeatureCollection", "Feature") or not isinstance(features, list):
+        raise InputError("neither STAC items nor GeoJSON", file=location, remedy=KINDS)
+    links = read.get("links")
+    linked = links if isinstance(links, list) else []
+    more = any(isinstance(link, Mapping) and link.get("rel") == "next" for link in linked)
+    matched = read.get("numberMatched")
+    if more or (isinstance(matched, int) and matched > len(features)):
         raise InputError(
-            "neither STAC items nor GeoJSON",
+            f"a page of {len(features)} items of a search that has found more",
             file=location,
-            remedy="give a VPC, STAC items, GeoJSON or GeoPackage",
+            remedy="save all of its pages in one file",
         )
-    _refuse_paged(read, len(features), location)
     for number, feature in enumerate(features, 1):
         if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
             raise _damaged(location, number, "is no feature")
     if any("assets" in feature for feature in features):
         dated = not location.lower().endswith(".vpc")  # which has days of writing there
         return [_item(item, n, location, dated) for n, item in enumerate(features, 1)]
-    return _indexed(_rows(read, features, location), column, dates, location)
+    named = read.get("crs")
+    crs = None
+    if isinstance(named, Mapping):  # of GeoJSON 2008, as GDAL writes it
+        try:
+            crs = CRS.from_user_input(named["properties"]["name"])
+        except (KeyError, TypeError, CRSError, ValueError):
+            raise _no_system(location) from None
+    rows = (
+        (_mapping(one.get("properties")), _outline(one.get("geometry"), crs)) for one in features
+    )
+    return _indexed(rows, column, dates, location)
 
 
-def _refuse_paged(read: Mapping[str, Any], held: int, location: str) -> None:
-    """Raise InputError if a search has found more items than the file has."""
-    links = read.get("links")
-    links = links if isinstance(links, list) else []
-    more = any(isinstance(link, Mapping) and link.get("rel") == "next" for link in links)
-    matched = read.get("numberMatched")
-    if more or (isinstance(matched, int) and matched > held):
-        raise InputError(
-            f"a page of {held} items of a search that has found more",
-            file=location,
-            remedy="save all of its pages in one file",
-        )
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _damaged(location: str, number: int, problem: str) -> InputError:
@@ -143,15 +172,56 @@ def _damaged(location: str, number: int, problem: str) -> InputError:
     )
 
 
+def _no_system(location: str) -> InputError:
+    return InputError(
+        "its coordinate system cannot be used",
+        file=location,
+        remedy="write it in WGS 84 longitude and latitude",
+    )
+
+
+def _rows_of_geopackage(content: bytes, location: str) -> Iterable[Row]:
+    """Columns and outline of each row of its one layer. Raises InputError for other files."""
+    import geopandas  # half a second, which other catalogues do not need
+    import pyogrio
+
+    table = None
+    try:
+        with NamedTemporaryFile(suffix=".gpkg") as file:
+            file.write(content)
+            file.flush()
+            layers = [str(name) for name, kind in pyogrio.list_layers(file.name) if kind]
+            if len(layers) == 1:
+                table = geopandas.read_file(file.name, layer=layers[0], rows=MOST_TILES + 1)
+    except (RuntimeError, ValueError, shapely.errors.ShapelyError) as error:
+        raise InputError(
+            f"no GeoPackage that can be read ({type(error).__name__})",
+            file=location,
+            remedy="check or fetch it again; see that its layer has polygons",
+        ) from None
+    if table is None:
+        raise InputError(
+            f"a GeoPackage of {len(layers)} layers ({', '.join(layers) or 'none'}); a tile index "
+            "has one",
+            file=location,
+            remedy="write the layer of the tiles alone",
+        )
+    if table.crs is None:
+        raise _no_system(location)
+    outlines = [_in_degrees(outline, table.crs) for outline in table.geometry]
+    return zip(table.drop(columns=table.geometry.name).to_dict("records"), outlines)
+
+
 def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> Tile:
-    """A tile of a STAC item."""
-    given = item.get("properties")
-    properties: Mapping[str, Any] = given if isinstance(given, Mapping) else {}
+    """A tile of a STAC item; its own coordinates come before degrees, as VPC has it."""
+    properties = _mapping(item.get("properties"))
     crs = _projection(properties)
-    rings = _own_outline(properties, crs) or _outline(item.get("geometry"), None)
-    if not rings and isinstance(box := item.get("bbox"), list) and len(box) in (4, 6):
-        rings = _boxed(box, None)
-    if not rings:
+    outline = None
+    if crs is not None:
+        outline = _outline(properties.get("proj:geometry"), crs)
+        outline = outline or _boxed(properties.get("proj:bbox"), crs)
+    outline = outline or _outline(item.get("geometry"), None) or _boxed(item.get("bbox"), None)
+    if outline is None:
         raise _damaged(location, number, "has no outline that can be read")
     first, last = properties.get("start_datetime"), properties.get("end_datetime")
     if dated and not (first and last):
@@ -159,7 +229,7 @@ def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> T
     points = properties.get("pc:count")
     return Tile(
         _asset(item.get("assets"), number, location),
-        rings,
+        outline,
         "" if crs is None else crs.to_wkt(),
         _day(first),
         _day(last),
@@ -178,46 +248,26 @@ def _projection(properties: Mapping[str, Any]) -> CRS | None:
     return None
 
 
-def _own_outline(properties: Mapping[str, Any], crs: CRS | None) -> tuple[Floats, ...]:
-    """Outline by the tile's own coordinates, which VPC prefers to degrees; empty if there is none.
-
-    Either proj:geometry or proj:bbox.
-    """
-    if crs is None:
-        return ()
-    if rings := _outline(properties.get("proj:geometry"), crs):
-        return rings
-    box = properties.get("proj:bbox")
-    return _boxed(box, crs) if isinstance(box, list) and len(box) in (4, 6) else ()
-
-
 def _asset(assets: Any, number: int, location: str) -> str:
     """The location of an item's points: the one asset with data."""
-    every = assets.values() if isinstance(assets, Mapping) else ()
-    held = [
-        str(asset["href"])
-        for asset in every
-        if isinstance(asset, Mapping) and isinstance(asset.get("href"), str)
-        if not _without_data(asset.get("roles"))
-    ]
+    held = []
+    for asset in map(_mapping, _mapping(assets).values()):
+        href, roles = asset.get("href"), asset.get("roles")
+        without = isinstance(roles, list) and NO_DATA_ROLES & set(map(str, roles))
+        if isinstance(href, str) and not without:
+            held.append(href)
     for kind in (LIDAR_SUFFIXES, (EPT,), RASTER_SUFFIXES):
         if fitting := [href for href in held if _path(href).endswith(kind)]:
             if len(set(fitting)) > 1:
                 raise _damaged(location, number, f"has {len(fitting)} files of points")
             return fitting[0]
-    packed = [href for href in held if _path(href).endswith(".zip")]
     raise _damaged(
         location,
         number,
         "is packed in a ZIP archive, of which no part can be read: fetch and unpack it"
-        if packed
+        if any(_path(href).endswith(".zip") for href in held)
         else "has no file of LAS, LAZ, COPC, EPT or GeoTIFF",
     )
-
-
-def _without_data(roles: Any) -> bool:
-    """Whether the roles of an asset say that it has no points."""
-    return isinstance(roles, list) and bool(NO_DATA_ROLES & set(map(str, roles)))
 
 
 def _path(href: str) -> str:
@@ -225,42 +275,18 @@ def _path(href: str) -> str:
     return re.split(r"[?#]", href, maxsplit=1)[0].lower()
 
 
-def _day(text: Any) -> str:
+def _day(value: Any) -> str:
     """The UTC date of a time, or empty."""
-    if not isinstance(text, str):
-        return ""
     try:
-        time = datetime.fromisoformat(text.strip())
+        time = datetime.fromisoformat(str(value).strip())
         time = time if time.tzinfo is None else time.astimezone(UTC)
     except (ValueError, OverflowError):  # none, or of the year 0
         return ""
     return time.date().isoformat()
 
 
-def _rows(
-    read: Mapping[str, Any], features: list[Mapping[str, Any]], location: str
-) -> Iterator[Row]:
-    """Properties and outline of each feature of a GeoJSON file."""
-    named = read.get("crs")
-    crs = None
-    if isinstance(named, Mapping):  # of GeoJSON 2008, as GDAL writes it
-        try:
-            crs = CRS.from_user_input(named["properties"]["name"])
-        except (KeyError, TypeError, CRSError, ValueError):
-            raise InputError(
-                "its coordinate system cannot be used",
-                file=location,
-                remedy="write it in WGS 84 longitude and latitude",
-            ) from None
-    for number, feature in enumerate(features, 1):
-        properties = feature.get("properties")
-        if not (rings := _outline(feature.get("geometry"), crs)):
-            raise _damaged(location, number, "has no outline that can be read (a polygon)")
-        yield properties if isinstance(properties, Mapping) else {}, rings
-
-
 def _indexed(
-    rows: Iterator[Row], column: str, dates: tuple[str, str] | None, location: str
+    rows: Iterable[Row], column: str, dates: tuple[str, str] | None, location: str
 ) -> list[Tile]:
     """Tiles of an index: the locations stand in a column."""
     held = list(rows)
@@ -273,12 +299,14 @@ def _indexed(
             remedy=f"its columns are {', '.join(map(str, held[0][0])) or 'none'}",
         )
     tiles = []
-    for number, (row, rings) in enumerate(held, 1):
+    for number, (row, outline) in enumerate(held, 1):
         href = row.get(column)
+        if outline is None:
+            raise _damaged(location, number, "has no outline that can be read (a polygon)")
         if not isinstance(href, str) or not href.strip():
             raise _damaged(location, number, f"names no file in column {column!r}")
         days = [_day(row.get(name)) for name in dates] if dates else ["", ""]
-        tiles.append(Tile(href.strip(), rings, "", *days))
+        tiles.append(Tile(href.strip(), outline, "", *days))
     return tiles
 
 
@@ -304,30 +332,121 @@ def _location_column(rows: list[Mapping[str, Any]], location: str) -> str:
     return fitting[0] if fitting else ""
 
 
-def _outline(geometry: Any, crs: CRS | None) -> tuple[Floats, ...]:
-    """Rings of a GeoJSON polygon or several, in degrees; empty if it is none."""
-    kind = geometry.get("type") if isinstance(geometry, Mapping) else None
-    if kind not in ("Polygon", "MultiPolygon"):
-        return ()
-    parts = geometry.get("coordinates")
-    polygons = [parts] if kind == "Polygon" else parts
-    try:
-        rings = [np.array([xy[:2] for xy in ring], np.float64).T for p in polygons for ring in p]
-    except (TypeError, ValueError, IndexError, OverflowError):
-        return ()
-    return in_degrees(rings, crs)
+# ---------------------------------------------------------------------------------------- outlines
 
 
-def _boxed(box: list[Any], crs: CRS | None) -> tuple[Floats, ...]:
-    """The ring of a box, of two or three dimensions; two of one across the antimeridian."""
+def _outline(geometry: Any, crs: CRS | None) -> Geometry | None:
+    """A GeoJSON geometry in degrees; see :func:`_in_degrees`."""
     try:
-        values = np.array(box, np.float64)
+        return _in_degrees(shape(geometry), crs)
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError,
+            shapely.errors.ShapelyError):  # fmt: skip
+        return None
+
+
+def _boxed(box: Any, crs: CRS | None) -> Geometry | None:
+    """A box of two or three dimensions in degrees; two of one across the antimeridian."""
+    try:
+        values = np.array(box, np.float64).reshape(2, -1)[:, :2]
+        (west, south), (east, north) = values
     except (TypeError, ValueError, OverflowError):
-        return ()
-    (west, south), (east, north) = values[:2], values[len(box) // 2 :][:2]
+        return None
     sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]
-    rings = [np.array([[w, e, e, w], [south, south, north, north]]) for w, e in sides]
-    return in_degrees(rings, crs)
+    if not np.isfinite(values).all():
+        return None
+    parts = [shapely.box(first, south, last, north) for first, last in sides]
+    return _in_degrees(shapely.multipolygons(parts), crs)
+
+
+def _in_degrees(outline: Geometry | None, crs: CRS | None) -> Geometry | None:
+    """Polygons in longitude and latitude; None if they lie nowhere on Earth, or are none.
+
+    ``crs``: of their coordinates, east first; None: they are degrees. Longitudes of a polygon do
+    not jump at the line of 180°, as those of footprints, unless it goes around the Earth.
+    """
+    if outline is None or outline.geom_type not in ("Polygon", "MultiPolygon") or outline.is_empty:
+        return None
+    if not (np.abs(shapely.get_coordinates(outline)) < FARTHEST).all():  # nor NaN
+        return None
+    outline = shapely.force_2d(outline)
+    if crs is not None:
+        west, south, east, north = outline.bounds
+        outline = shapely.segmentize(outline, max(east - west, north - south) / SIDE_PARTS)
+        try:
+            system = interpret(crs).horizontal
+            pyproj.network.set_network_enabled(False)
+            change = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+        except (ProjError, ValueError):
+            return None
+        outline = shapely.transform(outline, lambda xy: np.stack(change.transform(*xy.T), axis=1))
+    if not (np.abs(shapely.get_coordinates(outline)) <= [180.0, 90.0]).all():
+        return None
+    parts = [
+        part
+        if {-180.0, 180.0} <= set(shapely.get_coordinates(part)[:, 0].tolist())
+        else shapely.transform(part, lambda xy: np.stack([continuous(xy[:, 0]), xy[:, 1]], axis=1))
+        for part in shapely.get_parts(outline)
+    ]
+    found = shapely.make_valid(
+        shapely.multipolygons(parts), method="structure", keep_collapsed=False
+    )
+    return None if found.is_empty else found
+
+
+# ------------------------------------------------------------------------------------------- cover
+
+
+@dataclass(frozen=True)
+class Cover:
+    """What a catalogue's tiles are to a footprint.
+
+    ``taken``: indices of the tiles that touch it; ``area_m2`` of the footprint, ``hole_m2`` of it
+    in no tile, ``hole_at``: lon and lat in the largest part of that, None without a hole.
+    ``doubled``: pairs of taken tiles that have most of their ground in common.
+    """
+
+    taken: tuple[int, ...]
+    area_m2: float
+    hole_m2: float
+    hole_at: tuple[float, float] | None
+    doubled: tuple[tuple[int, int], ...]
+
+
+def cover_of(tiles: Sequence[Tile], footprint: Footprint) -> Cover:
+    """How the tiles cover the footprint; whether they touch it is told in whole cells around."""
+    row, first, last = np.array(footprint.runs).T
+    sides = np.stack([first, row, last + 1, row + 1]) * CELL_DEG
+    cells = shapely.box(*sides)
+    around = shapely.box(*(sides + np.array([[-1], [-1], [1], [1]]) * CELL_DEG))
+    outlines = np.array([tile.outline for tile in tiles])
+    taken = np.unique(shapely.STRtree(around).query(outlines, predicate="intersects")[0])
+    ground = outlines[taken]
+    covered = shapely.buffer(shapely.union_all(ground), JOINT_DEG, join_style="mitre")
+    holes = shapely.difference(cells, covered)
+    cell_m2 = footprint.cell_m2[row - footprint.row]
+    hole_m2 = float(shapely.area(holes) / CELL_DEG**2 @ cell_m2)
+    hole_at = None
+    if hole_m2 > 0:
+        parts = shapely.get_parts(shapely.union_all(holes))
+        inside = shapely.point_on_surface(parts[np.argmax(shapely.area(parts))])
+        hole_at = inside.x, inside.y
+    own = shapely.intersection(ground, shapely.union_all(cells))
+    one, other = shapely.STRtree(own).query(own, predicate="intersects")
+    one, other = one[one < other], other[one < other]
+    common = shapely.area(shapely.intersection(own[one], own[other]))
+    least = np.minimum(shapely.area(own[one]), shapely.area(own[other]))
+    same = (common > 0) & (common >= DOUBLED_SHARE * least)
+    doubled = np.stack([taken[one[same]], taken[other[same]]], axis=1)
+    return Cover(
+        tuple(taken.tolist()),
+        footprint.area_m2,
+        hole_m2,
+        hole_at,
+        tuple((a, b) for a, b in doubled[np.lexsort(doubled.T[::-1])].tolist()),
+    )
+
+
+# --------------------------------------------------------------------------------------- locations
 
 
 def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:

@@ -23,13 +23,13 @@ from pathlib import Path
 from ..errors import InputError
 from ..products.files import atomic_file
 from ..products.remote_files import is_remote, place_of, stand_in_of
+from ..tables import Table
 from .footprint import Footprint
 
 SUFFIX = ".tsv"
 EPT = "ept.json"  # a file of points by its name, no catalogue
 CATALOGUES = (".vpc", ".json", ".geojson", ".gpkg")
 TITLE = "# tiles of a catalogue, written by stereotruth: see docs/how-to/national_lidar.md"
-MOST_BYTES = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -124,21 +124,14 @@ def write_list(listed: TileList, to: str | Path) -> None:
 
 def read_list(file: str | Path) -> TileList:
     """A list of tiles. Raises InputError: missing, damaged, no list of tiles."""
-    file = Path(file)
-    if not file.is_file():
-        raise InputError("no such list of tiles", file=file, remedy="correct the path, or write it")
+    remedy = "write it again: stereotruth lidar CATALOGUE --to FILE"
+    table = Table.read(file, remedy, "\t")
+    table.require(COLUMNS, COLUMNS, remedy)
+    head = table.declared
     try:
-        if file.stat().st_size > MOST_BYTES:
-            raise ValueError(f"{file.stat().st_size / 1e6:.0f} MB")
-        text = file.read_text(encoding="utf-8-sig")
-        head = dict(re.findall(r"^# (\w+): ?(.*)$", text, re.MULTILINE))
-        lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-        rows = list(csv.reader(lines, delimiter="\t", strict=True))
-        if not rows or tuple(rows[0]) != COLUMNS:
-            raise ValueError(f"its columns are not {', '.join(COLUMNS)}")
         tiles = tuple(
-            ListedTile(name, int(size), content, int(points), start, end)
-            for name, size, content, points, start, end in rows[1:]
+            ListedTile(**cells | {key: int(cells[key]) for key in ("bytes", "points")})
+            for _, cells in table.rows
         )
         if len(tiles) != int(head["count"]):
             raise ValueError(f"{len(tiles)} of its {head['count']} tiles stand in it")
@@ -157,13 +150,9 @@ def read_list(file: str | Path) -> TileList:
             crs=head["crs"],
             tiles=tiles,
         )
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
-            f"no list of tiles that can be read ({error})",
-            file=file,
-            remedy="write it again: stereotruth lidar CATALOGUE --to FILE",
+            f"no list of tiles that can be read ({error})", file=file, remedy=remedy
         ) from None
 
 

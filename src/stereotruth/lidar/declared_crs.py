@@ -106,6 +106,21 @@ def _source(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
+def degrees_of(horizontal: CRS, x: Any, y: Any) -> tuple[Any, Any] | None:
+    """Longitude and latitude of coordinates of a system on its own datum, inf where there is none.
+
+    None of a system without a datum, or of a damaged one.
+    """
+    source = _source(horizontal)
+    if source.geodetic_crs is None:
+        return None
+    try:
+        change = pyproj.Transformer.from_crs(source, source.geodetic_crs.to_2d(), always_xy=True)
+    except ProjError:
+        return None
+    return change.transform(x, y)
+
+
 DEPTHS = "they are depths"  # of a system whose vertical axis points down
 
 
@@ -221,13 +236,13 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
     has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
     key is honoured here.
     """
-    from .geokeys import epoch_in, wkt_of_geokeys  # GDAL, which few files need
+    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
 
     keys = shorts[4:].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
     keys = keys[np.argsort(keys[:, 0], kind="stable")]
     shorts = np.concatenate([[1, 1, 0, len(keys)], keys.ravel()])
-    wkt = wkt_of_geokeys(shorts, doubles, text)
+    wkt, epoch = wkt_of_geokeys(shorts, doubles, text)
     if not wkt:
         return None
     meaning = interpret(CRS.from_wkt(wkt))
@@ -241,11 +256,7 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
-    return replace(meaning, epoch=epoch_in(shorts, doubles))
-
-
-def _wkt_text(data: bytes) -> str:
-    return data.split(b"\0")[0].decode("utf-8", errors="replace").strip()
+    return replace(meaning, epoch=epoch)
 
 
 def _held_against_code(meaning: LidarCRS, x: float, y: float) -> LidarCRS:
@@ -289,7 +300,8 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
                 found.append(meaning)
 
     def wkt() -> None:
-        if text := _wkt_text(records.get(2112, b"")):
+        data = records.get(2112, b"").split(b"\0")[0]
+        if text := data.decode("utf-8", errors="replace").strip():
             x, y = float(header.mins[0]), float(header.mins[1])
             attempt("WKT", lambda: _held_against_code(interpret_wkt(text), x, y))
 
@@ -323,21 +335,12 @@ def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
     """
     if one.equals(other, ignore_axis_order=True):
         return True
-    places = []
-    for crs in (one, other):
-        crs = _source(crs)
-        geographic = crs.geodetic_crs
-        if geographic is None:
-            return False
-        try:
-            degrees = pyproj.Transformer.from_crs(crs, geographic, always_xy=True)
-        except ProjError:  # of a damaged system
-            return False
-        lon, lat = degrees.transform(x, y)
-        places.append((lon, lat, geographic.ellipsoid.semi_major_metre))
-    difference = np.abs(np.subtract(*places))
-    same_datum = np.isfinite(difference).all() and difference[2] < 0.01
-    return bool(same_datum and max(difference[:2]) * DEGREE_M < 1e-3)
+    places = [degrees_of(crs, x, y) for crs in (one, other)]
+    if None in places:
+        return False
+    off_m = np.abs(np.subtract(*places)).max() * DEGREE_M
+    axes = [_source(crs).geodetic_crs.ellipsoid.semi_major_metre for crs in (one, other)]
+    return bool(off_m < 1e-3 and abs(axes[0] - axes[1]) < 0.01)  # nor NaN
 
 
 def resolve(

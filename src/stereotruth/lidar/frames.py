@@ -25,7 +25,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
+from ..numerics.degrees import turn
 from .plate_motion import moved, plate_at, speed
 
 Floats = NDArray[np.float64]
@@ -71,6 +72,9 @@ class Epochs(NamedTuple):
 
     images: Epoch
     own: float | None = None
+
+
+DEFAULT_EPOCHS = Epochs(DEFAULT_EPOCH)
 
 
 class Realisation(NamedTuple):
@@ -162,6 +166,18 @@ class FrameChange:
             lon, lat, height = step(lon, lat, height)
         return lon, lat, height
 
+    def inverse(self, lon: Floats, lat: Floats, height: Floats) -> Place:
+        """Of places in ITRF2020, those in the frame; to a micrometre.
+
+        A change moves places of a region by metres that are the same to 1e-6, so that what it does
+        to a place that is nearly right is known.
+        """
+        place = lon, lat, height
+        for _ in range(3):
+            off = [b - a for a, b in zip(self(*place), (lon, lat, height))]
+            place = place[0] + turn(off[0]), place[1] + off[1], place[2] + off[2]
+        return place
+
     def describe(self) -> dict[str, Any]:
         """Record for the attributes of a product."""
         return record(self.target, self.frame, self.epoch, self.legs)
@@ -209,24 +225,16 @@ def _geographic(datum: int) -> CRS:
     return GeographicCRS(name=found.name, datum=found).to_3d()
 
 
-def _is_dynamic(datum: int) -> bool:
-    return Datum.from_epsg(datum).type_name.startswith("Dynamic")
-
-
-def _operation(
-    source: CRS, target: int, place: tuple[float, float] | None
-) -> pyproj.Transformer | None:
-    """PROJ's best transformation between two frames at a place (None: at any), or None.
+def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.Transformer | None:
+    """PROJ's best transformation between two frames at a place, or None.
 
     What it calls a ballpark is none, nor is one that needs a grid which is not installed.
     """
     pyproj.network.set_network_enabled(False)
-    around = None
-    if place is not None:
-        lon, lat = (place[0] + 180.0) % 360.0 - 180.0, place[1]
-        west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
-        south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
-        around = AreaOfInterest(west, south, east, north)
+    lon, lat = float(turn(place[0])), place[1]
+    west, east = max(lon - NEAR_DEG, -180.0), min(lon + NEAR_DEG, 180.0)
+    south, north = max(lat - NEAR_DEG, -90.0), min(lat + NEAR_DEG, 90.0)
+    around = AreaOfInterest(west, south, east, north)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of grids that are not installed
@@ -266,9 +274,10 @@ class _Way:
         return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
 
 
-def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
+def _way(datum: int, place: tuple[float, float]) -> _Way | None:
     """How a datum gets to ITRF2020; None where nothing better than WGS 84 is known."""
-    own, dynamic, known = _geographic(datum), _is_dynamic(datum), REALISATIONS.get(datum)
+    own, known = _geographic(datum), REALISATIONS.get(datum)
+    dynamic = Datum.from_epsg(datum).type_name.startswith("Dynamic")
     direct = None
     if known is None or known.epoch is not None:  # PROJ may have a grid of deformations
         direct = _operation(own, ITRF2020, place)
@@ -287,32 +296,11 @@ def _way(datum: int, place: tuple[float, float] | None) -> _Way | None:
     return _Way((*before, best), known.epoch, dynamic, known.spread_m, notes)
 
 
-def is_known(system: CRS) -> bool:
-    """Whether coordinates of a system get to ITRF2020 otherwise than by WGS 84."""
-    geodetic = system.geodetic_crs
-    datum = None if geodetic is None else datum_code(geodetic)
-    if datum is None or datum == WGS84_ENSEMBLE:
-        return False
-    if datum in REALISATIONS:
-        return True
-    area = system.area_of_use or geodetic.area_of_use
-    east = area.east + 360 * (area.east < area.west) if area else 0.0
-    middle = ((area.west + east) / 2, (area.south + area.north) / 2) if area else None
-    return _way(datum, middle) is not None
-
-
 def _words(operation: pyproj.Transformer) -> str:
     """What an operation does, without what is no more than another form of coordinates."""
     parts = operation.description.split(" + ")
     forms = ("axis order change", "Conversion from", "Null geographic offset")
     return " + ".join(part for part in parts if not part.startswith(forms)) or "nothing"
-
-
-def _motion(plate: str, years: float) -> Callable[[Floats, Floats, Floats], Place]:
-    def move(lon: Floats, lat: Floats, height: Floats) -> Place:
-        return moved(lon, lat, height, plate, years)
-
-    return move
 
 
 def _refuse_without_epoch(
@@ -325,8 +313,8 @@ def _refuse_without_epoch(
         raise InputError(
             f"coordinates in {name} move by {1000 * m_a:.0f} mm a year here, and nothing states "
             "their epoch",
-            remedy="set lidar_epoch of the scene to the epoch of the coordinates, as 2016.4 or "
-            "2016-05-27",
+            remedy="state it, as 2016.4 or 2016-05-27: lidar_epoch of the scene, '# epoch:' above "
+            "control points (gcps import: --epoch), gdal_edit.py -a_coord_epoch of a raster",
         )
 
 
@@ -370,7 +358,7 @@ def frame_change(
             f"coordinates in {name} at {own:g}, where no plate's motion is known that would bring "
             f"them to {goal:.2f}, the date of the images",
             remedy="transform the points to ITRF2020 at that date by the country's own service, "
-            "and set lidar_epoch to it",
+            "and state that date as their epoch",
         )
     steps: list[Callable[[Floats, Floats, Floats], Place]] = []
     legs = []
@@ -379,7 +367,7 @@ def frame_change(
         legs.append(f"{_words(operation)}, at {goal if own is None else own:.3f}")
     years = 0.0 if own is None else goal - own
     if plate is not None and abs(years) * speed(*place, plate) > SETTLED_M:
-        steps.append(_motion(plate, years))
+        steps.append(partial(moved, plate=plate, years=years))
         legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
     notes = list(way.notes)
     if not target.by and plate is not None:

@@ -11,8 +11,7 @@ from pyproj import CRS
 from rasterio.windows import Window
 
 from ..errors import InputError
-from ..kernels import kernel
-from ..numerics.bilinear import between_four
+from ..numerics.bilinear import bilinear
 from ..numerics.degrees import metres_per_degree
 from ..products.raster_values import MOST_CELLS, Fills, Quantity, Values
 from ..products.ungeoreferenced import open_raster
@@ -24,58 +23,8 @@ UNDULATION = Quantity("undulation of a geoid", "geoid grid", -120.0, 120.0, REME
 TYPE = "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL"  # of PROJ's grids that are geoids (key TYPE)
 STEEPEST = 1e-3  # m per m of the geoid: deflections of the vertical are below 2 minutes of arc
 ROUGH = 0.01  # share of neighbouring nodes that are steeper: heights of ground
+SLACK = 1e-6  # of the step between nodes, against rounding at the outermost
 LEAST_SPREAD_M, WIDE_DEG = 3.0, 5.0  # undulations of any part of the Earth so wide differ by more
-
-
-@kernel
-def _undulations(
-    rows: np.ndarray,
-    grid: tuple[float, float, float, float],
-    first_row: int,
-    height: int,
-    around: int,
-    lon: np.ndarray,
-    lat: np.ndarray,
-    out: np.ndarray,
-    inside: np.ndarray,
-) -> None:
-    """Fill ``out`` [n] from a grid's rows [k, width], and ``inside`` [n]: whether a point is in it.
-
-    ``grid``: longitude of the first node and step, latitude likewise (southwards). ``first_row`` of
-    ``height`` is rows[0]; ``around``: columns once around the Earth, 0 if the grid covers less.
-    """
-    slack = 1e-6  # of a node's step, against rounding at the outermost nodes
-    width = rows.shape[1]
-    lon_first, step_lon, lat_first, step_lat = grid
-    turn = 360.0 / step_lon
-    for i in range(lon.size):
-        col = (lon[i] - lon_first) / step_lon + slack
-        col = col - np.floor(col / turn) * turn - slack
-        row = (lat_first - lat[i]) / step_lat
-        good = row > -slack and row < height - 1 + slack
-        good = good and (around > 0 or col < width - 1 + slack)
-        inside[i] = good
-        if not good:
-            out[i] = np.nan
-            continue
-        row = min(max(row, 0.0), height - 1.0)
-        top = min(int(row), max(height - 2, 0))
-        down = row - top
-        below = min(top + 1, height - 1)
-        if around > 0:
-            left = int(np.floor(col))
-            part = col - left
-            left %= around
-            right = (left + 1) % around
-        else:
-            col = min(max(col, 0.0), width - 1.0)
-            left = min(int(col), max(width - 2, 0))
-            part = col - left
-            right = min(left + 1, width - 1)
-        top, below = top - first_row, below - first_row
-        out[i] = between_four(
-            rows[top, left], rows[top, right], rows[below, left], rows[below, right], part, down
-        )
 
 
 @dataclass
@@ -148,7 +97,10 @@ class GeoidGrid:
         )
 
     def _window(self, first: int, last: int) -> np.ndarray:
-        """Rows first..last (inclusive) in metres, NaN where the grid has none."""
+        """Rows first..last (inclusive) in metres, NaN where the grid has none.
+
+        Of a grid around the Earth, the first column stands behind the last again.
+        """
         rows = self._rows
         if rows is None or first < self._first_row or last >= self._first_row + len(rows):
             if rows is not None:  # keep what is there: chunks of one file overlap
@@ -161,6 +113,8 @@ class GeoidGrid:
                 rows = self.unit_m * fills.add(*fills.values.raw(window=window))
             fills.refuse()
             self._refuse_other(rows, first)
+            if self.around:
+                rows = np.hstack([rows[:, : self.around], rows[:, :1]])
             self._first_row, self._rows = first, rows
         return rows
 
@@ -194,14 +148,13 @@ class GeoidGrid:
         """
         if lon.size == 0:
             return np.empty(0)
-        ends = (self.lat_first - np.array([lat.max(), lat.min()])) / self.step_lat
-        top, bottom = np.clip(np.floor(ends), 0, max(self.height - 2, 0)).astype(int)
-        rows = self._window(int(top), int(min(bottom + 1, self.height - 1)))
-        undulation, inside = np.empty(lon.size), np.empty(lon.size, np.bool_)
-        grid = (self.lon_first, self.step_lon, self.lat_first, self.step_lat)
-        _undulations(
-            rows, grid, self._first_row, self.height, self.around, lon, lat, undulation, inside
-        )
+        turn = 360.0 / self.step_lon
+        col = (lon - self.lon_first) / self.step_lon + SLACK
+        col = col - np.floor(col / turn) * turn - SLACK
+        row = (self.lat_first - lat) / self.step_lat
+        inside = (row > -SLACK) & (row < self.height - 1 + SLACK)
+        if not self.around:
+            inside &= col < self.width - 1 + SLACK
         if not inside.all():
             west, south = self.lon_first, self.lat_first - (self.height - 1) * self.step_lat
             east = west + (self.width - 1) * self.step_lon
@@ -211,6 +164,11 @@ class GeoidGrid:
                 f"{self.lat_first:.4f}), the first at {lon[~inside][0]:.5f}, {lat[~inside][0]:.5f}",
                 remedy="give a geoid grid that covers the LiDAR",
             )
+        row = np.clip(row, 0.0, self.height - 1.0)
+        top = int(min(row.min(), max(self.height - 2, 0)))
+        rows = self._window(top, min(int(row.max()) + 1, self.height - 1))
+        col = col % self.around if self.around else np.clip(col, 0.0, self.width - 1.0)
+        undulation = bilinear(rows, col, row - self._first_row)
         if not np.isfinite(undulation).all():
             bad = ~np.isfinite(undulation)
             raise InputError(

@@ -13,7 +13,7 @@ whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ from ..numerics.degrees import exact_metres_per_degree, turn
 from ..products.raster_values import HEIGHT, Fills, Quantity, Values
 from ..products.ungeoreferenced import open_raster
 from .declared_crs import LidarCRS, of_raster
+from .frames import Epochs
+from .geokeys import epoch_of
 from .to_wgs84 import ToWGS84, transformation
 
 log = logging.getLogger("stereotruth")
@@ -57,9 +59,11 @@ def refuse_grid(raster: Any, file: Path) -> None:
 
 
 def system_of(raster: Any, file: Path) -> LidarCRS | None:
-    """What the system and the band's unit of an open raster say; None if it has no system."""
-    unit = (raster.units[0] or "").strip()
-    return None if raster.crs is None else of_raster(raster.crs.to_wkt(), unit, file)
+    """What the system, the epoch and the band's unit of an open raster say; None without one."""
+    if raster.crs is None:
+        return None
+    system = of_raster(raster.crs.to_wkt(), (raster.units[0] or "").strip(), file)
+    return replace(system, epoch=epoch_of(raster))
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,15 @@ class HeightRaster:
         path: str | Path,
         geoid: str | Path | None = None,
         *,
+        epochs: Epochs | None = None,
         quantity: Quantity = HEIGHT,
         whole: bool = True,
     ) -> HeightRaster:
         """The raster of a file.
 
         ``geoid``: a grid of undulations, where the heights count from the geoid and not from the
-        WGS 84 ellipsoid. ``whole``: read once, for fill values that are not declared.
+        WGS 84 ellipsoid. ``epochs``: see :func:`.to_wgs84.transformation`. ``whole``: read once,
+        for fill values that are not declared.
 
         Raises InputError: no raster of one band, no place on a north-up grid, no coordinate system;
         values that are no heights; declared orthometric heights without a geoid.
@@ -106,7 +112,7 @@ class HeightRaster:
                     system = LidarCRS(system.horizontal, ellipsoidal=True)
                 values = Values(source, path, quantity, system.height_unit_m)
                 ends = np.array([transform * (0, shape[0]), transform * (shape[1], 0)])
-                to_wgs84 = transformation(system, path, ends, geoid=geoid)
+                to_wgs84 = transformation(system, path, ends, geoid=geoid, epochs=epochs)
                 if whole and quantity is HEIGHT:
                     values.refuse_fills()
         except RasterioError as error:
@@ -123,7 +129,7 @@ class HeightRaster:
         row, col = (n / 2 for n in self.shape)
         half = BASE / 2 * np.array([[-1, 1, 0, 0], [0, 0, -1, 1]])
         x, y = self.transform * (col + half[0], row + half[1])
-        lon, lat, _ = self.to_wgs84._exact(np.asarray(x), np.asarray(y), np.zeros(4))
+        lon, lat, _ = self.to_wgs84.exact(np.asarray(x), np.asarray(y), np.zeros(4))
         if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
             raise InputError(
                 f"its middle has no place on Earth in '{self.to_wgs84.system.name}'",
@@ -173,10 +179,6 @@ class HeightRaster:
         box = self.to_wgs84.ground_boxes(np.array([[west, south]]), np.array([[east, north]]))
         return tuple(map(float, box[0]))
 
-    def undulation(self, lon: Floats, lat: Floats) -> Floats | float:
-        """What an ellipsoidal height is above one of this raster, m."""
-        return self.to_wgs84.undulation(lon, lat)
-
     def window(self, rows: slice, cols: slice) -> Heights:
         """Heights in m of a window that may reach over the edges; NaN where there are none."""
         out = np.full((rows.stop - rows.start, cols.stop - cols.start), np.nan, np.float32)
@@ -224,7 +226,8 @@ class HeightRaster:
                 found[k] = unit * bilinear(values, j - 0.5 - left, i - 0.5 - top)
             fills.refuse()
         known = np.isfinite(found)
-        found[known] += self.undulation(np.asarray(lon)[known], np.asarray(lat)[known])
+        place = np.asarray(lon)[known], np.asarray(lat)[known]
+        found[known] += self.to_wgs84.height_shift_m(*place)
         return found
 
 

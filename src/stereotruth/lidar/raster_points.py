@@ -27,7 +27,6 @@ from ..products.file_parts import open_stream
 from ..products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
 from ..products.remote_files import url_of
 from ..products.ungeoreferenced import open_raster
-from .geokeys import epoch_of_tiff
 from .height_raster import refuse_grid, system_of
 
 FORMATS = ("GTiff",)
@@ -121,16 +120,16 @@ def _refuse_other(raster: rasterio.DatasetReader, file: Path) -> None:
 
 
 def _system(raster: rasterio.DatasetReader, file: Path) -> str:
-    """WKT of the file's system, with the unit of its band's heights where only this tells it."""
+    """WKT of the file's system, with the epoch, and the unit of its heights that its band tells."""
     if (system := system_of(raster, file)) is None:
         return ""
     wkt = pyproj.CRS.from_wkt(raster.crs.to_wkt()).to_wkt()
-    if system.has_vertical or system.vertical_unit_m is None:
-        return wkt
-    return (
-        f'COMPOUNDCRS["unknown",{wkt},VERTCRS["unknown",VDATUM["unknown"],CS[vertical,1],'
-        f'AXIS["up",up],LENGTHUNIT["{system.vertical_unit}",{system.vertical_unit_m!r}]]]'
-    )
+    if not system.has_vertical and system.vertical_unit_m is not None:
+        wkt = (
+            f'COMPOUNDCRS["unknown",{wkt},VERTCRS["unknown",VDATUM["unknown"],CS[vertical,1],'
+            f'AXIS["up",up],LENGTHUNIT["{system.vertical_unit}",{system.vertical_unit_m!r}]]]'
+        )
+    return wkt if system.epoch is None else f"COORDINATEMETADATA[{wkt},EPOCH[{system.epoch!r}]]"
 
 
 def _values(raster: rasterio.DatasetReader, file: Path) -> Values:
@@ -157,8 +156,6 @@ def raster_header(file: Path) -> laspy.LasHeader:
         header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
         header.point_count = rows * cols
         if wkt := _system(raster, file):
-            if url_of(file) is None and (epoch := epoch_of_tiff(file)) is not None:
-                wkt = f"COORDINATEMETADATA[{wkt},EPOCH[{epoch!r}]]"
             record = laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0")
             header.vlrs.append(record)
             header.global_encoding.wkt = True

@@ -31,7 +31,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import laspy
 import numpy as np
@@ -43,7 +43,7 @@ from pyproj.transformer import TransformerGroup
 
 from ..errors import InputError
 from ..numerics.degrees import continuous, turn
-from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, resolve
+from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .projection_polynomials import PatchedTransform
 
@@ -62,7 +62,9 @@ class ToWGS84:
     ``operation`` and ``accuracy_m`` (None: unknown) describe PROJ's datum transformation,
     ``heights`` what was done with the heights, ``notes`` are remarks for the user. ``area``: box of
     longitude and latitude that the operation was chosen for. ``frame``: record of the frame and the
-    epoch of the result and of the file, None if no epoch is wanted.
+    epoch of the result and of the file, None if no epoch is wanted. ``change``: from the file's
+    frame to ITRF2020, None where PROJ's way to WGS 84 is taken. ``exact``: lon, lat (degrees) and
+    height (m) of coordinates x, y and heights in m above the ellipsoid, without polynomials.
     """
 
     system: LidarCRS
@@ -72,6 +74,9 @@ class ToWGS84:
     notes: tuple[str, ...]
     area: tuple[float, float, float, float] | None
     frame: dict[str, object] | None
+    change: FrameChange | None = field(repr=False)
+    exact: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
+    _to_geodetic: pyproj.Transformer = field(repr=False)
     _transform: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]] = field(repr=False)
     _geoid: GeoidGrid | None = field(repr=False)
     _heights_follow_datum: bool = field(repr=False)
@@ -94,27 +99,22 @@ class ToWGS84:
             height[good] = base[good] + self._geoid(lon[good], lat[good])
         return lon, lat, height
 
-    @property
-    def _exact(self) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """PROJ's own, without polynomials."""
-        transform = self._transform
-        return transform.exact if isinstance(transform, PatchedTransform) else transform
-
     def inverse(self, lon: np.ndarray, lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none.
+        """Coordinates x, y of the file at places of the ellipsoid, degrees; inf where none."""
+        height = np.zeros(np.shape(lon))
+        if self.change is not None:
+            lon, lat, height = self.change.inverse(lon, lat, height)
+        return self._to_geodetic.transform(lon, lat, height, direction="INVERSE")[:2]
 
-        Of transformations without epochs.
+    def height_shift_m(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        """What an ellipsoidal height of the result is above the file's, m [n], at places [n].
+
+        The undulation of the geoid, and what the change of frame or datum lifts.
         """
-        return self._exact(lon, lat, np.zeros(np.shape(lon)), direction="INVERSE")[:2]
-
-    @property
-    def is_orthometric(self) -> bool:
-        """Whether heights of the file count from a geoid."""
-        return self._geoid is not None
-
-    def undulation(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray | float:
-        """What an ellipsoidal height is above one of the file, m; 0 without a geoid."""
-        return 0.0 if self._geoid is None else self._geoid(lon, lat)
+        shift = np.zeros(np.shape(lon))
+        if self._geoid is None or self._heights_follow_datum:
+            shift = self.exact(*self.inverse(lon, lat), shift)[2]
+        return shift if self._geoid is None else shift + self._geoid(lon, lat)
 
     def ground_boxes(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """West, south, east, north (degrees) [n, 4] around boxes of corners [n, 2 or more].
@@ -123,9 +123,10 @@ class ToWGS84:
         BOX_SLACK of it. NaN where PROJ cannot transform a box.
         """
         share = np.linspace(0.0, 1.0, BOX_SAMPLES)
-        ends = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
-        x, y = (np.ascontiguousarray(v).reshape(-1) for v in np.broadcast_arrays(*_crossed(*ends)))
-        lon, lat, _ = self._exact(x, y, np.zeros(x.size))
+        across, up = (low[:, k, None] + (high - low)[:, k, None] * share for k in (0, 1))
+        nodes = np.broadcast_arrays(across[:, :, None], up[:, None, :])
+        x, y = (np.ascontiguousarray(v).reshape(-1) for v in nodes)
+        lon, lat, _ = self.exact(x, y, np.zeros(x.size))
         lon = continuous(lon)
         places = np.stack([lon, lat], axis=-1).reshape(len(low), -1, 2)
         places[~np.isfinite(places)] = np.nan
@@ -146,11 +147,6 @@ class ToWGS84:
             "frame": self.frame,
             "geoid": None if self._geoid is None else self._geoid.path.name,
         }
-
-
-def _crossed(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places [n, k, 1] and [n, 1, k] of values [n, k] along both axes."""
-    return x[:, :, None], y[:, None, :]
 
 
 def _best_operation(
@@ -189,11 +185,6 @@ def _best_operation(
     return best, notes
 
 
-def _in_frame(horizontal: CRS, geographic: CRS) -> pyproj.Transformer:
-    """From a system to longitude, latitude and height on its own datum, exact and unambiguous."""
-    return pyproj.Transformer.from_crs(_source(horizontal).to_3d(), geographic, always_xy=True)
-
-
 def _change_of_frame(
     horizontal: CRS, stated: np.ndarray, epochs: Epochs | None
 ) -> FrameChange | None:
@@ -206,15 +197,11 @@ def _change_of_frame(
     geographic = _source(horizontal).geodetic_crs
     if epochs is None or geographic is None or not np.isfinite(stated[:, :2]).all():
         return None
-    area = area_of(horizontal, stated)
-    if area is not None:
+    if (area := area_of(horizontal, stated)) is not None:
         place = (area[0] + area[2]) / 2, (area[1] + area[3]) / 2
     else:
-        degrees = pyproj.Transformer.from_crs(
-            _source(horizontal), geographic.to_2d(), always_xy=True
-        )
-        place = degrees.transform(*stated[:, :2].mean(axis=0))
-        if not np.isfinite(place).all():
+        place = degrees_of(horizontal, *stated[:, :2].mean(axis=0))
+        if place is None or not np.isfinite(place).all():
             return None
     return frame_change(geographic, place, *epochs)
 
@@ -224,12 +211,10 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
 
     Whole ones, so that files of one scene have the same.
     """
-    geographic = _source(horizontal).geodetic_crs
-    if geographic is None:
+    corners = degrees_of(horizontal, extent[[0, 0, 1, 1], 0], extent[[0, 1, 0, 1], 1])
+    if corners is None:
         return None
-    x, y = extent[:, 0][[0, 0, 1, 1]], extent[:, 1][[0, 1, 0, 1]]
-    degrees = pyproj.Transformer.from_crs(_source(horizontal), geographic.to_2d(), always_xy=True)
-    lon, lat = degrees.transform(x, y)
+    lon, lat = corners
     if not (np.abs(lon).max() < 179 and np.abs(lat).max() < 89):  # no inf, no NaN either
         return None
     return (
@@ -240,41 +225,13 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
     )
 
 
-def _after(first: Callable[..., Any], change: FrameChange) -> Callable[..., Any]:
-    def transform(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
-        return change(*first(x, y, z))
-
-    return transform
-
-
-def _refuse_degrees_as_metres(system: LidarCRS, extent: np.ndarray, file: str | Path) -> None:
-    corners = np.abs(extent[:, :2]).max(axis=0)
-    if system.horizontal.is_projected and corners[0] <= 360 and corners[1] <= 90:
-        raise InputError(
-            f"coordinates up to ({corners[0]:g}, {corners[1]:g}) are no coordinates of "
-            f"'{system.name}'; they look like degrees",
-            file=file,
-            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
-            "(longitude/latitude is EPSG:4979)",
-        )
-
-
 def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
     """What to do about heights of a datum: the grid of the place that PROJ has of it."""
     from .geoid_candidates import grid_of  # for refusals alone
 
     text = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
-    geographic = _source(system.horizontal).geodetic_crs
-    if geographic is None:
-        return text
-    middle = extent[:, :2].mean(axis=0)
-    try:
-        degrees = pyproj.Transformer.from_crs(
-            _source(system.horizontal), geographic.to_2d(), always_xy=True
-        )
-    except ProjError:  # of a damaged system
-        return text
-    grid = grid_of(datum, *map(float, degrees.transform(*middle)))
+    place = degrees_of(system.horizontal, *extent[:, :2].mean(axis=0))
+    grid = None if place is None else grid_of(datum, *map(float, place))
     if grid is None:
         return text
     if grid.path is not None:
@@ -299,7 +256,15 @@ def to_wgs84(
     """
     system, notes = resolve(header, lidar_crs or None, file)
     stated = np.array([header.mins, header.maxs], np.float64)
-    _refuse_degrees_as_metres(system, stated, file)
+    x, y = np.abs(stated[:, :2]).max(axis=0)
+    if system.horizontal.is_projected and x <= 360 and y <= 90:
+        raise InputError(
+            f"coordinates up to ({x:g}, {y:g}) are no coordinates of '{system.name}'; they look "
+            "like degrees",
+            file=file,
+            remedy="correct the system that is given (lidar_crs, --crs) or that the file declares "
+            "(longitude/latitude is EPSG:4979)",
+        )
     extent = stated if extent is None else extent
     return transformation(system, file, extent, geoid=geoid, epochs=epochs, notes=notes)
 
@@ -337,7 +302,6 @@ def transformation(
     *,
     geoid: str | Path | None = None,
     epochs: Epochs | None = None,
-    keep_frame: bool = False,
     notes: Sequence[str] = (),
 ) -> ToWGS84:
     """The transformation of coordinates of a system, as LiDAR, rasters and control points need it.
@@ -345,8 +309,7 @@ def transformation(
     ``extent``: lowest and highest coordinates [2, 2 or more]; ``geoid``: path of a grid for
     orthometric heights; ``epochs``: that of the images, at which coordinates are brought to
     ITRF2020, and that of the coordinates for files that state none; None: frames are what PROJ
-    takes them for, most of them WGS 84; ``keep_frame``: the result is in the system's own frame;
-    ``notes``: remarks that go before others.
+    takes them for, most of them WGS 84; ``notes``: remarks that go before others.
 
     Raises InputError: a system that PROJ cannot transform, orthometric heights without a geoid, a
     dynamic frame without an epoch.
@@ -361,13 +324,11 @@ def transformation(
     try:
         area = area_of(system.horizontal, extent)
         change = _change_of_frame(system.horizontal, extent, epochs)
-        if keep_frame:
-            geographic = _source(system.horizontal).geodetic_crs.to_3d()
-            transformer, remarks = _in_frame(system.horizontal, geographic), []
-        elif change is None:
+        if change is None:
             transformer, remarks = _best_operation(system.horizontal, area)
         else:
-            transformer = _in_frame(system.horizontal, change.geographic)
+            source = _source(system.horizontal).to_3d()
+            transformer = pyproj.Transformer.from_crs(source, change.geographic, always_xy=True)
             remarks = list(change.notes)
     except InputError as error:
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
@@ -378,17 +339,19 @@ def transformation(
             remedy="name a system that PROJ can transform (lidar_crs, --crs), or transform the "
             "file",
         ) from error
-    transform, operation = transformer.transform, transformer.description
-    accuracy = frame = None
+
+    def exact(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        place = transformer.transform(x, y, z)
+        return place if change is None else change(*place)
+
+    operation, accuracy, frame = transformer.description, None, None
     if transformer.accuracy >= 0:
         accuracy = float(transformer.accuracy)
     if epochs is not None and change is None:
         frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
     if change is not None:
-        transform = _after(transform, change)
         operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
-    if system.horizontal.is_projected:
-        transform = PatchedTransform(transform, system.horizontal_unit_m)
+    is_map = system.horizontal.is_projected
     grid = None
     if geoid:
         from .geoid import GeoidGrid  # GDAL, which few scenes need
@@ -408,11 +371,14 @@ def transformation(
         notes=tuple(notes + remarks),
         area=area,
         frame=frame,
-        _transform=transform,
+        change=change,
+        exact=exact,
+        _to_geodetic=transformer,
+        _transform=PatchedTransform(exact, system.horizontal_unit_m) if is_map else exact,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.
-        _heights_follow_datum=modern and not keep_frame and not (grid and grid.above_wgs84),
+        _heights_follow_datum=modern and not (grid and grid.above_wgs84),
     )
 
 

@@ -6,7 +6,6 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -125,6 +124,8 @@ def spread(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[n
     root mean square over windows of ``WINDOW_PX`` around each pixel, where both are finite. NaN
     where the first is, or no pixel of the window has both.
     """
+    import cv2  # slow to import, and most matchers have no spread
+
     both = np.isfinite(first) & np.isfinite(second)
     square = np.where(both, first - second, np.float32(0)).astype(np.float32) ** 2
     size = (WINDOW_PX, WINDOW_PX)

@@ -13,8 +13,7 @@ from .built_city import surfaces_of
 from .camera import Pass, aim, drift_of_attitude, jittering
 from .control_points import GCP_COUNT, GCP_NOISE_PX, marks, spread_out, visible_in
 from .dated_worlds import world_of
-from .layout import frame_of
-from .lidar import coverage
+from .layout import coverage, frame_of
 from .render import (
     LEFT_COLLAR,
     SHOWN,

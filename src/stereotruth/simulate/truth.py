@@ -17,7 +17,7 @@ from .camera import direction, pose, project_point
 from .cities import CitySpec, SceneSpec
 from .dated_worlds import world_of
 from .geodesy import LocalFrame, world_to_geodetic_point
-from .lidar import coverage, covered
+from .layout import coverage, covered
 from .render import Camera, in_collar, prepare
 from .surfaces import GROUND, IN_LIDAR, NONE, WATER, Surfaces, cast, stands_in, terrain_at
 
@@ -182,7 +182,7 @@ def truth_between(
     """The layers of LAYERS at positions (col, row) of the first of two images of one city.
 
     What is called right is the second image. ``scanned``: the LiDAR's world. ``cover``: of
-    :func:`.lidar.coverage`.
+    :func:`.layout.coverage`.
     """
     first, second = cameras
     size = np.array([first.cols, first.rows, second.cols, second.rows], dtype=np.float64)

@@ -86,7 +86,7 @@ def test_a_small_file_of_many_pixels_is_sized_and_not_read(folder, side, level, 
 
 def test_files_without_permission_are_findings(folder, monkeypatch):
     """Tests may run as a user who may do everything, so the system's answers are made up."""
-    usual = Path.iterdir, Path.read_text
+    usual = Path.iterdir, Path.read_bytes
 
     def iterdir(path):
         if path.name == "lidar":
@@ -97,13 +97,13 @@ def test_files_without_permission_are_findings(folder, monkeypatch):
     assert any("lidar: no permission" in text for text in texts(Level.ERROR))
     monkeypatch.undo()
 
-    def read_text(path, *arguments, **more):
+    def read_bytes(path, *arguments, **more):
         if path.name == "scenes.tsv":
             raise PermissionError(13, "Permission denied", str(path))
         return usual[1](path, *arguments, **more)
 
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(Path, "read_text", read_text)
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
     assert any("scenes.tsv: no permission" in text for text in texts(Level.ERROR))
 
 

@@ -65,6 +65,19 @@ def qgis(path, rows, view, *, utm=True, ids=False, crs=True):
     return path
 
 
+def test_points_of_qgis_in_a_dynamic_frame_need_an_epoch(rows, tmp_path):
+    files = [qgis(tmp_path / f"{v}.points", rows, v, utm=False) for v in ("left", "right")]
+    for file in files:
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join(["# EPSG: 9000", *lines[1:]]))  # ITRF2014
+    given = {"heights": heights(tmp_path / "h.csv", rows, ("lon", "lat", "height"))}
+    with pytest.raises(InputError, match="nothing states their epoch"):
+        import_gcps(files, tmp_path / "out.csv", **given)
+    import_gcps(files, tmp_path / "out.csv", epoch="2010.5", **given)
+    assert (tmp_path / "out.csv").read_text().startswith("# frame: EPSG:9000\n# epoch: 2010.5\n")
+    assert len(read_gcps(tmp_path / "out.csv").ids) == 6
+
+
 def heights(path, rows, columns=("id", "height")):
     with path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, columns, extrasaction="ignore")
@@ -138,19 +151,18 @@ def test_tables_with_other_names(rows, truth, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [(lambda t: t.replace("#CRS", "#"), "are no degrees"),
-     (lambda t: t.replace("mapX", "map"), "column 'mapx' is missing"),
-     (lambda t: t.replace(",-", ","), "above the image's first row"),
-     (lambda t: "", "no points"),
-     (lambda t: t.replace("3341", "33x41").replace("3342", "33x42"), "is no number")],
+    "change",
+    [lambda t: t.replace("#CRS", "#"), lambda t: t.replace("mapX", "map"),
+     lambda t: t.replace(",-", ","), lambda t: "", lambda t: t.replace(",1,0,0,0", ",1,0,0,0,0"),
+     lambda t: t.replace("3341", "33x41").replace("3342", "33x42")],
+    ids=["no system", "no column", "rows upward", "empty", "a cell too many", "no number"],
 )  # fmt: skip
-def test_what_cannot_be_read_is_named(rows, tmp_path, change, words):
+def test_what_cannot_be_read_is_named(rows, tmp_path, change):
     files = [qgis(tmp_path / f"{v}.points", rows, v) for v in ("left", "right")]
     files[0].write_text(change(files[0].read_text()))
-    with pytest.raises(InputError, match=words) as error:
+    with pytest.raises(InputError) as error:
         import_gcps(files, tmp_path / "out.csv", heights=heights(tmp_path / "h.csv", rows))
-    assert "left.points" in str(error.value)
+    assert "left.points" in str(error.value) and error.value.remedy
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -176,5 +188,45 @@ def test_points_keep_a_frame_that_is_known(tmp_path):
     assert lines[:2] == ["# frame: EPSG:6318", "# epoch: 2010.0"]
     found = read_gcps(tmp_path / "out.csv")
     assert found.height[0] - 20 == pytest.approx(-0.32, abs=0.01)
+    text = (tmp_path / "a.csv").read_text().replace("5272000,20", "5272000,")
+    (tmp_path / "b.csv").write_text(text)
+    place = lines[3].split(",")
+    (tmp_path / "h.csv").write_text(f"lon;lat;height\n{place[1]};{place[2]};20,0\n")
+    import_gcps([tmp_path / "b.csv"], tmp_path / "out_b.csv", crs="EPSG:6339",
+                heights=tmp_path / "h.csv")  # fmt: skip
+    assert read_gcps(tmp_path / "out_b.csv").height[0] == found.height[0]
     import_gcps([tmp_path / "a.csv"], tmp_path / "wgs.csv", crs="EPSG:32610")
     assert not (tmp_path / "wgs.csv").read_text().startswith("#")
+
+
+SEATTLE = (-122.3, 47.6)
+HEAD = "id,lon,lat,height,left_col,left_row,right_col,right_row\n"
+
+
+@pytest.mark.parametrize("crs", ["EPSG:6318+5773", "EPSG:4326+5773"])
+def test_heights_above_egm_are_in_itrf_whatever_the_frame_of_the_places(tmp_path, crs):
+    """EGM counts from WGS 84, not from NAD83(2011), which lies 0.32 m below it there."""
+    geoid = write_gtx(tmp_path / "egm96.gtx", np.full((9, 9), -22.0), -124.0, 46.0, 0.5)
+    (tmp_path / "a.csv").write_text(f"{HEAD}A,{SEATTLE[0]},{SEATTLE[1]},120,1,2,3,4\n")
+    import_gcps([tmp_path / "a.csv"], tmp_path / "out.csv", crs=crs, geoid=geoid)
+    assert read_gcps(tmp_path / "out.csv").height[0] == pytest.approx(98.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("points", ["EPSG:6318", "EPSG:4326"])
+@pytest.mark.parametrize("raster", ["EPSG:6318", "EPSG:4326"])
+def test_heights_of_a_raster_are_brought_to_the_frame_of_the_points(tmp_path, points, raster):
+    """Points of either frame, of a raster of either: the height that holds in ITRF2020."""
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=50, height=50, count=1, dtype="float64",
+        crs=pyproj.CRS(raster).to_3d().to_wkt(), transform=from_origin(-122.31, 47.61, 4e-4, 4e-4),
+    ) as grid:  # fmt: skip
+        grid.write(100.0 + np.mgrid[:50, :50][0], 1)
+    (tmp_path / "a.csv").write_text(f"{HEAD}A,{SEATTLE[0]},{SEATTLE[1]},,1,2,3,4\n")
+    import_gcps(
+        [tmp_path / "a.csv"], tmp_path / "out.csv", crs=points, heights=tmp_path / "dem.tif"
+    )
+    found = read_gcps(tmp_path / "out.csv")
+    north_m = {"EPSG:6318": 0.322, "EPSG:4326": 0.0}  # that places move by to ITRF2020
+    row = (47.61 - 47.6) / 4e-4 - 0.5 + (north_m[raster] - north_m[points]) / 44.5
+    lifted = -0.317 if raster == "EPSG:6318" else 0.0
+    assert found.height[0] == pytest.approx(100.0 + row + lifted, abs=2e-3)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import CHANGED, probability_of_change
+from stereotruth.disparity.change_probability import CHANGED, change_probability
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.learned_evidence import (
-    UNKNOWN,
-    as_learned,
+    ASKED,
+    beyond_counts,
     beyond_learned,
     learned,
 )
@@ -39,7 +39,8 @@ INNER = np.s_[20:-20, 20:-20]
 def probability(
     window: PairWindow, noise: tuple[float, float] = NOISE, diachronic: bool = True
 ) -> np.ndarray:
-    return probability_of_change(LabelledWindow(window, LEVEL, ALL, GROUND, noise), diachronic)
+    of = LabelledWindow(window, LEVEL, ALL, GROUND, noise)
+    return change_probability(of, diachronic).probability
 
 
 LIGHTS = pytest.mark.parametrize("diachronic", [False, True])
@@ -89,7 +90,7 @@ def test_no_window_changes_it(diachronic: bool) -> None:
     of = LabelledWindow(
         window, labels, np.ones(shape, np.bool_), np.full(shape, 2, np.uint8), NOISE
     )
-    part = probability_of_change(of, diachronic)
+    part = change_probability(of, diachronic).probability
     inner = np.s_[30:-30, 30:-30]
     assert np.array_equal(whole[11:-7, 13:-9][inner], part[inner])
 
@@ -105,12 +106,12 @@ def test_what_is_left_to_doubt_goes_into_the_variance() -> None:
 
 
 @LIGHTS
-def test_what_was_never_learned_is_asked_less(diachronic: bool) -> None:
-    """A figure beyond what trees were fitted to brings a probability nearer to the usual one."""
+def test_what_was_never_learned_is_counted_by_figure(diachronic: bool) -> None:
     low, high = learned(diachronic).astype(np.float32)
     middle = (low + high) / 2
     figures = np.stack([middle, high + 1, np.where(np.arange(low.size) == 3, low - 1, middle)])
-    assert beyond_learned(figures.T, diachronic).tolist() == [0, low.size, 1]
-    found = as_learned(np.full(3, 0.98), np.arange(3))
-    assert found[0] == pytest.approx(0.98) and UNKNOWN < found[2] == found[1] < 0.95
-    assert as_learned(np.array([UNKNOWN]), np.array([5])) == pytest.approx(UNKNOWN)
+    figures[0, 0] = np.nan  # nothing was told
+    beyond = beyond_learned(figures.T, diachronic)
+    assert (beyond & ASKED == ASKED).all()
+    assert beyond_counts(beyond).tolist() == [3, 1, 1, 1, 2, *[1] * (low.size - 4)]
+    assert beyond_counts(np.append(beyond, np.uint32(0)))[0] == 3  # agrees closely

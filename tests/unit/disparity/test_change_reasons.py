@@ -58,7 +58,7 @@ def lidar(
     labels = Labels(disparity, level, zeros)
     count = np.ones(SHAPE, np.int64)
     nothing = np.zeros(SHAPE, np.uint8)
-    found = WindowLabels(status, labels, height, classes, zeros, count, zeros, nothing)
+    found = WindowLabels(status, labels, height, classes, zeros, count, zeros, nothing, nothing)
     return found, OwnPoints(count, height, classes)
 
 

@@ -122,20 +122,16 @@ def contradicted_by(
     ).changed
 
 
-@pytest.mark.parametrize(
-    ("noise", "diachronic", "share"), [(4.0, False, 0.98), (20.0, False, 0.98), (20.0, True, 0.75)]
-)
-def test_a_change_is_found_up_to_its_rim_and_nothing_else(
-    noise: float, diachronic: bool, share: float
-) -> None:
-    """A field in which the left image shows something else, and single pixels that noise spoils.
-    Of two days it may be a new texture as well."""
+@pytest.mark.parametrize("diachronic", [False, True])
+@pytest.mark.parametrize("noise", [4.0, 20.0])
+def test_a_change_is_found_up_to_its_rim_and_nothing_else(noise: float, diachronic: bool) -> None:
+    """A field in which the left image shows something else, and single pixels that noise spoils."""
     ground = fields.through_optics(0)
     right = fields.right_of(ground, np.full(ground.shape, 4))
     ground[fields.ROWS, fields.COLS][fields.FIELD] = fields.through_optics(5)[:40, :50]
     images = (fields.with_noise(image, noise, seed) for seed, image in enumerate((ground, right)))
     found = contradicted_by(*images, noise=noise, diachronic=diachronic)
-    assert found[42:78, 52:98].mean() > share  # 2 px inside
+    assert found[42:78, 52:98].mean() > 0.99  # 2 px inside
     found[37:83, 47:103] = False
     assert not found.any()
 
@@ -149,7 +145,7 @@ def test_what_is_small_is_found(size: int) -> None:
     ground[fields.ROWS, fields.COLS][hut] = 1.5 * fields.through_optics(5)[:size, :size]
     images = (fields.with_noise(image, 4.0, seed) for seed, image in enumerate((ground, right)))
     found = contradicted_by(*images, noise=4.0)
-    assert found[52 : 48 + size, 62 : 58 + size].mean() > 0.7
+    assert found[52 : 48 + size, 62 : 58 + size].all()
     found[47 : 53 + size, 57 : 63 + size] = False
     assert not found.any()
 
@@ -160,7 +156,7 @@ def test_noise_is_no_change(contrast: float) -> None:
     ground = fields.through_optics(6, contrast, 1.5)
     right = fields.right_of(ground, np.full(ground.shape, 4))
     images = (fields.with_noise(image, 10.0, seed) for seed, image in enumerate((ground, right)))
-    assert contradicted_by(*images, noise=10.0)[10:-10, 10:-10].mean() < 0.03
+    assert contradicted_by(*images, noise=10.0)[10:-10, 10:-10].mean() < 0.01
 
 
 def test_change_shows_through_noise() -> None:

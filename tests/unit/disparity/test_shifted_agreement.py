@@ -142,8 +142,7 @@ def test_single_pixels_at_the_borders_of_a_wide_window():
 
 @pytest.mark.parametrize("diachronic", [False, True])
 def test_beside_a_young_crown_labels_are_confirmed(diachronic: bool) -> None:
-    """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings.
-    Under two suns half of it may be a shadow that has moved."""
+    """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings."""
     grown, still, tree = np.s_[56:65, 66:75], np.s_[30:33, 20:23], 5
     classes, disparity = GROUND.copy(), np.full((160, 260), 4)
     classes[59:62, 69:72] = classes[still] = tree
@@ -152,7 +151,7 @@ def test_beside_a_young_crown_labels_are_confirmed(diachronic: bool) -> None:
     window = pair(left, right_of(left, disparity))
     comparison = Comparison(9, NOISE, diachronic)
     changed = contradicted(LEVEL, window, comparison, ALL, classes).changed
-    assert changed[grown].mean() > (0.35 if diachronic else 0.9)
+    assert changed[grown].mean() > 0.9
     assert not changed[25:38, 15:28].any()
 
 
@@ -170,7 +169,7 @@ def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
         )
     )
     inner = np.s_[20:-20, 20:-20]
-    assert (sure[inner] < 0.002).all() and unsure[inner].min() > sure[inner].max()
+    assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
     same = Comparison(9, NOISE)
     assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-import struct
 
+import geopandas
 import numpy as np
 import pyproj
 import pytest
+import shapely
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.catalogue import read_catalogue, resolved
-from stereotruth.lidar.catalogue_ground import cover_of
+from stereotruth.lidar.catalogue import Tile, cover_of, read_catalogue, resolved
 from stereotruth.lidar.catalogue_list import (
     ListedTile,
     TileList,
@@ -24,7 +23,6 @@ from stereotruth.lidar.catalogue_list import (
     unlisted_m2,
     write_list,
 )
-from stereotruth.lidar.catalogue_tiles import Tile
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.products import remote_files
 from stereotruth.products.remote_files import hosts_of, url_of
@@ -85,7 +83,7 @@ def test_stac_items_have_location_outline_dates_and_points(tmp_path):
     assert [tile.href for tile in tiles] == ["./tile_0.copc.laz", "./tile_1.copc.laz"]
     assert [tile.points for tile in tiles] == [1000, 1001]
     assert tiles[0].start == tiles[0].end == "2021-05-02"  # of UTC
-    assert np.allclose(tiles[1].box, [WEST + SIDE, SOUTH, WEST + 2 * SIDE, SOUTH + SIDE])
+    assert np.allclose(tiles[1].outline.bounds, [WEST + SIDE, SOUTH, WEST + 2 * SIDE, SOUTH + SIDE])
 
 
 def test_one_item_is_a_catalogue_and_the_day_of_a_vpc_is_that_of_writing(tmp_path):
@@ -103,27 +101,22 @@ def test_the_tiles_own_coordinates_come_before_degrees(tmp_path):
     tile = read_catalogue(written(tmp_path, collection([item(0, **properties)]))).tiles[0]
     x, y = np.meshgrid(np.linspace(900_000, 901_000, 9), np.linspace(6_200_000, 6_201_000, 9))
     lon, lat = change.transform(x, y)
-    assert np.allclose(tile.box, [lon.min(), lat.min(), lon.max(), lat.max()], atol=1e-7)
+    assert np.allclose(tile.outline.bounds, [lon.min(), lat.min(), lon.max(), lat.max()], atol=1e-7)
     assert pyproj.CRS(tile.crs).to_epsg() == 2154
 
 
-@pytest.mark.parametrize("roles", [True, 7, 1.5, "overview", {"overview": 1}, None])
-def test_roles_that_are_none_hide_no_tile(tmp_path, roles):
-    one = item(0)
+@pytest.mark.parametrize("value", [True, -5, 1.5, "overview", {"overview": 1}, None, 10**30])
+def test_roles_and_counts_that_are_none_are_passed_over(tmp_path, value):
+    one = item(0, **{"pc:count": value})
     del one["assets"]["overview"]
-    one["assets"]["data"]["roles"] = roles
-    assert len(read_catalogue(written(tmp_path, collection([one]))).tiles) == 1
-
-
-@pytest.mark.parametrize("count", [True, -5, 1.5, "9", None, 10**30])
-def test_a_count_of_points_that_is_none_is_not_known(tmp_path, count):
-    one = item(0, **{"pc:count": count})
-    assert read_catalogue(written(tmp_path, collection([one]))).tiles[0].points is None
+    one["assets"]["data"]["roles"] = value
+    (tile,) = read_catalogue(written(tmp_path, collection([one]))).tiles
+    assert tile.points is None
 
 
 @pytest.mark.parametrize("href", ["a\nb.laz", "a\x1b[31m.laz", "a;b.laz", "https://x/a\u2028.laz"])
 def test_names_that_no_sheet_can_have_are_refused(href):
-    for catalogue in ("lidar/tiles.vpc", WEB):
+    for catalogue in (DISK, WEB):
         with pytest.raises(InputError, match="no sheet can have") as refused:
             resolved(href, catalogue, frozenset({"x"}))
         assert href not in str(refused.value)
@@ -133,7 +126,6 @@ def test_a_box_across_the_antimeridian_covers_nothing_but_itself(tmp_path):
     """Its west is east of its east (RFC 7946, section 5.2)."""
     one = item(0) | {"geometry": None, "bbox": [179.99, -17.0, -179.99, -16.9]}
     tile = read_catalogue(written(tmp_path, collection([one]))).tiles[0]
-    assert len(tile.rings) == 2
     far, near = around(5.0, -16.96, 5.01, -16.95), around(179.992, -16.96, 179.993, -16.95)
     assert cover_of([tile], far).hole_m2 == pytest.approx(far.area_m2)
     assert cover_of([tile], near).taken == (0,) and cover_of([tile], near).hole_m2 == 0
@@ -158,53 +150,33 @@ def test_an_index_in_another_system_is_brought_to_degrees(tmp_path):
     ring = [list(change.transform(*corner)) for corner in square(0)]
     made["features"][0]["geometry"]["coordinates"] = [ring]
     tile = read_catalogue(written(tmp_path, made)).tiles[0]
-    assert np.allclose(tile.box, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
+    assert np.allclose(tile.outline.bounds, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
 
 
-def geopackage(file, rings, srs=4326, hrefs=None):
-    """A GeoPackage of one layer of polygons, by hand."""
-    base = sqlite3.connect(file)
-    base.executescript(
-        "CREATE TABLE gpkg_geometry_columns (table_name, column_name, kind, srs_id, z, m);"
-        "CREATE TABLE gpkg_spatial_ref_sys (srs_name, srs_id, organization, "
-        "organization_coordsys_id, definition);"
-        'CREATE TABLE "my ""tiles" (fid INTEGER PRIMARY KEY, geom BLOB, name TEXT, location TEXT);'
-    )
-    base.execute(
-        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'POLYGON', ?, 0, 0)",
-        ('my "tiles', srs),
-    )
-    base.execute("INSERT INTO gpkg_spatial_ref_sys VALUES ('x', ?, 'EPSG', ?, '')", (srs, srs))
-    for k, ring in enumerate(rings):
-        flat = np.array(ring, "<f8")
-        wkb = struct.pack("<BIII", 1, 3, 1, len(flat)) + flat.tobytes()
-        if k % 2:  # as several polygons, and with an envelope
-            box = [*flat.min(axis=0), *flat.max(axis=0)]
-            envelope = struct.pack("<4d", box[0], box[2], box[1], box[3])
-            head = b"GP\0\3" + struct.pack("<i", srs) + envelope
-            blob = head + struct.pack("<BII", 1, 6, 1) + wkb
-        else:
-            blob = b"GP\0\1" + struct.pack("<i", srs) + wkb
-        href = hrefs[k] if hrefs else f"t{k}.laz"
-        base.execute('INSERT INTO "my ""tiles" VALUES (NULL, ?, ?, ?)', (blob, f"T{k}", href))
-    base.commit()
-    base.close()
+def geopackage(file, rings, srs=4326, layer="my tiles"):
+    """A GeoPackage of one layer: polygons, and several polygons in one."""
+    outlines = [shapely.Polygon(ring) for ring in rings]
+    outlines = [shapely.multipolygons([one]) if k % 2 else one for k, one in enumerate(outlines)]
+    columns = {"name": [f"T{k}" for k in range(len(rings))],
+               "location": [f"t{k}.laz" for k in range(len(rings))]}  # fmt: skip
+    table = geopandas.GeoDataFrame(columns, geometry=outlines, crs=srs)
+    table.to_file(file, layer=layer, driver="GPKG")
     return str(file)
 
 
-def test_a_geopackage_is_read(tmp_path):
-    file = geopackage(tmp_path / "a.gpkg", [square(0), square(1)])
-    tiles = read_catalogue(file).tiles
+@pytest.mark.parametrize("srs", [4326, 2154])
+def test_a_geopackage_is_read(tmp_path, srs):
+    change = pyproj.Transformer.from_crs(4326, srs, always_xy=True)
+    rings = [[change.transform(*corner) for corner in square(k)] for k in range(2)]
+    tiles = read_catalogue(geopackage(tmp_path / "a.gpkg", rings, srs)).tiles
     assert [tile.href for tile in tiles] == ["t0.laz", "t1.laz"]
     for k, tile in enumerate(tiles):
-        assert np.allclose(tile.box[0], WEST + k * SIDE)
+        box = [WEST + k * SIDE, SOUTH, WEST + (k + 1) * SIDE, SOUTH + SIDE]
+        assert np.allclose(tile.outline.bounds, box, atol=2e-6)
 
 
-def test_a_geopackage_in_metres_is_brought_to_degrees(tmp_path):
-    change = pyproj.Transformer.from_crs(4326, 2154, always_xy=True)
-    ring = [change.transform(*corner) for corner in square(0)]
-    tile = read_catalogue(geopackage(tmp_path / "a.gpkg", [ring], 2154)).tiles[0]
-    assert np.allclose(tile.box, [WEST, SOUTH, WEST + SIDE, SOUTH + SIDE], atol=2e-6)
+def polygon(ring):
+    return {"geometry": {"type": "Polygon", "coordinates": [ring]}}
 
 
 DAMAGED = {
@@ -213,39 +185,36 @@ DAMAGED = {
     "no text": b"\xff\xfe\0",
     "deep": b"[" * 100_000,
     "a list": b"[]",
-    "a collection": b'{"type": "Collection", "links": []}',
-    "no feature": b'{"type": "FeatureCollection", "features": [7]}',
-    "no features": b'{"type": "FeatureCollection", "features": []}',
-    "features of another kind": b'{"type": "FeatureCollection", "features": {"a": 1}}',
     "SQLite cut": b"SQLite format 3\0" + bytes(80),
-    "another page": json.dumps(
-        collection([item(0)]) | {"links": [{"rel": "next", "href": "x"}]}
-    ).encode(),
-    "more matched": json.dumps(collection([item(0)]) | {"numberMatched": 12}).encode(),
-    "no outline": json.dumps(collection([item(0) | {"geometry": None}])).encode(),
-    "off the Earth": json.dumps(
-        collection([item(0) | {"geometry": {"type": "Polygon", "coordinates": [[[900, 9]] * 4]}}])
-    ).encode(),
-    "no data": json.dumps(collection([item(0) | {"assets": {}}])).encode(),
-    "assets of another kind": json.dumps(collection([item(0) | {"assets": [1]}])).encode(),
-    "properties of another kind": json.dumps(
-        collection([item(0) | {"properties": 3, "assets": {"d": {"href": "a.zip"}}}])
-    ).encode(),
-    "beyond all numbers": json.dumps(
-        collection(
-            [item(0) | {"geometry": {"type": "Polygon", "coordinates": [[[10**400, 1]] * 4]}}]
-        )
-    ).encode(),
-    "a box beyond all numbers": json.dumps(
-        collection([item(0) | {"geometry": None, "bbox": [10**400, 1, 2, 3]}])
-    ).encode(),
-    "two files": json.dumps(
-        collection([item(0) | {"assets": {"a": {"href": "a.laz"}, "b": {"href": "b.laz"}}}])
-    ).encode(),
-    "not a number": json.dumps(
-        collection([item(0) | {"geometry": {"type": "Polygon", "coordinates": [[["a", 1]] * 4]}}])
-    ).encode(),
+    "a collection": {"type": "Collection", "links": []},
+    "no feature": collection([7]),
+    "no features": collection([]),
+    "features of another kind": collection({"a": 1}),
+    "another page": collection([item(0)]) | {"links": [{"rel": "next", "href": "x"}]},
+    "more matched": collection([item(0)]) | {"numberMatched": 12},
+    "no outline": {"geometry": None},
+    "off the Earth": polygon([[900, 9]] * 4),
+    "beyond all numbers": polygon([[10**400, 1]] * 4),
+    "not a number": polygon([["a", 1]] * 4),
+    "a box beyond all numbers": {"geometry": None, "bbox": [10**400, 1, 2, 3]},
+    "a box of three": {"geometry": None, "bbox": [1, 2, 3]},
+    "no data": {"assets": {}},
+    "assets of another kind": {"assets": [1]},
+    "properties of another kind": {"properties": 3, "assets": {"d": {"href": "a.zip"}}},
+    "two files": {"assets": {"a": {"href": "a.laz"}, "b": {"href": "b.laz"}}},
 }
+
+
+@pytest.mark.parametrize("fault", DAMAGED)
+def test_a_damaged_catalogue_is_refused(tmp_path, fault):
+    content, file = DAMAGED[fault], tmp_path / "tiles.json"
+    if isinstance(content, dict):  # of a file, or of an item
+        whole = content if "type" in content else collection([item(0) | content])
+        content = json.dumps(whole).encode()
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"tiles\.json") as error:
+        read_catalogue(str(file))
+    assert error.value.remedy
 
 
 @pytest.mark.parametrize("far", [float("inf"), float("nan"), 1e308])
@@ -253,15 +222,7 @@ DAMAGED = {
 def test_own_coordinates_without_end_leave_those_in_degrees(tmp_path, far):
     one = item(0, **{"proj:code": "EPSG:2154", "proj:bbox": [-far, -far, far, far]})
     (tile,) = read_catalogue(written(tmp_path, collection([one]))).tiles
-    assert tile.box == (WEST, SOUTH, WEST + SIDE, SOUTH + SIDE)
-
-
-@pytest.mark.parametrize("fault", DAMAGED)
-def test_a_damaged_catalogue_is_refused(tmp_path, fault):
-    file = tmp_path / "tiles.json"
-    file.write_bytes(DAMAGED[fault])
-    with pytest.raises(InputError, match=r"tiles\.json"):
-        read_catalogue(str(file))
+    assert tile.outline.bounds == (WEST, SOUTH, WEST + SIDE, SOUTH + SIDE)
 
 
 def test_damaged_geopackages_are_refused_or_read_right(tmp_path):
@@ -293,67 +254,45 @@ def test_a_catalogue_that_is_too_large_is_not_read(tmp_path, monkeypatch):
         read_catalogue(file)
 
 
-WEB = "https://data.example.org/lidar/index.json"
+WEB, DISK = "https://data.example.org/lidar/index.json", "lidar/tiles.vpc"
+HOSTS = frozenset({"tiles.example.org"})  # that the user allows
+B = "https://tiles.example.org/b.laz"
 
 
 @pytest.mark.parametrize(
-    ("href", "where"),
+    ("catalogue", "href", "hosts", "where"),
     [
-        ("a.laz", "https://data.example.org/lidar/a.laz"),
-        ("../other/a.laz", "https://data.example.org/other/a.laz"),
-        ("/a.laz", "https://data.example.org/a.laz"),
-        ("https://data.example.org/b.laz", "https://data.example.org/b.laz"),
-        ("https://tiles.example.org/b.laz", "https://tiles.example.org/b.laz"),
+        (WEB, "a.laz", HOSTS, "https://data.example.org/lidar/a.laz"),
+        (WEB, "../other/a.laz", HOSTS, "https://data.example.org/other/a.laz"),
+        (WEB, "/a.laz", HOSTS, "https://data.example.org/a.laz"),
+        (WEB, "https://data.example.org/b.laz", HOSTS, "https://data.example.org/b.laz"),
+        (WEB, B, HOSTS, B),
+        (DISK, B, HOSTS, B),
+        (DISK, "./a.laz", frozenset(), "lidar/a.laz"),
+        (DISK, "/data/a.laz", frozenset(), "/data/a.laz"),
+        ("s3://bucket/x/i.json", "sub/a.laz", frozenset(), "s3://bucket/x/sub/a.laz"),
+        *((WEB, href, HOSTS, "") for href in (
+            "file:///etc/passwd", "FILE:///etc/passwd", "https://evil.example/a.laz",
+            "//evil.example/a.laz", "https://data.example.org.evil.example/a.laz",
+            "https://data.example.org@evil.example/a.laz", "https://data.example.org:8443/a.laz",
+            "http://tiles.example.org/a.laz",  # came by https itself
+            "http://data.example.org/a.laz", "s3://data/a.laz", "ftp://data.example.org/a.laz",
+            "ftp://tiles.example.org/a.laz",  # an allowed host, by another scheme
+            "file://tiles.example.org/etc/a.laz", "gopher://x/", "data:text/plain,x",
+            "https://[::1/a.laz", "http://169.254.169.254/latest/meta-data",
+        )),
+        *((DISK, href, frozenset(), "") for href in (
+            "file:///etc/passwd", "https://evil.example/a.laz", "//evil.example/a", "s3://b/a.laz",
+        )),
+        ("s3://bucket/x/i.json", "s3://other/a.laz", frozenset(), ""),
     ],
-)
-def test_tiles_of_a_web_catalogue(href, where):
-    assert resolved(href, WEB, frozenset({"tiles.example.org"})) == where
-
-
-@pytest.mark.parametrize(
-    "href",
-    [
-        "file:///etc/passwd",
-        "FILE:///etc/passwd",
-        "https://evil.example/a.laz",
-        "//evil.example/a.laz",
-        "https://data.example.org.evil.example/a.laz",
-        "https://data.example.org@evil.example/a.laz",
-        "https://data.example.org:8443/a.laz",
-        "http://tiles.example.org/a.laz",  # came by https itself
-        "http://data.example.org/a.laz",
-        "s3://data/a.laz",
-        "ftp://data.example.org/a.laz",
-        "ftp://tiles.example.org/a.laz",  # an allowed host, by another scheme
-        "file://tiles.example.org/etc/a.laz",
-        "gopher://x/",
-        "data:text/plain,x",
-        "https://[::1/a.laz",
-        "http://169.254.169.254/latest/meta-data",
-    ],
-)
-def test_a_web_catalogue_leads_nowhere_else(href):
+)  # fmt: skip
+def test_a_catalogue_leads_to_its_own_origin_and_to_allowed_hosts(catalogue, href, hosts, where):
+    if where:
+        assert resolved(href, catalogue, hosts) == where
+        return
     with pytest.raises(InputError, match="a tile of it leads to"):
-        resolved(href, WEB, frozenset({"tiles.example.org"}))
-
-
-@pytest.mark.parametrize(
-    "href", ["file:///etc/passwd", "https://evil.example/a.laz", "//evil.example/a", "s3://b/a.laz"]
-)
-def test_a_local_catalogue_leads_to_no_host_that_is_not_allowed(href):
-    with pytest.raises(InputError, match="a tile of it leads to"):
-        resolved(href, "lidar/tiles.vpc", frozenset())
-
-
-def test_tiles_of_local_and_bucket_catalogues():
-    assert resolved("./a.laz", "lidar/tiles.vpc", frozenset()) == "lidar/a.laz"
-    assert resolved("/data/a.laz", "lidar/tiles.vpc", frozenset()) == "/data/a.laz"
-    hosts = frozenset({"tiles.example.org"})
-    there = "https://tiles.example.org/a.laz"
-    assert resolved(there, "lidar/tiles.vpc", hosts) == there
-    assert resolved("sub/a.laz", "s3://bucket/x/i.json", frozenset()) == "s3://bucket/x/sub/a.laz"
-    with pytest.raises(InputError, match="another host"):
-        resolved("s3://other/a.laz", "s3://bucket/x/i.json", frozenset())
+        resolved(href, catalogue, hosts)
 
 
 def around(west, south, east, north):
@@ -363,7 +302,7 @@ def around(west, south, east, north):
 
 
 def tile(ring, href="a.laz"):
-    return Tile(href, (np.array(ring, np.float64).T,))
+    return Tile(href, shapely.Polygon(ring))
 
 
 def test_the_tiles_that_touch_the_footprint_are_taken():
@@ -411,10 +350,9 @@ def test_ground_that_no_tile_covers_is_named_with_its_area():
 
 def test_a_hole_in_an_outline_is_a_hole():
     outer, inner = square(0, 0, 3 * SIDE), square(1, 1)
-    ring = [np.array(r, np.float64).T for r in (outer, inner)]
     footprint = around(WEST + SIDE / 2, SOUTH + SIDE / 2, WEST + 2.5 * SIDE, SOUTH + 2.5 * SIDE)
-    assert cover_of([Tile("a.laz", tuple(ring))], footprint).hole_m2 > 0
-    assert cover_of([Tile("a.laz", (ring[0],))], footprint).hole_m2 == 0
+    assert cover_of([Tile("a.laz", shapely.Polygon(outer, [inner]))], footprint).hole_m2 > 0
+    assert cover_of([tile(outer)], footprint).hole_m2 == 0
 
 
 def test_doubled_tiles_are_named():
@@ -465,25 +403,21 @@ def test_the_files_of_a_list_are_known_without_a_network(tmp_path, monkeypatch):
     assert (tmp_path / stand_in).stat().st_mtime_ns == before
 
 
-def test_a_list_without_its_last_line_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    "damage",
+    [*(lambda text, cut=cut: text[:cut] for cut in (0, 40, 200, 400, -30)),
+     lambda text: "".join(text.splitlines(keepends=True)[:-1]),
+     lambda text: text.replace("2020-01-02", "spring 2020"),
+     lambda text: text.replace("\t10\t", "\tten\t"),
+     lambda text: text.replace("# hosts", "# guests")],
+)  # fmt: skip
+def test_a_damaged_list_is_refused(tmp_path, damage):
     file = tmp_path / "a.tsv"
     write_list(made_list(), file)
-    file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
-    with pytest.raises(InputError, match="1 of its 2 tiles stand in it"):
+    file.write_text(damage(file.read_text()))
+    with pytest.raises(InputError, match=r"a\.tsv") as error:
         read_list(file)
-
-
-@pytest.mark.parametrize("cut", [0, 40, 200, 400, -1, -30])
-def test_a_damaged_list_is_refused_or_whole(tmp_path, cut):
-    file = tmp_path / "a.tsv"
-    write_list(made_list(), file)
-    text = file.read_text()
-    file.write_text(text[:cut])
-    if cut == -1:  # the last line's end
-        assert read_list(file) == made_list()
-    else:
-        with pytest.raises(InputError, match="no list of tiles"):
-            read_list(file)
+    assert error.value.remedy
 
 
 def test_a_catalogue_that_has_changed_is_told(tmp_path):
@@ -514,11 +448,3 @@ def test_cells_that_name_lists_and_catalogues():
         assert is_catalogue(name)
     for name in ("https://host/x/ept.json", "ept.json", "https://host/a.laz?of=a.json", "a.tsv"):
         assert not is_catalogue(name)
-
-
-def test_a_list_with_a_day_that_is_none_is_refused(tmp_path):
-    file = tmp_path / "a.tsv"
-    write_list(made_list(), file)
-    file.write_text(file.read_text().replace("2020-01-02", "spring 2020"))
-    with pytest.raises(InputError, match=r"no list of tiles that can be read .*spring 2020"):
-        read_list(file)

@@ -17,8 +17,7 @@ from pyproj import CRS
 from rasterio.transform import from_origin
 
 from stereotruth.errors import InputError
-from stereotruth.lidar.frames import DEFAULT_EPOCH, Epoch, Epochs, frame_change, is_known
-from stereotruth.lidar.geokeys import epoch_of_tiff
+from stereotruth.lidar.frames import DEFAULT_EPOCH, Epoch, Epochs, frame_change
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.plate_motion import moved, plate_at, speed
 from stereotruth.lidar.point_store import PointStore
@@ -208,20 +207,18 @@ def test_the_geokey_of_the_epoch_is_read() -> None:
 
 @pytest.mark.parametrize("bigtiff", ["NO", "YES"])
 def test_the_epoch_of_a_geotiff_is_read(tmp_path, bigtiff) -> None:
-    """rasterio neither reads nor writes it: a key that GDAL can do without is made one."""
+    """rasterio does not write it: a key that GDAL can do without is made one."""
     file = tmp_path / "a.tif"
     with rasterio.open(
         file, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32", crs="EPSG:9000",
         transform=from_origin(151.2, -33.9, 1e-5, 1e-5), BIGTIFF=bigtiff,
     ) as raster:  # fmt: skip
         raster.write(np.full((1, 40, 40), 20, np.float32))
-    assert epoch_of_tiff(file) is None
     data = file.read_bytes()
     before = struct.pack("<3H", 2057, 34736, 1)  # semi-major axis
     assert before in data
     data = data.replace(before, struct.pack("<3H", 5120, 34736, 1))
     file.write_bytes(data.replace(struct.pack("<d", 6378137.0), struct.pack("<d", 2010.25)))
-    assert epoch_of_tiff(file) == 2010.25
     record = to_wgs84(raster_header(file), file, epochs=at(2020.0)).frame
     assert record["source"]["epoch"] == 2010.25
 
@@ -232,14 +229,24 @@ def test_the_date_that_nothing_tells_is_said() -> None:
     assert not frame_change(CRS.from_epsg(6318), (-81.66, 30.33), Epoch(2020.0, "a sheet")).notes
 
 
-@pytest.mark.parametrize("code", [4326, 4149, 4214, 6668])  # WGS 84, CH1903, Beijing 1954, JGD2011
-def test_other_frames_are_left_to_proj(code) -> None:
-    assert not is_known(CRS.from_epsg(code))
+@pytest.mark.parametrize(
+    ("code", "place"),
+    [(4326, (7.4, 46.9)), (4149, (7.4, 46.9)), (4214, (110.0, 30.0)), (6668, (140.0, 36.0))],
+)  # WGS 84, CH1903, Beijing 1954, JGD2011
+def test_other_frames_are_left_to_proj(code, place) -> None:
+    assert frame_change(CRS.from_epsg(code), place, DEFAULT_EPOCH) is None
 
 
-def test_a_frame_is_known_without_an_area_of_use() -> None:
-    plain = CRS.from_wkt(CRS.from_epsg(6339).to_wkt("WKT1_GDAL"))
-    assert is_known(plain.geodetic_crs)
+def test_a_frame_goes_there_and_back() -> None:
+    change = frame_change(CRS.from_epsg(6318), (179.99, 52.0), Epoch(2026.0))
+    own = (
+        np.array([179.99, 180.01, -179.99]),
+        np.array([52.0, 52.1, 51.9]),
+        np.array([0.0, 9, 9e3]),
+    )
+    back = change.inverse(*change(*own))
+    np.testing.assert_allclose((back[0] - own[0] + 180) % 360, 180, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(back[1:], own[1:], rtol=0, atol=1e-8)
 
 
 # ------------------------------------------------------------------ plates

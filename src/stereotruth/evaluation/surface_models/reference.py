@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from ...errors import InputError
+from ...lidar.frames import DEFAULT_EPOCHS, Epochs
 from ...lidar.height_raster import CLASSES, Floats, HeightRaster
 from ...lidar.point_store import PointStore, open_stores, query_points
 
@@ -112,20 +113,26 @@ class LidarReference:
         dx, dy = model.cell_m
         inside = (x >= (cols.start - 0.5) * dx) & (x < (cols.stop - 0.5) * dx)
         inside &= (-y >= (rows.start - 0.5) * dy) & (-y < (rows.stop - 0.5) * dy)
-        height = height[inside] - model.undulation(lon[inside], lat[inside])
+        height = height[inside] - model.to_wgs84.height_shift_m(lon[inside], lat[inside])
         return x[inside], y[inside], height, kind[chosen][inside]
 
 
 class RasterReference:
     """The cells of a reference raster; without ``classes`` all are of one kind, OTHER.
 
-    ``geoid``: of its heights. ``classes``: a raster of LAS classes on the same grid.
+    ``geoid``: of its heights. ``classes``: a raster of LAS classes on the same grid. ``epochs``: of
+    the model, see :func:`..score.score_surface_model`.
     """
 
     def __init__(
-        self, path: str | Path, geoid: str | Path | None = None, classes: str | Path | None = None
+        self,
+        path: str | Path,
+        geoid: str | Path | None = None,
+        classes: str | Path | None = None,
+        *,
+        epochs: Epochs = DEFAULT_EPOCHS,
     ) -> None:
-        self.raster = HeightRaster.open(path, geoid)
+        self.raster = HeightRaster.open(path, geoid, epochs=epochs)
         self.classes = None if classes is None else HeightRaster.open(classes, quantity=CLASSES)
         self.name = Path(path).name
         self.classified = classes is not None
@@ -170,11 +177,10 @@ class RasterReference:
         east, north = self.raster.coordinates(col * dx, -row * dy)
         z = heights[known].astype(np.float64)
         own, other = self.raster.to_wgs84, model.to_wgs84
-        is_same = own.system.horizontal.equals(other.system.horizontal)
-        if is_same and not (own.is_orthometric or other.is_orthometric):
+        if own.describe() == other.describe():
             return (*model.places_of(east, north), z, kind)
-        lon, lat, _ = own._exact(east, north, np.zeros(east.size))
-        z = z + own.undulation(lon, lat) - other.undulation(lon, lat)
+        lon, lat, _ = own.exact(east, north, np.zeros(east.size))
+        z = z + own.height_shift_m(lon, lat) - other.height_shift_m(lon, lat)
         return (*model.places(lon, lat), z, kind)
 
 

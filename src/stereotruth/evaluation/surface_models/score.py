@@ -21,6 +21,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...job import progress
+from ...lidar.frames import DEFAULT_EPOCHS, Epochs
 from ...lidar.height_raster import Floats, HeightRaster, Window
 from .edges import REACH_M, EdgeErrors, find_edges, measure
 from .height_errors import SOLID, HeightErrors, strata
@@ -99,15 +100,21 @@ def _parts(model: HeightRaster, reference: Reference, step_m: float) -> Iterator
 
 
 def score_surface_model(
-    path: str | Path, reference: Reference, *, geoid: str | Path | None = None
+    path: str | Path,
+    reference: Reference,
+    *,
+    geoid: str | Path | None = None,
+    epochs: Epochs = DEFAULT_EPOCHS,
 ) -> Verdict:
     """Judge a GeoTIFF of heights (m, or its system's vertical unit).
 
     Heights count from the WGS 84 ellipsoid, or from the geoid whose grid ``geoid`` names. A model
-    of any north-up grid will do, in degrees or a projection. Raises InputError for a file that is
-    no such raster, and for a reference that shares no ground with it.
+    of any north-up grid will do, in degrees or a projection. ``epochs``: of the images that it was
+    made from, at which national frames are brought to ITRF2020 (:mod:`...lidar.frames`); those of
+    the reference have to be the same. Raises InputError for a file that is no such raster, and for
+    a reference that shares no ground with it.
     """
-    model = HeightRaster.open(path, geoid)
+    model = HeightRaster.open(path, geoid, epochs=epochs)
     step_m = lattice_step(reference, model)
     parts = list(_parts(model, reference, step_m))
     found = None

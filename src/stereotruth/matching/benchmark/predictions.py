@@ -40,7 +40,7 @@ from ...products.rasters import image_shape, read_image, write_disparity
 from ..kinds import FOLDER, MOVED, TOLD
 from ..matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
 from ..methods import make_method
-from ..user_command import SUFFIXES, read_result
+from ..result_files import SUFFIXES, read_result
 from .identity import identity, machine
 from .prediction_files import RECORD, UNCERTAINTY
 from .submission import SUBMITTED, Submission

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from stereotruth.errors import InputError
-from stereotruth.matching.user_command import read_result
+from stereotruth.matching.result_files import read_result
 from stereotruth.products.rasters import image_shape, read_disparity, read_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
