@@ -302,7 +302,7 @@ def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
         "points": {name: counted[name] for name in COUNTED[:3]},
         "labelled_share": round(labelled / max(reached, 1), 6),
     }
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         asked = max(counted["asked"], 1)
         out["asked"] = counted["asked"]
         out["beyond_learned"] = {n: round(counted[n] / asked, 4) for n in Evidence._fields}
