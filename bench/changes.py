@@ -35,9 +35,9 @@ from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.lidar.ingest import ingest
 from stereotruth.matching.image_faults import as_images
+from stereotruth.pages.pictures import save_figure, stretch
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import require_complete
-from stereotruth.products.pictures import save_figure, stretch
 from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.changes import REASONS, changes_at
 from stereotruth.simulate.cities import (

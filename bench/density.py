@@ -30,7 +30,7 @@ from labelled_block import Block
 from synthetic_pairs import CONDITIONS, Pair, fresh_pair, made_pair
 
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.products.pictures import SERIES
+from stereotruth.pages.pictures import SERIES
 
 TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1 px at most, %
     4: (95, 0.2, 0.03),

@@ -38,7 +38,6 @@ from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.lidar.ingest import ingest
@@ -370,7 +369,7 @@ def by_matching(window: PairWindow, disparity: Floats) -> tuple[Bools, Bools]:
     known = np.isfinite(disparity)
     low = int(np.floor(disparity[known].min())) - 16
     count = -(-(int(np.ceil(disparity[known].max())) + 16 - low) // 16) * 16
-    left, _ = left_and_warped(window, disparity)
+    left, _ = window.images_at(disparity)
     top = window.rows.start - window.right.row
     right = np.zeros_like(left)
     first = window.right.col - window.cols.start

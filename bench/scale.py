@@ -25,7 +25,7 @@ from numba import njit
 from rasterio.rpc import RPC
 from rasterio.windows import Window
 
-from stereotruth.products.pictures import SERIES
+from stereotruth.pages.pictures import SERIES
 from stereotruth.simulate.camera import Pass, aim, locate, project
 from stereotruth.simulate.geodesy import LocalFrame
 from stereotruth.simulate.rpcs import draw_bias, fit_rpc

@@ -27,10 +27,9 @@ from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.surface_means import left_and_warped
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL, ROUNDING, NoiseCurve, pair_noise
-from stereotruth.products.pictures import save_figure
+from stereotruth.pages.pictures import save_figure
 from stereotruth.status import is_labelled
 
 SHADE_DN, LIGHT_DN = 3.5, 0.7  # noise at the darkest and at the brightest
@@ -86,7 +85,7 @@ def main() -> None:
         )
         limit = least_probability(compared)
         lost.append(labelled & (change_probability(compared, diachronic=False).probability > limit))
-    left, warped = left_and_warped(window, labels.labels.disparity)
+    left, warped = window.images_at(labels.labels.disparity)
     for low, high in ((1, 60), (60, 100), (100, 150), (150, 256)):
         chosen = labelled & (left >= low) & (left < high)
         shares = (f"{100.0 * part[chosen].mean():.1f}" for part in lost)

@@ -17,7 +17,7 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from stereotruth.lidar.lattice import LATTICE_M
-from stereotruth.products.pictures import save_figure
+from stereotruth.pages.pictures import save_figure
 from stereotruth.surface.scale import SurfaceScale
 from stereotruth.surface.surface import GroundSurface, ground_surface
 from stereotruth.surface.vertices import VertexBuilder

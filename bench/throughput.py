@@ -48,7 +48,7 @@ from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.epipolar.rpc_files import read_rpc
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import Points, PointStore
-from stereotruth.lidar.projection_polynomials import PatchedTransform
+from stereotruth.lidar.smooth_maps import PatchedTransform
 from stereotruth.products.grids import Layer, require_complete
 from stereotruth.products.provenance import source_digest
 from stereotruth.products.resumable_grids import resumable_grid
@@ -86,11 +86,10 @@ with job(log, "project"):
 BOUNDS = {  # part of a profile: what its time goes into
     "laspy": "arithmetic decoding, bit by bit: the floor",
     "to_wgs84": "two passes over 6 arrays: memory",
-    "projection_polynomials": "27 multiplications and additions a point in vectors: memory",
     "cell_sort": "scattered writes of the sort: cache misses",
     "point_store": "one pass over memory",
     "zarr": "LZ4 and three copies in Zarr",
-    "local_projection": "80 multiplications and additions a point in vectors: arithmetic",
+    "smooth_maps": "27 or 80 multiplications and additions a point in vectors: memory, arithmetic",
     "pixel_points": "scattered writes of the sort: cache misses",
     "vertices": "scattered updates of the cells",
     "delaunay": "exact tests and cache misses, a vertex at a time",

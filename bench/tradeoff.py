@@ -42,9 +42,9 @@ from stereotruth.evaluation.labels_against_truth import (
     open_truth,
     status_names,
 )
+from stereotruth.pages.pictures import SERIES
 from stereotruth.products.files import atomic_file
 from stereotruth.products.grids import blocks, open_grid
-from stereotruth.products.pictures import SERIES
 from stereotruth.products.provenance import source_digest
 
 THRESHOLDS = (-1.0, 0.0, 0.25, 0.5, 0.8, 0.9)

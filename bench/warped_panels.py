@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from stereotruth.dataset.warped_tile import WarpedTile
+from stereotruth.pages.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
 from stereotruth.products.files import atomic_file
-from stereotruth.products.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
 
 
 def draw_panels(tile: WarpedTile, path: str | Path) -> None:

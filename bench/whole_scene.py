@@ -34,8 +34,8 @@ from stereotruth.matching.scenes.predict_scene import predict_scene
 from stereotruth.matching.scenes.surface_model import Raster, write_dsm
 from stereotruth.numerics.error_sums import ErrorSum
 from stereotruth.numerics.robust import median_and_nmad
+from stereotruth.pages.pictures import colours, stretch
 from stereotruth.products.grids import Layer, atomic_store, blocks, create_grid, require_complete
-from stereotruth.products.pictures import colours, stretch
 from stereotruth.simulate.built_city import top_surface
 from stereotruth.simulate.cities import Character, CitySpec, SceneSpec
 from stereotruth.simulate.control_points import simulate_points

@@ -36,7 +36,7 @@ ORDER = (
     {"tables"},
     {"sheets"},
     {"products"},
-    {"lidar", "epipolar", "simulate"},
+    {"lidar", "epipolar", "pages", "simulate"},
     {"alignment", "dataset", "surface"},
     {"disparity", "report"},
     {"evaluation", "matching"},

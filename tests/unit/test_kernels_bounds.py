@@ -10,7 +10,11 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-TESTS = ("disparity/test_shifted_agreement.py", "disparity/test_image_agreement.py")
+TESTS = (
+    "disparity/test_shifted_agreement.py",
+    "epipolar/test_surface_windows.py",
+    "lidar/test_smooth_maps.py",
+)
 
 
 @pytest.mark.slow

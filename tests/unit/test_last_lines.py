@@ -62,7 +62,7 @@ def test_each_product_is_named_with_its_figures_in_the_order_of_the_workflow():
         "results/predict/A/A-1/sgm_dsm.tif",
         "audit/own",
         "benchmark/own/index.html",
-        "benchmark/own/table5.csv",
+        "benchmark/own/methods.csv",
         "benchmark/own/sgm",
         "results/train/own/net/best.pt",
         "results/train/own/net/training.json",

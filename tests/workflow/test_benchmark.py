@@ -69,7 +69,7 @@ def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     assert scores(scored, "theirs")["all"] == scores(scored, "sgm")["all"]
     assert scores(scored, "mine")["all"]["epe_px"] < 2
     folder = scored.folder / "benchmark/synthetic"
-    with (folder / "table5.csv").open(newline="") as stream:
+    with (folder / "methods.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["method"] for row in rows] == ["SGM", "mine", "Theirs"]
     assert rows[0]["median_seconds"] and not rows[2]["median_seconds"]

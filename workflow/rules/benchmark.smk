@@ -104,9 +104,9 @@ rule benchmark_tables:
         tables=expand(
             "benchmark/{{dataset}}/{table}.{kind}",
             table=(
-                "table5",
-                "table6",
-                "table7",
+                "methods",
+                "by_city",
+                "fine_tuned",
                 "strata",
                 "differences",
                 "confidence",
@@ -114,7 +114,6 @@ rule benchmark_tables:
             ),
             kind=("csv", "md"),
         ),
-        curves="benchmark/{dataset}/confidence.png",
         figure=report(
             "benchmark/{dataset}/figure10.png",
             caption="../report/figure10.rst",
@@ -145,10 +144,7 @@ rule benchmark_tables:
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
         code=source_digest("matching.benchmark.compare_methods"),
-        templates=[
-            templates_of("matching", "benchmark", page)
-            for page in ("page.html.jinja", "confidence.html.jinja")
-        ],
+        templates=templates_of("matching", "benchmark", "page.html.jinja"),
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

@@ -84,11 +84,9 @@ def scenes_of(city):
 
 
 def templates_of(*parts):
-    """Digests of a page's template, of the script in its folder and of what all pages share."""
-    template = PACKAGE.joinpath(*parts)
-    scripts = sorted(template.parent.glob("*.js.jinja"))
-    shared = sorted((PACKAGE / "products").glob("*.jinja"))
-    return [file_sha256(file) for file in (template, *scripts, *shared)]
+    """Digests of a page's template and of what all pages share."""
+    shared = sorted((PACKAGE / "pages").glob("*.jinja"))
+    return [file_sha256(file) for file in (PACKAGE.joinpath(*parts), *shared)]
 
 
 def content_of(script):

@@ -4,8 +4,8 @@ from stereotruth.config.methods import Audit
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
 from stereotruth.job import job
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":

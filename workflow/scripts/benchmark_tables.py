@@ -5,8 +5,8 @@ from pathlib import Path
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.job import job
 from stereotruth.matching.benchmark.compare_methods import compare
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 from stereotruth.job import job
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
-from stereotruth.report.city_files import CityFiles
 from stereotruth.report.index_page import write_index
-from stereotruth.report.page import write_report
+from stereotruth.report.page import CityFiles, write_report
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
@@ -27,6 +26,7 @@ if __name__ == "__main__":
             looks={scene: Path(given.looks, f"{scene}_left.tif") for scene in scenes},
             alignments=scenes,
             refinements=by_scene(given.refinements),
+            residual_figures=by_scene(given.residual_figures),
             refinement_figures=by_scene(given.refinement_figures),
             truth=given.truth[0] if given.truth else None,
             truth_table=given.truth_table[0] if given.truth_table else None,

@@ -3,14 +3,15 @@
 from pathlib import Path
 
 from stereotruth.alignment.site_images import GivenImage, open_image
+from stereotruth.epipolar.pair_quality import rate
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.roughness import roughness_m
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
 from stereotruth.products.files import read_json
-from stereotruth.products.html_page import INDEX
 from stereotruth.report.index_page import write_index
-from stereotruth.report.site_page import image_of, pairs_of, write_site_page
+from stereotruth.report.site_page import write_site_page
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
@@ -24,13 +25,10 @@ if __name__ == "__main__":
         ]
         write_site_page(
             city,
-            [image_of(image) for image in images],
-            pairs_of(
-                images,
-                snakemake.params.scenes,
-                roughness_m([PointStore(path) for path in given.points]),
-            ),
+            images,
+            rate(images, roughness_m([PointStore(path) for path in given.points])),
             snakemake.output[0],
+            scenes=snakemake.params.scenes,
             adjusted=read_json(given.adjusted[0]) if given.adjusted else {},
             closure=read_json(given.closure[0]) if given.closure else {},
             page=given.page,

@@ -4,8 +4,8 @@ from stereotruth.evaluation.surface_models.page import write_verdict
 from stereotruth.evaluation.surface_models.reference import LidarReference
 from stereotruth.evaluation.surface_models.score import score_surface_model
 from stereotruth.job import job
+from stereotruth.pages.page import INDEX
 from stereotruth.products.atomic_outputs import atomic_outputs
-from stereotruth.products.html_page import INDEX
 from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":

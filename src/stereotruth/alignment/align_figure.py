@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from ..pages.pictures import round_length
 from ..products.files import atomic_file
-from ..products.pictures import round_length
 from .aligned_pair import Alignment
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from ..products.pictures import DIFFERENCES, save_figure, stretch
+from ..pages.pictures import DIFFERENCES, save_figure, stretch
 from ..products.rasters import open_raster
 from .aligned_pair import Alignment
 

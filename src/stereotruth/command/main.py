@@ -465,9 +465,9 @@ def open_pages(
     listed: Annotated[bool, typer.Option("--list", help="Print their paths, open none.")] = False,
 ) -> None:
     """Open the index of all pages (cities, benchmarks, audits), or those that are named."""
-    from .pages import pages
+    from ..report.index_page import pages_with
 
-    found = pages(words or [])
+    found = pages_with(words or [])
     for page in found:
         typer.echo(str(page))
     for page in [] if listed else found if words else found[:1]:

@@ -308,7 +308,7 @@ class AuditLimits(Section):
     edge, is faulty, as is what exceeds the limits below"""
 
     label_bias_px: Pixels = 0.3
-    """labels less matches of the images, likewise"""
+    """label - match of the images, likewise"""
 
     contradicted_share: Share = 0.03
     """labels that the images contradict: they correlate better elsewhere"""

@@ -42,13 +42,18 @@ from .label_doubts import Doubt, ToldDoubt, doubts, surface_figures
 from .layer_kinds import column
 from .orientation import save
 from .quality_limits import flag, missed
-from .quick_looks import draw_contact_sheet, draw_coverage
+from .quick_looks import (
+    STATUS_COLOURS_FILE,
+    draw_contact_sheet,
+    draw_coverage,
+    write_status_colours,
+)
 from .scene_stores import SceneFiles, SceneStores, open_stores
 from .sift_matches import MATCH_COLUMNS, match_rows
 from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
 from .summary import in_counts, summarise
-from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks
+from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks, sigma_by_surface
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
 from .windows import Window, cell_step, choose_windows, scan_scene
 
@@ -335,8 +340,11 @@ def _write_tiles(
         half = settings.disparity_dtype == "float16"
         summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
         summary["quality"] = gates
+        stated = np.sum([checks.stated for checks in scene_checks.values()], axis=0)
+        summary["label_uncertainty"] = sigma_by_surface(stated)
         write_table(scratch / "manifest.csv", rows)
         write_footprints(scratch, [feature(row, ring) for row, ring in written])
+        write_status_colours(scratch / STATUS_COLOURS_FILE, cut.flags)
         for picture in drawn:
             picture.result()
     return summary, rows

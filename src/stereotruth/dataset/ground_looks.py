@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 from scipy.ndimage import distance_transform_edt
 
-from ..products import pictures
+from ..pages import pictures
 from .scene_stores import SceneStores
 
 Floats = NDArray[np.float64]

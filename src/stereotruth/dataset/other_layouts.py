@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..job import progress
-from ..products import pictures
+from ..pages import pictures
 from ..products.files import atomic_folder, write_table
 from ..products.provenance import file_sha256
 from ..products.rasters import KITTI_STEPS, read_disparity, read_image, read_labels, write_tiff

@@ -13,9 +13,10 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from ..errors import in_number
-from ..products import pictures
-from ..products.pictures import colours, save_figure
+from ..pages import pictures
+from ..pages.pictures import colours, save_figure
 from ..products.rasters import read_disparity, read_image
+from ..status import BY_LABEL
 
 Picture = NDArray[np.uint8]
 
@@ -62,7 +63,29 @@ def draw_contact_sheet(
     contact_sheet(path, title, tiles, limits)
 
 
+STATUS_COLOURS_FILE = "status_colours.txt"
 SPLIT_COLOURS = {"train": "#0072b2", "val": "#e69f00", "test": "#6f0952", "none": "#8a8a8a"}
+
+
+def status_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
+    known = {name: BY_LABEL[name].colour for name in names if name in BY_LABEL}
+    unknown = [name for name in names if name not in known]
+    other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
+    return known | other
+
+
+def write_status_colours(path: Path, flags: Mapping[int, str]) -> None:
+    """The colours of status values as a colour map of QGIS: value, R, G, B, A, meaning by lines.
+
+    It stands beside the tiles: some readers give colours, not values, of a TIFF with a table.
+    """
+    colours = status_colours(list(flags.values()))
+    lines = ["INTERPOLATION:EXACT"]
+    for value, name in flags.items():
+        red, green, blue = bytes.fromhex(colours[name][1:])
+        lines.append(f"{value},{red},{green},{blue},255,{name.replace('_', ' ')}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def coverage_figure(

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..numerics.bilinear import bilinear
-from ..products.pictures import stretch
+from ..pages.pictures import stretch
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -58,6 +58,7 @@ ANGLE_DEG = 20.0
 SIZE_RATIO = 1.3
 AGREE_PX = 1.0
 GROSS_PX = 3.0
+SIFT_NOISE_PX = 0.18  # mean absolute error of matches against exact truth, see above
 MIN_PARALLAX = 5  # matches; fewer give no y-parallax
 BAND = 64  # rows
 APRON = 12  # rows around a band that key points in it look at

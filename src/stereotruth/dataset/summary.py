@@ -8,6 +8,7 @@ from typing import Any
 
 from ..errors import in_number
 from ..status import HIDDEN, Status, carries_label
+from .sift_matches import SIFT_NOISE_PX
 
 
 def in_counts(counts: Mapping[str, int]) -> str:
@@ -78,6 +79,7 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
         f"{100 * labelled:.1f} % of their pixels labelled ({100 * labelled / in_both:.1f} % of "
         f"those that neither image hides), disparities {low:.1f} … {high:.1f} px, "
         f"rounded by at most {summary['disparity_rounding']['largest_px']:.4f} px",
+        *label_uncertainty(summary),
         *(_quality_line(scene, found) for scene, found in summary["quality"]["scenes"].items()),
     ]
     flagged = summary["quality"]["flagged_tiles"]
@@ -96,6 +98,21 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
     return [*lines, f"Look at {out_dir}/manifest.csv, {out_dir}/left, right, disp, status"]
 
 
+def label_uncertainty(summary: Mapping[str, Any]) -> list[str]:
+    """How well labels are known by what they state, and by what they lie on; nothing of none."""
+    by = dict(summary["label_uncertainty"])
+    if "all" not in by:
+        return []
+    total = by.pop("all")
+    surfaces = ", ".join(
+        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2g} px" for name, of in by.items()
+    )
+    return [
+        f"Labels known to {total['uncertainty_median_px']:.2g} px (median), "
+        f"{total['uncertainty_p95_px']:.2g} px for 95 % ({surfaces})"
+    ]
+
+
 def _quality_line(scene: str, found: Mapping[str, Any]) -> str:
     def px(name: str, sign: str = "") -> str:
         return "–" if found[name] is None else f"{found[name]:{sign}.2f} px"
@@ -103,7 +120,8 @@ def _quality_line(scene: str, found: Mapping[str, Any]) -> str:
     warp = found["warp_correlation"]
     return (
         f"{scene}: {found['sift_matches']} SIFT matches, error {px('sift_mean_error_px', '+')} "
-        f"mean, {px('sift_mean_absolute_error_px')} mean absolute; y-parallax "
+        f"mean, {px('sift_mean_absolute_error_px')} mean absolute, of which about "
+        f"{SIFT_NOISE_PX:g} px are SIFT's own; y-parallax "
         f"{px('y_parallax_median_px', '+')} median; correlation with the warped right image "
         f"{'–' if warp is None else f'{warp:.3f}'}"
         + ("" if found["quality"] == "ok" else f"; beyond the limits: {found['quality']}")

@@ -25,7 +25,7 @@ from .orientation import orientation, save
 from .scene_stores import SceneStores
 from .sift_matches import match_tile
 from .split_names import NONE
-from .tile_checks import TileChecks, check_cells
+from .tile_checks import TileChecks, check_cells, count_sigma
 from .tile_classes import Buildings
 from .tile_layers import tile_layers, write_layer
 from .windows import Window
@@ -360,10 +360,12 @@ def _check(crop: _Crop, known: LabelsKnown) -> TileChecks:
     disparity = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
     x = np.arange(left.shape[1])[None, :] - disparity
     matches = match_tile(left, right, disparity, known.surface_class)
+    labelled = np.isfinite(disparity)
     return TileChecks(
         kind=known.kind,
         matches=matches,
         warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
         surface=known.surface[matches.pixel],
         sigma=known.sigma[matches.pixel],
+        stated=count_sigma(known.sigma[labelled], known.surface[labelled]),
     )

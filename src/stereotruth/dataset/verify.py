@@ -15,13 +15,14 @@ from ..products.provenance import file_sha256, own_digest
 from ..products.records import DamagedRecord, read_record
 from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest
+from .quick_looks import STATUS_COLOURS_FILE
 
 log = logging.getLogger("stereotruth")
 
 
 # files that the manifest does not list; STYLE is the user's to change
 LOOSE = (
-    *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE),
+    *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE, STATUS_COLOURS_FILE),
     *("croissant.json", "stac/collection.json", "stac/rpc/*"),
 )
 

@@ -1,7 +1,7 @@
 """What both images of a pair tell of each label: whether they show the LiDAR's surface.
 
 The right image is brought to the left by the labels themselves, and is compared with the left one
-over the pixels of one surface (:mod:`stereotruth.epipolar.surface_correlation`). Windows of a few
+over the pixels of one surface (:mod:`stereotruth.epipolar.surface_windows`). Windows of a few
 pixels agree closely on most labels; such pixels are asked no more. Of the others several things
 together tell (:class:`Evidence`): agreement over windows of several kinds, the brightness that both
 images have at a pixel, agreement at other disparities, and where the pixel lies.
@@ -19,14 +19,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.alike_correlation import alike_correlation, brightness_of_pair
-from ..epipolar.surface_correlation import correlation_and_expected, wanted_runs
+from ..epipolar.surface_windows import (
+    alike_correlation,
+    apart_from_steps,
+    brightness_of_pair,
+    correlation_and_expected,
+    surface_mean,
+    surface_means,
+)
+from ..epipolar.window_sums import wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
 from ..numerics.box_max import box_max
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
-from .surface_means import apart_from_steps, left_and_warped, surface_mean, surface_means
 from .young_crowns import beside_young_crowns
 
 Singles = NDArray[np.float32]
@@ -76,7 +82,7 @@ class LabelledWindow:
     @cached_property
     def images(self) -> tuple[Singles, NDArray[np.float64]]:
         """Left image, 0 where it has no value, and the right one brought to it, NaN there."""
-        return left_and_warped(self.window, self.labels.disparity)
+        return self.window.images_at(self.labels.disparity)
 
     @cached_property
     def brightness(self) -> tuple[Singles, Singles]:
@@ -126,8 +132,8 @@ class Evidence(NamedTuple):
     ``signal``: what the same ground would agree by, as noise leaves it.
 
     ``alike``: correlation of the brightness over the pixels that are alike
-    (:mod:`stereotruth.epipolar.alike_correlation`), which lie on one side of the edges of shadows
-    and of new roofs; ``alike_around``: the mean of these up to ALIKE_PX. ``contrast_left`` and
+    (:func:`.surface_windows.alike_correlation`), which lie on one side of the edges of shadows and
+    of new roofs; ``alike_around``: the mean of these up to ALIKE_PX. ``contrast_left`` and
     ``contrast_right``: standard deviation of the surface up to ALIKE_PX in each image, in that of
     its noise. ``gain``: how much the ratio of both images' brightness there differs from that up to
     GAIN_PX, as a logarithm.

@@ -18,12 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.alike_means import alike_mean
-from ..epipolar.surface_correlation import wanted_runs
+from ..epipolar.surface_windows import alike_mean, surface_mean
+from ..epipolar.window_sums import wanted_runs
 from ..numerics.decision_trees import DecisionTrees
 from .change_evidence import LabelledWindow, change_evidence
 from .learned_evidence import beyond_learned
-from .surface_means import surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

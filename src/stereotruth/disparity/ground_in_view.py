@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from ..lidar.smooth_maps import LocalProjection
 from ..numerics.box_max import box_max
 from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import PART_BITS
 from ..surface.surface_store import Block
 from ..surface.vertices import Vertices
-from .local_projection import LocalProjection
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]

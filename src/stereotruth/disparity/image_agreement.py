@@ -5,7 +5,7 @@ each point. Where heights step, such a window mixes surfaces and fails although 
 Here the right image is brought to the left by the labels themselves, and windows hold the pixels of
 one surface only:
 
-- :mod:`stereotruth.epipolar.surface_correlation`: correlation coefficient of the left and the
+- :mod:`stereotruth.epipolar.surface_windows`: correlation coefficient of the left and the
   warped right image in a window around each pixel, over the pixels of its surface;
 - :mod:`.change_evidence`: what both images tell of a label;
 - :mod:`.change_probability`: how probable it is by that, that what a label shows has changed.
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from ..lidar.point_store import WATER_CLASS
 from ..status import Status, is_labelled
 from .change_evidence import LabelledWindow

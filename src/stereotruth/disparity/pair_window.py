@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_noise import NoiseCurve
+from ..epipolar.warping import warp_rows
 from ..status import Status
 from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
@@ -62,6 +64,17 @@ class PairWindow:
             for patch, curve in zip((self.left, self.right), noise)
         )
         return replace(self, left=left, right=right)
+
+    def images_at(self, disparity: Floats) -> tuple[Singles, Floats]:
+        """Left image [h, w], and the right one brought to it by the ``disparity`` (px): its value
+        at (x - disparity, y) of each pixel, NaN where there is none."""
+        top, side = self.rows.start - self.left.row, self.cols.start - self.left.col
+        rows, cols = self.shape
+        left = self.left.pixels[top : top + rows, side : side + cols]
+        top = self.rows.start - self.right.row
+        right = self.right.pixels[top : top + rows, : self.right.usable.shape[1]]
+        at = np.arange(self.cols.start, self.cols.stop) - disparity - self.right.col
+        return left, warp_rows(right, at)
 
     @property
     def inner(self) -> tuple[slice, slice]:

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from ..kernels import kernel
 from ..lidar.lattice import PER_M
+from ..lidar.smooth_maps import LocalProjection
 from ..surface.raster import PRISM_IN_LEFT, SeenSurface
 from ..surface.scale import HEIGHT_NOISE_M, PRIOR_NOISE_M
-from .local_projection import LocalProjection
 from .pixel_points import PX, PixelPoints
 
 Floats = NDArray[np.float64]

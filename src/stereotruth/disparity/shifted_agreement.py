@@ -11,24 +11,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.surface_correlation import BLOCK, correlate, padded_columns, wanted_runs
-from ..epipolar.warping import value_in_row
-from ..kernels import inner, kernel
+from ..epipolar.surface_windows import (
+    apart_from_steps,
+    correlations,
+    surface_mean,
+    surface_means,
+)
+from ..epipolar.warping import values_in_row
+from ..epipolar.window_sums import BLOCK, Runs, wanted_runs
+from ..kernels import kernel
 from ..numerics.box_max import box_max
 from .image_patches import Detail
 from .pair_window import PairWindow
 from .pixel_labels import Labels
-from .surface_means import Voters, apart_from_steps, fill_voters, mean_of_runs, surface_mean
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
-Steps = NDArray[np.int32]
 
 SHIFTS_PX = (-15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0, -3.0, -2.0, -1.0)
 SHIFTS_PX += (1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0)
@@ -42,7 +45,7 @@ INDEPENDENT_PX2 = 4.0
 Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
 FAR = 2  # times as far off more of the surface is asked, which noise hides less
-AT_ONCE = 4  # shifts that are worked on together: which pixels count is the same for all
+AT_ONCE = 11  # shifts that are worked on together: which pixels count is the same for all
 TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
@@ -138,135 +141,71 @@ def _means(
     row, col = window.rows.start + around[0].start, window.cols.start + around[1].start
     original = left.pixels[row - left.row :, col - left.col :][:rows, :cols]
     clear = apart_from_steps(disparity) if apart else np.isfinite(disparity)
-    every = max(reach // 2, 1)
-    averaged = box_max(wanted, FAR * reach)
+    every, far_px = max(reach // 2, 1), FAR * reach
+    averaged = box_max(wanted, far_px)
     compared = np.where(box_max(averaged, window_px // 2), disparity, np.nan)
     compared[original == 0.0] = np.nan
     known = np.isfinite(compared)
-    voters = Voters.of((AT_ONCE, rows, cols), reach, every, row)
-    far = Voters.of((AT_ONCE, rows, cols), FAR * reach, FAR * every, row)
-    averaged[np.arange(rows) % every != voters.first] = False
+    averaged[np.arange(row, row + rows) % every != 0] = False  # no others are asked for
     to_compare, to_average = wanted_runs(averaged & known), wanted_runs(wanted)
-    surface = (np.ascontiguousarray(values, dtype=np.float32) for values in (disparity, slope))
-    level, slope = surface
+    level, slope = (np.ascontiguousarray(array, np.float32) for array in (disparity, slope))
+    strip = right.pixels[row - right.row :, : right.usable.shape[1]]
+    at = np.arange(col, col + cols) - compared - right.col
+    runs, warped = wanted_runs(known), np.full((AT_ONCE, rows, cols), np.nan, np.float32)
     means = np.full((5, rows, cols), np.nan, np.float32)
-    part = _Compared(
-        original, right.pixels[row - right.row :], right.usable.shape[1], (col, right.col),
-        compared, wanted_runs(known), clear, level, slope,
-    )  # fmt: skip
-    of_shifts = np.array([0.0, *shifts])
-    _means_at_shifts(part, window_px // 2, of_shifts, to_compare, (voters, far), to_average, means)
     here, elsewhere, shifted, here_far, elsewhere_far = means
+    shifted_far = np.empty_like(shifted)
+    of_shifts = np.array([0.0, *shifts])
+    for first in range(0, of_shifts.size, AT_ONCE):
+        several = of_shifts[first : first + AT_ONCE]
+        there = warped[: several.size]
+        _warp_shifted(strip, at, several, runs, there)
+        if first == 0:  # what has a match counts at all shifts
+            known = np.isfinite(warped[0])
+            centres = np.where(known, level, np.float32(np.nan))
+        correlation = correlations(
+            original, there, centres, slope, known & clear, window_px, to_compare
+        )
+        near = surface_means(correlation, level, slope, reach, every, to_average, row)
+        far = surface_means(correlation, level, slope, far_px, FAR * every, to_average, row)
+        if first == 0:
+            here[:], here_far[:] = near[0], far[0]
+        _keep_greatest(near, several, to_average, elsewhere, shifted)
+        _keep_greatest(far, several, to_average, elsewhere_far, shifted_far)
     signal = _signal(images, row, col, disparity)
     around_it = surface_mean(signal, level, slope, reach, every, to_average, row)
     return here, elsewhere, shifted, np.fmin(signal, around_it), here_far, elsewhere_far
 
 
-class _Compared(NamedTuple):
-    """A part of a window in which both images are compared at several disparities; arrays [h, w].
-
-    ``left`` image; ``right`` one [h or more, ``right_cols`` or more] from the same row on;
-    ``first``: columns of both images' first pixels in their grids. ``compared``: disparity (px) of
-    the pixels that are compared, NaN elsewhere, and the ``runs`` of these; ``clear``: those that
-    count. ``level`` (px) and ``slope`` [2, h, w] of the disparity of all.
-    """
-
-    left: Singles
-    right: Singles
-    right_cols: int
-    first: tuple[int, int]
-    compared: Floats
-    runs: Steps
-    clear: Bools
-    level: Singles
-    slope: Singles
-
-
-@inner
-def _right_values(part: _Compared, run: Steps, shift: float, at: Floats, value: Singles) -> None:
-    """Right image at the shifted disparity of a run, NaN for none, to ``value``; at columns
-    ``at``."""
-    y, x0, size = run[0], run[1], run[2] - run[1]
-    right, compared = part.right[:, : part.right_cols], part.compared[y, x0:]
-    for k in range(size):
-        at[k] = part.first[0] + (x0 + k) - (compared[k] + shift) - part.first[1]
-    for k in range(size):
-        value[k] = value_in_row(right, y, at[k])
-
-
 @kernel
-def _warp_shifted(
-    part: _Compared, shifts: Floats, half: int, known: Singles, counted: Singles, warped: Singles
-) -> None:
-    """Right image at the shifted disparities to ``warped`` [n, h, half + w or more], 0 for none.
-
-    Where the first of the ``shifts`` (px) is 0, the disparity of pixels with a match to ``known``
-    [h, w], and of those of them that count to ``counted`` [h, half + w or more].
-    """
-    none = np.float32(np.nan)
-    at, value = np.empty(BLOCK), np.empty(BLOCK, np.float32)
-    for run in part.runs:
+def _warp_shifted(right: Singles, at: Floats, shifts: Floats, runs: Runs, out: Singles) -> None:
+    """Values of the rows of an image ``right`` [h or more, w'] at columns ``at`` [h, w] less each
+    of several shifts (px) to ``out`` [n, h, w], NaN for none; of the pixels of ``runs`` alone."""
+    column, taps = np.empty(BLOCK), np.empty((4, BLOCK), right.dtype)
+    for run in runs:
         y, x0, size = run[0], run[1], run[2] - run[1]
         for n in range(shifts.size):
-            _right_values(part, run, shifts[n], at, value)
-            if shifts[n] == 0.0:
-                for k in range(size):
-                    level = part.level[y, x0 + k] if np.isfinite(value[k]) else none
-                    known[y, x0 + k] = level
-                    counted[y, half + x0 + k] = level if part.clear[y, x0 + k] else none
             for k in range(size):
-                warped[n, y, half + x0 + k] = value[k] if np.isfinite(value[k]) else 0.0
+                column[k] = at[y, x0 + k] - shifts[n]
+            values_in_row(right[y], column[:size], taps, out[n, y, x0:])
 
 
 @kernel
-def _means_at_shifts(
-    part: _Compared,
-    half: int,
-    shifts: Floats,
-    to_compare: Steps,
-    voters: tuple[Voters, Voters],
-    to_average: Steps,
-    out: Singles,
+def _keep_greatest(
+    means: Singles, shifts: Floats, runs: Runs, greatest: Singles, shift: Singles
 ) -> None:
-    """Mean correlation, by the first of the ``voters``, at the first of the ``shifts``, which is 0
-    px, to ``out`` [5, h, w]; the greatest at the others, and which one that is; the first two by
-    the other voters.
-
-    What has a match counts at all shifts. Where the right image ends it has no detail.
-    """
-    rows, cols = part.left.shape
-    wide = padded_columns(cols, half)
-    left, warped = np.zeros((rows, wide), np.float32), np.zeros((AT_ONCE, rows, wide), np.float32)
-    counted, known = np.empty((rows, wide), np.float32), np.empty((rows, cols), np.float32)
-    counted[:], known[:] = np.nan, np.nan
-    left[:, half : half + cols] = part.left
-    correlation, mean = np.empty((2, AT_ONCE, rows, cols), np.float32)
-    expected = np.empty((rows, cols), np.float32)
-    for first in range(0, shifts.size, AT_ONCE):
-        several = shifts[first : first + AT_ONCE]
-        n = several.size
-        _warp_shifted(part, several, half, known, counted, warped[:n])
-        correlate(
-            left, warped[:n], known, counted, part.slope, half, (0.0, 0.0), to_compare,
-            correlation[:n], expected,
-        )  # fmt: skip
-        for far in range(2):
-            which = voters[far]
-            few = Voters(which.value[:n], which.disparity, which.reach, which.every, which.first)
-            fill_voters(correlation[:n], part.level, few)
-            mean_of_runs(part.level, part.slope, few, to_average, mean[:n])
-            here, elsewhere = out[3 * far], out[3 * far + 1]
-            for run in to_average:
-                y = run[0]
-                for k in range(n):
-                    for x in range(run[1], run[2]):
-                        if first + k == 0:
-                            here[y, x] = mean[k, y, x]
-                        elif np.isnan(elsewhere[y, x]) or mean[k, y, x] > elsewhere[y, x]:
-                            elsewhere[y, x] = mean[k, y, x]
-                            if far == 0:
-                                shifted = np.nan if np.isnan(mean[k, y, x]) else several[k]
-                                out[2, y, x] = shifted
+    """Takes the greatest of the ``means`` [n, h, w] of shifts other than 0, and its shift."""
+    for run in runs:
+        y, x0, end = run[0], run[1], run[2]
+        most, at = greatest[y, x0:end], shift[y, x0:end]
+        for n in range(shifts.size):
+            if shifts[n] == 0.0:
+                continue
+            mean = means[n, y, x0:end]
+            for k in range(mean.size):
+                better = np.isnan(most[k]) or mean[k] > most[k]
+                at[k] = (np.nan if np.isnan(mean[k]) else shifts[n]) if better else at[k]
+                most[k] = mean[k] if better else most[k]
 
 
 def _signal(images: tuple[Detail, Detail], row: int, col: int, disparity: Floats) -> Singles:

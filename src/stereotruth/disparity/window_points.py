@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
+from ..lidar.smooth_maps import LocalProjection
 from ..surface.surface_store import WindowSurface
 from .image_patches import read_patch
-from .local_projection import LocalProjection
 from .pair_window import PairWindow
 from .pixel_points import Collection, PixelPoints
 from .point_windows import Box, Footprint

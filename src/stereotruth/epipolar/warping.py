@@ -15,22 +15,35 @@ Floats = NDArray[np.float64]
 
 
 @inlined
-def value_in_row(image: NDArray, y: int, x: float) -> float:
-    """Value at column ``x`` of row ``y``; see :func:`warp_rows`."""
-    if not (x >= 1.0 and x <= image.shape[1] - 3.0):
-        return np.nan
-    i = int(x)
-    a, b, c, d = image[y, i - 1], image[y, i], image[y, i + 1], image[y, i + 2]
-    if a == 0.0 or b == 0.0 or c == 0.0 or d == 0.0:
-        return np.nan
-    return four_point_value(a, b, c, d, x - i)
+def values_in_row(row: NDArray, at: Floats, taps: NDArray, out: NDArray) -> None:
+    """Values at columns ``at`` [n] of a row to ``out``; see :func:`warp_rows`. ``taps`` [4, n or
+    more]: scratch.
+
+    In loops of one kind each, of which all but the second are vectorised.
+    """
+    last = row.size - 3.0
+    if last < 1.0:
+        out[: at.size] = np.nan
+        return
+    a, b, c, d = taps[0], taps[1], taps[2], taps[3]
+    for k in range(at.size):
+        inside = (at[k] >= 1.0) & (at[k] <= last)  # false for NaN
+        at[k] = at[k] if inside else np.nan
+    for k in range(at.size):
+        i = int(at[k]) if at[k] >= 1.0 else 1
+        a[k], b[k], c[k], d[k] = row[i - 1], row[i], row[i + 1], row[i + 2]
+    for k in range(at.size):
+        value = four_point_value(a[k], b[k], c[k], d[k], at[k] - np.floor(at[k]))
+        known = (a[k] != 0.0) & (b[k] != 0.0) & (c[k] != 0.0) & (d[k] != 0.0)
+        out[k] = value if known else np.nan
 
 
 @kernel
-def _warp(image: NDArray, at: Floats, out: Floats) -> None:
-    for y in range(len(at)):
-        for k in range(at.shape[1]):
-            out[y, k] = value_in_row(image, y, at[y, k])
+def _warp(image: NDArray, x: Floats, out: Floats) -> None:
+    at, taps = np.empty(x.shape[1]), np.empty((4, x.shape[1]), image.dtype)
+    for y in range(len(x)):
+        at[:] = x[y]
+        values_in_row(image[y], at, taps, out[y])
 
 
 def warp_rows(image: NDArray[np.floating], x: Floats) -> Floats:

@@ -22,7 +22,7 @@ from ..dataset.tile_classes import BUILDING, VEGETATION
 from ..dataset.warped_tile import warp_tile
 from ..epipolar.warping import CorrelationSum
 from ..numerics.error_sums import ErrorSum
-from ..products import pictures
+from ..pages import pictures
 from ..products.files import read_table, write_table
 from ..products.grids import require_complete
 from ..products.rasters import read_tile
@@ -267,20 +267,20 @@ def _draw_sift(
             weights = np.full(errors.size, 100.0 / errors.size)
             axis.hist(errors, bins, weights=weights, histtype="step", color=colour, label=label)
     axis.axvline(0.0, color="0.6", linewidth=0.8)
-    axis.set(xlabel="SIFT disparity less label, px", ylabel="% of the matches in 0.05 px")
+    axis.set(xlabel="SIFT disparity − label, px", ylabel="% of the matches in 0.05 px")
     if axis.get_legend_handles_labels()[0]:
         axis.legend(loc="upper left", fontsize=8)
     axis.set_title(f"{city}: SIFT matches against the labels")
     for line, (scene, found) in enumerate(maps.items(), start=1):
         rows, cols = found.shape
         for column, (values, title) in enumerate(
-            zip(found.medians(), ("SIFT disparity less label", "y-parallax"))
+            zip(found.medians(), ("SIFT disparity − label", "y-parallax"))
         ):
             axis = figure.add_subplot(grid[line, column])
             axis.set_facecolor("0.85")
             extent = (0, -(-cols // CELL_PX) * CELL_PX, -(-rows // CELL_PX) * CELL_PX, 0)
             shown = axis.imshow(
-                values, cmap=pictures.DIFFERENCES, vmin=-0.5, vmax=0.5, extent=extent
+                values, cmap=f"{pictures.DIFFERENCES}_r", vmin=-0.5, vmax=0.5, extent=extent
             )
             axis.set(xlabel="x in px of the epipolar grid", ylabel="y in px")
             axis.set_title(f"{scene}: {title}, median of {CELL_PX} × {CELL_PX} px", fontsize=10)

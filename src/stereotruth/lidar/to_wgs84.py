@@ -13,7 +13,7 @@ Rules
 - Orthometric heights H need a geoid grid: h = H + N. Grids give N above the GRS 80 or WGS 84
   ellipsoid. Nothing is ever downloaded.
 - Map projections are undone by polynomials that are checked against PROJ at run time, see
-  :mod:`stereotruth.lidar.projection_polynomials`; a coordinate may come out one step of 1e-9
+  :mod:`stereotruth.lidar.smooth_maps`; a coordinate may come out one step of 1e-9
   degree beside PROJ's.
 - Frames that are known to centimetres go to ITRF2020 at the date of the images
   (:mod:`stereotruth.lidar.frames`): WGS 84 as RPCs mean it. Geoid grids count from the frame of
@@ -45,7 +45,7 @@ from ..errors import InputError
 from ..numerics.degrees import continuous, turn
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
-from .projection_polynomials import PatchedTransform
+from .smooth_maps import PatchedTransform
 
 if TYPE_CHECKING:
     from .geoid import GeoidGrid

@@ -1,4 +1,4 @@
 """Files and stores that are whole or absent, and what they were made of.
 
-In: arrays, records, figures. Out: files, folders, Zarr grids. It knows no stage.
+In: arrays, records. Out: files, folders, Zarr grids. It knows no stage.
 """

@@ -1,7 +1,7 @@
 """The figures on top of a city's page, most important first; the page folds all but six.
 
 What images and control points say of a scene is as ``export.json`` has it and as the last lines of
-a run print it: over all matches and all labelled pixels of a scene.
+a run print it: over all matches and all labelled pixels of a scene. More of it is in the tables.
 """
 
 from __future__ import annotations
@@ -13,18 +13,12 @@ from typing import Any
 import numpy as np
 
 from ..dataset.label_doubts import ABOUT, ALIGNMENT, LIDAR
+from ..dataset.sift_matches import SIFT_NOISE_PX
 from ..dataset.split_names import NONE, SPLITS
-from ..products.html_tables import Headline, metres, minus, missed, number, spread
+from ..pages.tables import Headline, joined, metres, minus, missed, number, spread
 
 Rows = Sequence[Mapping[str, str]]
 Records = Mapping[str, Mapping[str, Any]]
-TRUTH = (  # title, column of the truth's table, form, factor, unit, remark
-    ("off by more than 1 px", "share_over_1_px", ".3f", 100, " %", "of the labels, by truth"),
-    ("visible pixels labelled", "share_of_visible_labelled", ".2f", 100, " %", "by truth"),
-    ("hidden pixels labelled", "share_of_hidden_labelled", ".2f", 100, " %", "by truth"),
-    ("y-parallax", "y_parallax_rms_px", ".3f", 1, " px", "rms, by truth"),
-    ("within uncertainty", "share_below_1_uncertainty", ".1f", 100, " %", "68.3 % is right"),
-)
 
 
 def headlines(
@@ -32,30 +26,32 @@ def headlines(
     alignments: Records,
     refined: Records,
     truth: Rows,
-    quality: Mapping[str, Any],
+    export: Mapping[str, Any],
     height_m_per_px: float | None = None,
 ) -> list[Headline]:
     """The figures of a city; those whose input is missing are left out.
 
-    ``rows`` of the manifest, ``truth`` of truth.csv, ``quality`` of export.json; ``alignments``,
+    ``rows`` of the manifest, ``truth`` of truth.csv, ``export``: export.json; ``alignments``,
     ``refined`` by scene; ``height_m_per_px``: metres of height for one px of disparity.
     """
+    quality = export.get("quality", {})
     labelled = [row for row in rows if row["complete"] == "yes"]
     scenes = list(quality.get("scenes", {}).values())
-    found = [_pairs(rows, labelled)]
+    by_scope = {row["scope"]: row for row in truth}
+    best = by_scope.get("tiles") or by_scope.get("scene") or {}
+    found = _uncertainty(export.get("label_uncertainty", {}), height_m_per_px)
+    error = number(best.get("mean_absolute_px", ""))
+    if error is not None:
+        note = joined("mean absolute", metres(error, height_m_per_px))
+        found.append(Headline("error against the truth", f"{error:.3f} px", note))
+    found.append(_pairs(rows, labelled))
     shares = [s for row in labelled if (s := number(row["labelled_share"])) is not None]
     if shares:
         note = f"per tile {spread([100 * s for s in shares], '.0f')} %"
         found.append(Headline("pixels labelled", f"{100 * np.mean(shares):.1f} %", note))
     if "quality" in rows[0]:
         found.append(_gates(labelled, quality))
-    by_scope = {row["scope"]: row for row in truth}
-    best = by_scope.get("tiles") or by_scope.get("scene") or {}
-    error = number(best.get("mean_absolute_px", ""))
-    if error is not None:
-        note = _and("mean absolute", metres(error, height_m_per_px))
-        found.append(Headline("error against the truth", f"{error:.3f} px", note))
-    found += _of_images(scenes, height_m_per_px)
+    found += _sift(scenes, height_m_per_px)
     if alignments:
         found.append(_gcps(alignments, refined))
     if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
@@ -68,12 +64,23 @@ def headlines(
         text = minus(f"{min(low):.0f} … {max(high):.0f} px")
         note = metres(max(high) - min(low), height_m_per_px) or "of the tiles"
         found.append(Headline("disparities", text, note))
-    found += _ties(refined)
-    for title, name, form, factor, unit, note in TRUTH:
-        value = number(best.get(name, ""))
-        if value is not None:
-            found.append(Headline(title, minus(format(factor * value, form)) + unit, note))
     return found
+
+
+def _uncertainty(by: Mapping[str, Any], height_m_per_px: float | None) -> list[Headline]:
+    """How well labels are known by what they state: of all, and by what they lie on."""
+    if "all" not in by:
+        return []
+    median, most = (by["all"][f"uncertainty_{name}_px"] for name in ("median", "p95"))
+    surfaces = ", ".join(
+        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2g}"
+        for name, of in by.items()
+        if name != "all"
+    )
+    note = joined(
+        f"median; {most:.2g} px for 95 %", metres(median, height_m_per_px), f"medians: {surfaces}"
+    )
+    return [Headline("labels known to", f"{median:.2g} px", note)]
 
 
 def _lidar(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
@@ -125,8 +132,8 @@ def _dates(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline
     text = f"{min(d[0] for d in days)} to {max(d[1] for d in days)}" if days else "not known"
     some = f"of {len(days)} of {len(scenes)} scenes" if 0 < len(days) < len(scenes) else ""
     note = f"heights of different surfaces: {'; '.join(surfaces)}" if mixed else ""
-    parts = some, _days_to_images(labelled), note
-    return [Headline("LiDAR measured", text, _and(*filter(None, parts)), mixed)]
+    note = joined(some, _days_to_images(labelled), note)
+    return [Headline("LiDAR measured", text, note, mixed)]
 
 
 def _days_to_images(labelled: Rows) -> str:
@@ -141,15 +148,11 @@ def _days_to_images(labelled: Rows) -> str:
     return f"images {text} days {'later' if high > 0 else 'earlier'}"
 
 
-def _and(*parts: str) -> str:
-    return "; ".join(part for part in parts if part)
-
-
 def _pairs(rows: Rows, labelled: Rows) -> Headline:
     counts = [(s, sum(row["split"] == s for row in labelled)) for s in (*SPLITS, NONE)]
     note = ", ".join(f"{n} {s if s != NONE else 'of no split'}" for s, n in counts if n)
     if more := len(rows) - len(labelled):
-        note = _and(note, f"{more} more without full labels")
+        note = joined(note, f"{more} more without full labels")
     return Headline("labelled pairs", str(len(labelled)), note)
 
 
@@ -166,40 +169,27 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     doubted = [s for s, of in doubts.items() if any(d.get("of") not in ABOUT for d in of)]
     told = [s for s, of in doubts.items() if any(map(_is_told, of))]
     if doubted:
-        note = _and(note, f"images and labels disagree in {', '.join(doubted)}")
+        note = joined(note, f"images and labels disagree in {', '.join(doubted)}")
     if told:
-        note = _and(note, f"alignment or LiDAR of {', '.join(told)} in doubt")
+        note = joined(note, f"alignment or LiDAR of {', '.join(told)} in doubt")
     text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
     return Headline("limits of quality", text, note, bool(bad or scenes or doubted or told))
 
 
-def _of_images(
-    scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None
-) -> list[Headline]:
-    """What the images say of the labels, scene by scene."""
-    found = []
-
-    def values(name: str) -> list[float]:
-        return [float(of[name]) for of in scenes if of.get(name) is not None]
-
-    def of(count: int) -> str:
-        return "" if count == 1 else f"{count} scenes"
-
-    if errors := values("sift_mean_absolute_error_px"):
-        matches = f"{sum(values('sift_matches')):.0f} matches, mean absolute"
-        height = metres(max(errors), height_m_per_px)
-        note = _and(of(len(errors)), matches, height and f"≤ {height}" if errors[1:] else height)
-        found.append(Headline("SIFT disparity minus label", f"{spread(errors, '.2f')} px", note))
-    if medians := values("y_parallax_median_px"):
-        text = f"{spread(medians, '+.2f')} px"
-        note = _and(
-            of(len(medians)), f"median; rms {spread(values('y_parallax_rms_px'), '.2f')} px"
-        )
-        found.append(Headline("y-parallax of matches", text, note))
-    if known := values("warp_correlation"):
-        note = _and(of(len(known)), "correlation over the labelled pixels")
-        found.append(Headline("left and warped right", spread(known, ".3f"), note))
-    return found
+def _sift(scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None) -> list[Headline]:
+    """What SIFT matches say of the labels, scene by scene, and SIFT's own noise."""
+    of = [scene for scene in scenes if scene.get("sift_mean_absolute_error_px") is not None]
+    if not of:
+        return []
+    errors = [float(scene["sift_mean_absolute_error_px"]) for scene in of]
+    height = metres(max(errors), height_m_per_px)
+    note = joined(
+        f"{len(of)} scenes" if of[1:] else "",
+        f"{sum(scene['sift_matches'] for scene in of)} matches, mean absolute",
+        f"about {SIFT_NOISE_PX:g} px of it SIFT's own",
+        height and f"≤ {height}" if of[1:] else height,
+    )
+    return [Headline("SIFT disparity − label", f"{spread(errors, '.2f')} px", note)]
 
 
 def _gcps(alignments: Records, refined: Records) -> Headline:
@@ -215,15 +205,3 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
     if refined:
         note += f", {rms(refined, 'after')} px after refinement"
     return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
-
-
-def _ties(refined: Records) -> list[Headline]:
-    ties = [record.get("refinement", {}) for record in refined.values()]
-    if not any(tie.get("after") for tie in ties):
-        return []
-
-    def parallax(when: str) -> str:
-        return spread([tie.get(when, {}).get("y_parallax", {}).get("rms") for tie in ties], ".2f")
-
-    note = f"rms; {parallax('before')} px before refinement"
-    return [Headline("y-parallax of tie points", f"{parallax('after')} px", note)]

@@ -4,93 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
 
-from ..epipolar import site_pairs
 from ..epipolar.linked_images import Links
-from ..epipolar.pair_quality import rate
+from ..epipolar.pair_geometry import ray_upwards
+from ..epipolar.pair_quality import RatedPair
+from ..epipolar.site_pairs import SiteImage
 from ..numerics.degrees import metres_per_degree
-from ..products.charts import Axis
-from ..products.html_page import way, write_page
-from ..products.html_tables import Table, table
-from ..products.pictures import DISPARITIES, SERIES, gradient, round_length
+from ..pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
+from ..pages.page import way, write_page
+from ..pages.pictures import DISPARITIES, Scale
+from ..pages.tables import Table, table
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
-SIDE, WIDTH, HEIGHT = 600.0, 620.0, 360.0
 FIRST_DAY = 1.0  # below it, the axis of days is linear
-
-
-@dataclass(frozen=True)
-class SiteImage:
-    """An image: when it was taken (text), its corners on the ground as (lon, lat) degrees."""
-
-    name: str
-    acquired: str
-    corners: Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A pair of images; ``matched``: predicted share; ``scene`` that is made of it, or empty."""
-
-    left: str
-    right: str
-    matched: float
-    convergence: float
-    days: float | None
-    reason: str
-    scene: str
-
-
-def image_of(image: site_pairs.SiteImage) -> SiteImage:
-    """An image with its corners at the height of its RPC."""
-    cols, rows = image.size
-    lon, lat = image.sensor.localize(
-        np.array([0.0, cols - 1.0, cols - 1.0, 0.0]),
-        np.array([0.0, 0.0, rows - 1.0, rows - 1.0]),
-        float(image.sensor.rpc.height_off),
-    )
-    corners = [(float(x), float(y)) for x, y in zip(lon, lat)]
-    return SiteImage(image.name, "" if image.time is None else f"{image.time:%Y-%m-%d}", corners)
-
-
-def pairs_of(
-    images: Sequence[site_pairs.SiteImage],
-    scenes: Mapping[str, tuple[str, str]],
-    roughness_m: float | None,
-) -> list[Pair]:
-    """All pairs of a site, best first.
-
-    ``scenes``: names of the images of each, in any order; ``roughness_m`` of the site, None: not
-    known.
-    """
-    names = {frozenset(pair): scene for scene, pair in scenes.items()}
-    return [
-        Pair(
-            one.pair.left,
-            one.pair.right,
-            one.quality.matched,
-            one.pair.convergence,
-            one.pair.days,
-            one.quality.reason,
-            names.get(frozenset((one.pair.left, one.pair.right)), ""),
-        )
-        for one in rate(images, roughness_m)
-    ]
 
 
 def write_site_page(
     city: str,
     images: Sequence[SiteImage],
-    pairs: Sequence[Pair],
+    pairs: Sequence[RatedPair],
     out: str | Path,
     *,
+    scenes: Mapping[str, Sequence[str]],
     adjusted: Mapping[str, Any],
     closure: Mapping[str, Any],
     page: str | Path | None,
@@ -98,114 +37,161 @@ def write_site_page(
 ) -> None:
     """Write the page of a site to ``out``.
 
-    ``adjusted``, ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there
-    are none; ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all
-    pages.
+    ``pairs``: best first; ``scenes``: names of the images of each, in any order; ``adjusted``,
+    ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there are none;
+    ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all pages.
     """
+    names = {frozenset(pair): scene for scene, pair in scenes.items()}
+    rows = _pair_rows(pairs, names)
+    made = [pair.names for pair in pairs if frozenset(pair.names) in names]
     values = {
         "city": city,
         "index": way(out, index),
         "page": way(out, page),
         "map": _map(images),
-        "pairs": _chart(pairs),
-        "table": _pairs_table(pairs, way(out, page)),
+        "chart_of_pairs": _chart(rows, way(out, page)),
+        "images": _images_table(images),
+        "pairs": _pairs_table(rows, way(out, page)),
+        "counts": (len(images), len(pairs), len(made)),
         "residuals": _residuals(adjusted),
         "remarks": _remarks(adjusted),
         "closure": _closure(closure),
-        "qualities": gradient(DISPARITIES),
-        "scenes": [pair.scene for pair in pairs if pair.scene],
-        "images": images,
-        "unlinked": _unlinked(images, pairs),
+        "qualities": Scale.of(DISPARITIES, "0", "100 % matched"),
+        "unlinked": Links.of((image.name for image in images), made).sentences,
     }
     write_page(out, TEMPLATE, values)
 
 
-def _unlinked(images: Sequence[SiteImage], pairs: Sequence[Pair]) -> list[str]:
-    """Images that no scene uses, and groups that none links."""
-    made = [(pair.left, pair.right) for pair in pairs if pair.scene]
-    return Links.of((image.name for image in images), made).sentences
+def _pair_rows(
+    pairs: Sequence[RatedPair], scenes: Mapping[frozenset[str], str]
+) -> list[dict[str, str]]:
+    """Rows of the pairs: angles, days, what each promises, the scene that is made of it."""
+    return [
+        {
+            "left": one.pair.left,
+            "right": one.pair.right,
+            "scene": scenes.get(frozenset(one.names), ""),
+            "matched_share": f"{one.quality.matched:.4f}",
+            "height_sigma_m": f"{one.quality.height_sigma_m:.2f}",
+            "height_of_1_px_m": f"{one.pair.metres_per_px:.2f}",
+            "convergence_degrees": f"{one.pair.convergence:.1f}",
+            "days": "" if one.pair.days is None else f"{one.pair.days:.2f}",
+            "reason": one.quality.reason,
+        }
+        for one in pairs
+    ]
 
 
-def _map(images: Sequence[SiteImage]) -> dict[str, Any]:
-    """Footprints north up in an SVG view box (y down), and a bar for the scale."""
-    every = np.array([corner for image in images for corner in image.corners])
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2
-    metres = np.array(metres_per_degree(float(middle[1])))
-    extent = np.ptp(every, axis=0) * metres
-    scale = SIDE / float(extent.max())
-    width, height = (float(v) for v in extent * scale)
-    shapes = []
+def _corners(image: SiteImage) -> np.ndarray:
+    """[4, (lon, lat)] degrees, at the height of the image's RPC."""
+    cols, rows = image.size
+    lon, lat = image.sensor.localize(
+        np.array([0.0, cols - 1.0, cols - 1.0, 0.0]),
+        np.array([0.0, 0.0, rows - 1.0, rows - 1.0]),
+        float(image.sensor.rpc.height_off),
+    )
+    return np.stack([lon, lat], axis=1)
+
+
+def _acquired(image: SiteImage) -> str:
+    return "" if image.time is None else f"{image.time:%Y-%m-%d %H:%M}"
+
+
+@styled
+def _map(images: Sequence[SiteImage]) -> Chart:
+    """Footprints, north up, in metres from their south-west corner."""
+    corners = {image.name: _corners(image) for image in images}
+    every = np.concatenate(list(corners.values()))
+    corner = every.min(axis=0)
+    metres = np.array(metres_per_degree(float(every[:, 1].mean())))
+    east, north = np.ptp(every, axis=0) * metres
+    plot = Plot.of(
+        "footprints of the images",
+        "Footprints at the height of each image's RPC; names on hover.",
+        (5.6, 1.2 + 4.6 * min(north / east, 1.6) + 0.17 * min(len(images), 6)),
+    )
+    table = []
     for k, image in enumerate(images):
-        x, y = ((np.array(image.corners) - middle) * metres * scale * (1, -1)).T
-        x, y = x + width / 2, y + height / 2
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y))
-        colour = SERIES[k % len(SERIES)]
-        shapes.append(
-            {"name": image.name, "day": image.acquired, "points": points, "colour": colour}
+        x, y = ((corners[image.name] - corner) * metres).T
+        style = look(k)
+        (shape,) = plot.axis.fill(x, y, facecolor="none", edgecolor=style["color"], linewidth=1.6)
+        shape.set(linestyle=style["linestyle"], label=image.name)
+        plot.hover(shape, [f"{image.name} {_acquired(image)}".strip()])
+        table += [
+            {"image": image.name, "lon": f"{lon:.7f}", "lat": f"{lat:.7f}"}
+            for lon, lat in corners[image.name]
+        ]
+    on_the_ground(plot.axis)
+    if len(images) <= 6:
+        plot.figure.legend(loc="outside lower center", ncols=3)
+    return plot.chart(table)
+
+
+@styled
+def _chart(rows: Sequence[Mapping[str, str]], page: str | None) -> Chart | None:
+    """Pairs with dates by convergence and days, coloured by their quality; scenes are squares."""
+    dated = [row for row in rows if row["days"]]
+    if not dated:
+        return None
+    undated = len(rows) - len(dated)
+    more = f" Without dates, so in the table alone: {undated}." if undated else ""
+    plot = Plot.of(
+        "pairs by convergence and days",
+        "Colour: predicted share of the pixels seen in both images that matching finds within "
+        f"1 px. Large squares are scenes.{more}",
+        (6.4, 4.4),
+    )
+    for is_scene, marker, size in ((False, "o", 36), (True, "s", 90)):
+        of = [row for row in dated if bool(row["scene"]) == is_scene]
+        if not of:
+            continue
+        convergence, days, matched = (
+            [float(row[name]) for row in of]
+            for name in ("convergence_degrees", "days", "matched_share")
         )
-    bar_m = round_length(float(extent[0]) / 4)
-    return {
-        "width": round(width, 1),
-        "height": round(height, 1),
-        "shapes": shapes,
-        "bar": round(bar_m * scale, 1),
-        "bar_m": bar_m,
-    }
+        marks = plot.axis.scatter(
+            convergence, days, s=size, marker=marker, c=matched,
+            cmap=DISPARITIES, vmin=0, vmax=1, edgecolors=AXES, linewidths=1.2,
+        )  # fmt: skip
+        texts = [
+            f"{row['scene'] + ': ' if is_scene else ''}{row['left']} and {row['right']}: "
+            f"{100 * float(row['matched_share']):.0f} %, {row['convergence_degrees']}°, "
+            f"{row['days']} days; {row['reason']}"
+            for row in of
+        ]
+        links = [f"{page}#scene-{row['scene']}" if page and is_scene else "" for row in of]
+        plot.hover(marks, texts, links)
+    plot.axis.set_yscale("symlog", linthresh=FIRST_DAY)
+    plot.axis.set(xlabel="convergence, degrees", ylabel="days apart", xlim=(0, None))
+    longest = max(float(row["days"]) for row in dated)
+    plot.axis.set_ylim(-0.2, 1.5 * max(longest, FIRST_DAY))
+    plot.axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    return plot.chart(dated)
 
 
-def _chart(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Pairs with dates by convergence and days, coloured by their quality."""
-    dated = [(pair, pair.days) for pair in pairs if pair.days is not None]
-    x = Axis(0.0, max([pair.convergence for pair in pairs], default=1.0) * 1.05, WIDTH)
-    longest = max([days for _, days in dated], default=1.0) * 1.1
-    y = Axis(0.0, max(longest, FIRST_DAY), HEIGHT, turned=True, linear_to=FIRST_DAY)
-    points = [
-        {
-            "x": x.at(pair.convergence),
-            "y": y.at(days),
-            "colour": to_hex(colormaps[DISPARITIES](pair.matched)),
-            "scene": pair.scene,
-            "text": f"{pair.left} and {pair.right}: {100 * pair.matched:.0f} %, "
-            f"{pair.convergence:.1f} degrees, {days:.2f} days; {pair.reason}",
-        }
-        for pair, days in dated
-    ]
-    return {
-        "width": WIDTH,
-        "height": HEIGHT,
-        "points": points,
-        "x_ticks": x.ticks(),
-        "y_ticks": [(at, text) for at, text in y.ticks() if "." not in text],
-        "undated": len(pairs) - len(dated),
-    }
+def _images_table(images: Sequence[SiteImage]) -> Table | None:
+    """When and from where each image was taken, angles at its middle."""
+    rows = []
+    for image in images:
+        cols, lines = image.size
+        middle = (cols - 1) / 2, (lines - 1) / 2, float(image.sensor.rpc.height_off)
+        upwards = float(ray_upwards(image.sensor, *middle)[2])
+        rows.append(
+            {
+                "image": image.name,
+                "acquired (UTC)": _acquired(image),
+                "off_nadir_degrees": f"{math.degrees(math.acos(min(upwards, 1.0))):.1f}",
+                "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
+                "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),
+            }
+        )
+    return table(rows)
 
 
-def _pairs_table(pairs: Sequence[Pair], page: Path | None) -> Table | None:
+def _pairs_table(rows: Sequence[Mapping[str, str]], page: str | None) -> Table | None:
     """All pairs; those that are scenes lead to their part of the page."""
-    rows = [
-        {
-            "left": pair.left,
-            "right": pair.right,
-            "scene": pair.scene,
-            "matched_share": f"{pair.matched:.4f}",
-            "convergence_degrees": f"{pair.convergence:.1f}",
-            "days": "" if pair.days is None else f"{pair.days:.2f}",
-            "reason": pair.reason,
-        }
-        for pair in pairs
-    ]
-    made = table(rows)
-    if made is None or page is None:
-        return made
-    ((heading, lines),) = made.groups
-    at = list(rows[0]).index("scene")
-    linked = [
-        (*cells[:at], replace(cells[at], href=f"{page}#scene-{pair.scene}"), *cells[at + 1 :])
-        if pair.scene
-        else cells
-        for cells, pair in zip(lines, pairs)
-    ]
-    return replace(made, groups=((heading, tuple(linked)),))
+    scenes = [row["scene"] for row in rows if row["scene"]] if page else []
+    return table(rows, links={"scene": {scene: f"{page}#scene-{scene}" for scene in scenes}})
 
 
 def _number(value: Any, form: str = ".3f") -> str:

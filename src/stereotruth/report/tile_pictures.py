@@ -3,49 +3,40 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..dataset.quick_looks import status_colours
 from ..dataset.warped_tile import warp_tile
-from ..products import pictures
-from ..products.pictures import Picture, encode, hillshade
+from ..pages import pictures
+from ..pages.pictures import Layer, Picture, Scale, encode, hillshade
+from ..pages.tables import minus
 from ..products.rasters import read_flags, read_image, read_tile
-from ..status import BY_LABEL
-from .relief import Relief
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
-NO_DIFFERENCE = (178, 182, 188)  # and in the difference
 GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
 DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
 
 
+LARGE = ("left", "warped right", "left − warped right", "disparity", "hillshade")
+
+
 @dataclass
 class TilePictures:
-    """Data URIs of a tile by name, and what they show.
+    """Data URIs of a tile's thumbnails by name, and what they show.
 
-    ``disparity_px``: percentiles 1 and 99 of the labels; ``difference_dn``: limit of the
-    difference's colours in the image's units; ``correlation`` of left and warped right image;
-    ``relief``: the grid of the 3-D view.
+    ``disparity_px``: percentiles 1 and 99 of the labels; ``layers``: large pictures, ``LARGE``, to
+    be laid over each other; ``correlation`` of left and warped right image.
     """
 
     uris: dict[str, str]
     disparity_px: tuple[float, float] | None = None
-    difference_dn: float | None = None
+    layers: dict[str, Layer] = field(default_factory=dict)
     correlation: float | None = None
-    relief: Relief | None = None
-
-
-@dataclass(frozen=True)
-class Large:
-    """Of the large pictures of a tile: longer side in px, bytes of each, side of the 3-D grid."""
-
-    side: int
-    limit: int
-    grid: int
 
 
 def disparity_counts(folder: Path, row: Mapping[str, str]) -> Counter[int]:
@@ -72,14 +63,6 @@ def disparity_limits(counted: Iterable[Mapping[int, int]]) -> tuple[float, float
     return float(low), float(high + 1)
 
 
-def status_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
-    known = {name: BY_LABEL[name].colour for name in names if name in BY_LABEL}
-    unknown = [name for name in names if name not in known]
-    other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
-    return known | other
-
-
 def _shown(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
     lut = np.rint(255.0 * np.linspace(0, 1, 256) ** GAMMA).astype(np.uint8)
     return lut[pictures.stretch(image, limits=limits)]
@@ -99,16 +82,15 @@ def tile_pictures(
     row: Mapping[str, str],
     *,
     thumbnail: tuple[int, int],
-    large: Large | None,
+    large: tuple[int, int] | None,
     limits_px: tuple[float, float] | None,
     base_to_height: float = 1.0,
 ) -> TilePictures:
     """The pictures of one tile; ``row`` is its line of the manifest in ``folder``.
 
-    ``thumbnail``: longer side in px and bytes of each picture; without ``large`` there is no
-    warped image, no difference, no hillshade and no 3-D view. A pair without labels has its images
-    only. ``limits_px``: of the colours of disparity; ``base_to_height``: px of disparity for a px
-    of height.
+    ``thumbnail``, ``large``: longer side in px and bytes of each picture; without ``large`` there
+    are no ``layers``. A pair without labels has its images only. ``limits_px``: of the colours of
+    disparity; ``base_to_height``: px of disparity for a px of height.
     """
     folder = Path(folder)
     side, size = thumbnail
@@ -134,33 +116,43 @@ def tile_pictures(
     result.disparity_px = low, high
     coloured = pictures.colours(disparity, limits_px)
     result.uris["disparity"] = encode(pictures.shrink(coloured, side), size)
-    if large is not None:
-        shaded = hillshade(disparity, base_to_height)
-        _large_pictures(result, folder, row, large, {"disparity": coloured, "hillshade": shaded})
-        result.relief = Relief.of(disparity, base_to_height, large.grid)
+    if large is not None and limits_px is not None:
+        ends = (minus(f"{value:.0f} px") for value in limits_px)
+        layers = {
+            "disparity": (coloured, Scale.of(pictures.DISPARITIES, *ends)),
+            "hillshade": (hillshade(disparity, base_to_height), None),
+        }
+        _add_large(result, folder, row, large, layers)
     return result
 
 
-def _large_pictures(
+def _add_large(
     result: TilePictures,
     folder: Path,
     row: Mapping[str, str],
-    large: Large,
-    layers: Mapping[str, Picture],
+    large: tuple[int, int],
+    layers: Mapping[str, tuple[Picture, Scale | None]],
 ) -> None:
-    """Add the large pictures, named ``slider_…``: the ``layers``, left, warped, difference."""
+    """Add the large pictures: left, warped, difference, and the ``layers``."""
     tile = warp_tile(folder, row)
-    limits = _limits(tile.left)
-    sums = tile.sums
-    matched = sums.match(tile.warped)
+    low, high = _limits(tile.left)
+    matched = tile.sums.match(tile.warped)
     nothing = ~np.isfinite(matched)
-    spread = max(DIFFERENCE * (limits[1] - limits[0]), 1e-9)
-    warped = np.repeat(_shown(np.nan_to_num(matched), limits)[..., None], 3, axis=2)
+    spread = max(DIFFERENCE * (high - low), 1e-9)
+    warped = np.repeat(_shown(np.nan_to_num(matched), (low, high))[..., None], 3, axis=2)
     warped[nothing] = NO_MATCH
     difference = pictures.colours(tile.left - matched, (-spread, spread), pictures.DIFFERENCES)
-    difference[nothing] = NO_DIFFERENCE
-    images = {"left": _shown(tile.left, limits), "warped": warped, "difference": difference}
-    for name, picture in {**images, **layers}.items():
-        result.uris[f"slider_{name}"] = encode(pictures.shrink(picture, large.side), large.limit)
-    result.difference_dn = spread
-    result.correlation = sums.coefficient if np.isfinite(sums.coefficient) else None
+    scale = Scale.of(pictures.DIFFERENCES, f"−{spread:.0f} DN", f"+{spread:.0f} DN")
+    made = {
+        "left": (_shown(tile.left, (low, high)), None),
+        "warped right": (warped, None),
+        "left − warped right": (difference, scale),
+        **layers,
+    }
+    side, limit = large
+    result.layers = {
+        name: Layer(encode(pictures.shrink(picture, side), limit), scale)
+        for name, (picture, scale) in made.items()
+    }
+    correlation = tile.sums.coefficient
+    result.correlation = correlation if np.isfinite(correlation) else None

@@ -24,7 +24,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar.one_surface import SURFACE_PX
+from ..epipolar.window_sums import SURFACE_PX
 from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
 from ..numerics.triangles import plane_slopes, row_span

@@ -16,7 +16,7 @@ from stereotruth.disparity.change_evidence import (
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
-from stereotruth.epipolar.surface_correlation import BLOCK
+from stereotruth.epipolar.window_sums import BLOCK
 
 from ...synthetic.textured_fields import (
     ALL,

@@ -7,9 +7,9 @@ import pytest
 
 from stereotruth.disparity.image_agreement import Comparison, contradicted
 from stereotruth.disparity.image_patches import read_patch
+from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
-from stereotruth.disparity.surface_means import apart_from_steps, surface_mean, warp_to_left
-from stereotruth.epipolar.surface_correlation import surface_correlation
+from stereotruth.epipolar.surface_windows import apart_from_steps, surface_correlation
 
 from ...synthetic import textured_fields as fields
 
@@ -26,71 +26,17 @@ def test_warp_samples_at_x_less_disparity() -> None:
     image = np.broadcast_to(np.round(500 + 2 * x + 0.01 * x * x), (40, 200)).astype(np.uint16)
     rows, cols = slice(5, 25), slice(60, 120)
     patch = read_patch(image, rows, slice(0, 200), 9)
+    window = PairWindow(rows, cols, 0, patch, patch)
     disparity = np.full((20, 60), 10.25)
-    warped = warp_to_left(patch, rows, cols, disparity)
+    left, warped = window.images_at(disparity)
+    assert np.array_equal(left, image[rows, cols])
     at = np.arange(60, 120) - 10.25
     assert np.abs(warped - (500 + 2 * at + 0.01 * at * at)).max() < 0.6  # of the rounding
     disparity[:, :5] = np.nan
     disparity[:, 5:9] = 300.0
-    warped = warp_to_left(patch, rows, cols, disparity)
+    _, warped = window.images_at(disparity)
     assert np.isnan(warped[:, :9]).all()
     assert np.isfinite(warped[:, 9:]).all()
-
-
-def test_surface_correlation_stays_on_the_surface() -> None:
-    """Beside a step, what the other surface shows does not count."""
-    left = texture((60, 60))
-    warped = 0.7 * left + 40
-    warped[:, 30:] = texture((60, 30), seed=1)  # the upper surface shows something else
-    disparity = np.zeros((60, 60))
-    disparity[:, 30:] = 20.0
-    found = surface_correlation(left, warped, disparity, LEVEL[:, :60, :60], 9)
-    assert found[:, :30] == pytest.approx(1.0, abs=1e-5)
-    assert np.abs(found[:, 30:]).mean() < 0.25
-    # With one surface, the same pixels would be mixed.
-    mixed = surface_correlation(left, warped, np.zeros((60, 60)), LEVEL[:, :60, :60], 9)
-    assert mixed[:, 28:30].max() < 0.99
-
-
-def test_correlation_is_that_of_numpy() -> None:
-    left, warped = texture((21, 21)), texture((21, 21), seed=1)
-    warped[3, 4] = np.nan
-    found = surface_correlation(left, warped, np.zeros((21, 21)), LEVEL[:, :21, :21], 7)
-    window = np.s_[2:9, 3:10]
-    known = np.isfinite(warped[window])
-    expected = np.corrcoef(left[window][known], warped[window][known])[0, 1]
-    assert found[5, 6] == pytest.approx(expected, abs=1e-5)
-    assert np.isnan(found[3, 4])
-    assert (
-        surface_correlation(left, np.full((21, 21), 5.0), np.zeros((21, 21)), LEVEL[:, :21, :21], 7)
-        == 0
-    ).all()
-
-
-def test_surface_mean_is_that_of_the_surface() -> None:
-    values = np.ones((60, 60))
-    disparity = np.zeros((60, 60))
-    disparity[:, 30:], values[:, 30:] = 20.0, 5.0
-    values[10, 10] = np.nan
-    level = LEVEL[:, :60, :60]
-    found = surface_mean(values, disparity, level, 4, 1)
-    assert found[:, :30] == pytest.approx(1.0)
-    assert found[:, 30:] == pytest.approx(5.0)
-    assert np.isnan(surface_mean(np.full((60, 60), np.nan), disparity, level, 4, 1)).all()
-
-
-def test_a_slope_is_one_surface_and_a_low_roof_another() -> None:
-    """A hillside of 0.8 px per px is one surface; ground does not count for a roof of 3.5 px."""
-    x = np.broadcast_to(np.arange(60.0), (60, 60))
-    slope, fails = np.zeros((2, 60, 60)), np.zeros((60, 60))
-    slope[0], fails[30, 30] = 0.8, 1.0
-    assert not (surface_mean(fails, 0.8 * x, slope, 12, 3) > 0.5).any()
-    roof = np.s_[22:38, 22:38]
-    disparity, fails = np.zeros((60, 60)), np.zeros((60, 60))
-    disparity[roof], fails[roof] = 3.5, 1.0
-    changed = surface_mean(fails, disparity, np.zeros((2, 60, 60)), 12, 3) > 0.5
-    assert changed[roof].all()
-    assert changed.sum() == 256
 
 
 def test_beside_a_blurred_roof_pixels_apart_from_steps_correlate() -> None:
@@ -178,13 +124,3 @@ def test_a_roof_that_is_blurred_into_the_ground_is_no_change(diachronic: bool) -
     labels = Labels(disparity, fields.LEVEL.slope, fields.LEVEL.variance)
     found = contradicted_by(left, right, labels, diachronic=diachronic)
     assert not (found & np.isfinite(disparity))[20:-20, 20:-20].any()
-
-
-def test_steps_are_told_from_slopes() -> None:
-    x = np.arange(30.0)
-    slope = np.broadcast_to(0.6 * x, (20, 30)).copy()
-    inner = np.s_[1:-1, 1:-1]
-    assert apart_from_steps(slope)[inner].all()
-    slope[:, 15:] += 2.0
-    found = apart_from_steps(slope)
-    assert not found[:, 14:16].any() and found[inner][:, :13].all()

@@ -13,8 +13,11 @@ from stereotruth.disparity.shifted_agreement import (
     ShiftedAgreement,
     shifted_agreement,
 )
-from stereotruth.disparity.surface_means import apart_from_steps, surface_mean, surface_means
-from stereotruth.epipolar.surface_correlation import BLOCK, surface_correlation, wanted_runs
+from stereotruth.epipolar.surface_windows import (
+    apart_from_steps,
+    surface_correlation,
+    surface_mean,
+)
 
 from ...synthetic.textured_fields import (
     ALL,
@@ -126,20 +129,6 @@ def test_wanted_pixels_have_the_values_that_all_together_have(share):
         assert np.isnan(other[~wanted]).all(), name
 
 
-def test_single_pixels_at_the_borders_of_a_wide_window():
-    """Their neighbours begin or end beyond the window, which is wider than a block."""
-    rng, shape = np.random.default_rng(3), (12, 3 * BLOCK)
-    values, warped = rng.normal(size=(2, *shape))
-    flat = np.zeros(shape), np.zeros((2, *shape))
-    wanted = np.zeros(shape, np.bool_)
-    wanted[:, [0, 1, 40, BLOCK - 1, BLOCK, -2, -1]] = True
-    for of in (
-        lambda runs: surface_mean(values, *flat, 9, 1, runs),
-        lambda runs: surface_correlation(values, warped, *flat, 9, None, runs),
-    ):
-        assert np.array_equal(of(wanted_runs(wanted))[wanted], of(None)[wanted], equal_nan=True)
-
-
 @pytest.mark.parametrize("diachronic", [False, True])
 def test_beside_a_young_crown_labels_are_confirmed(diachronic: bool) -> None:
     """A crown of 3 px in the LiDAR has grown to 9 px; one that has not keeps its surroundings."""
@@ -172,30 +161,6 @@ def test_labels_that_two_lights_do_not_confirm_are_less_certain() -> None:
     assert (sure[inner] < 0.002).all() and (unsure[inner] >= 0.02).all()
     same = Comparison(9, NOISE)
     assert contradicted(LEVEL, pair(left, right), same, ALL, GROUND).variance == 0.0
-
-
-def test_means_of_images_together_are_those_of_each():
-    rng, shape = np.random.default_rng(4), (40, 300)
-    values = rng.normal(size=(5, *shape))
-    values[:, rng.uniform(size=shape) < 0.1] = np.nan
-    surface = rng.normal(scale=0.5, size=shape), rng.normal(scale=0.1, size=(2, *shape))
-    together = surface_means(values, *surface, 6, 2)
-    for one, image in zip(together, values):
-        assert np.array_equal(one, surface_mean(image, *surface, 6, 2), equal_nan=True)
-
-
-def test_the_rows_that_vote_are_those_of_the_grid() -> None:
-    """By their number, whatever row a window begins with; on a plane, so that all are near."""
-    values = np.random.default_rng(5).normal(size=(60, 80))
-    flat, first, reach, every = (np.zeros((60, 80)), np.zeros((2, 60, 80))), 7, 8, 4
-    found = surface_mean(values, *flat, reach, every, None, first)
-    row, col = 30, 40  # 37 of the grid, around which 32, 36, 40 and 44 vote
-    voters = values[[25, 29, 33, 37]][:, col - reach : col + reach + 1 : every]
-    assert np.isclose(found[row, col], voters.mean(), atol=1e-6)
-    for cut in (1, 2, 3, 4):
-        of_part = (values[cut:], flat[0][cut:], flat[1][:, cut:])
-        part = surface_mean(*of_part, reach, every, None, first + cut)
-        assert np.array_equal(part[reach:], found[cut + reach :])
 
 
 def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:

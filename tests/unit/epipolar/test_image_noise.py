@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from stereotruth.epipolar.image_noise import STEPS, NoiseCurve, pair_noise
-from stereotruth.epipolar.surface_correlation import correlation_and_expected
+from stereotruth.epipolar.surface_windows import correlation_and_expected
 
 SIDE = 400
 LEVEL = np.zeros((2, SIDE, SIDE), np.float32)

@@ -34,7 +34,7 @@ ROW = {
 
 
 def cards(scenes, height=None, rows=(ROW,), truth=()):
-    found = headlines(rows, {}, {}, truth, {"scenes": scenes}, height)
+    found = headlines(rows, {}, {}, truth, {"quality": {"scenes": scenes}}, height)
     return {card.title: card for card in found}
 
 
@@ -48,39 +48,52 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
         "share_of_pixels": {"labelled": 0.829, "no_points": 0.171},
         "disparity_px": {"min": -5.5, "max": 33.3},
         "disparity_rounding": {"largest_px": 0.0005},
+        "label_uncertainty": {},
         "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}, "doubts": {}},
     }
     said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
     found = cards({"A-1": SCENE})
-    assert found["SIFT disparity minus label"].value == "0.24 px"
-    for title in (
-        "SIFT disparity minus label",
-        "y-parallax of matches",
-        "left and warped right",
-        "pixels labelled",
-    ):
+    assert found["SIFT disparity − label"].value == "0.24 px"
+    for title in ("SIFT disparity − label", "pixels labelled"):
         assert re.search(rf"(?<![\d.]){re.escape(found[title].value)}(?!\d)", said), title
-    assert "1315 matches" in found["SIFT disparity minus label"].note
+    assert "1315 matches" in found["SIFT disparity − label"].note
 
 
 def test_several_scenes_have_their_range():
     other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
-    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity minus label"]
+    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity − label"]
     assert card.value == "0.24–0.31 px"
-    assert card.note == "2 scenes; 1400 matches, mean absolute; ≤ 0.62 m of height"
+    assert card.note == (
+        "2 scenes; 1400 matches, mean absolute; about 0.18 px of it SIFT's own; ≤ 0.62 m of height"
+    )
 
 
 def test_metres_stand_beside_px_where_the_geometry_is_known():
     truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
     found = cards({"A-1": SCENE}, height=1.03, truth=truth)
-    assert found["SIFT disparity minus label"].note.endswith("0.25 m of height")
+    assert found["SIFT disparity − label"].note.endswith("0.25 m of height")
     assert found["error against the truth"].note == "mean absolute; 0.022 m of height"
     assert found["disparities"].note == "40 m of height"
     assert cards({"A-1": SCENE})["disparities"].note == "of the tiles"
 
 
+def test_how_well_labels_are_known_comes_first_with_the_surfaces():
+    by = {
+        "all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104},
+        "open_ground": {"uncertainty_median_px": 0.03, "uncertainty_p95_px": 0.05},
+    }
+    truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
+    export = {"quality": {"scenes": {"A-1": SCENE}}, "label_uncertainty": by}
+    known, exact, *_ = headlines([ROW], {}, {}, truth, export, 1.0)
+    assert (known.title, known.value) == ("labels known to", "0.041 px")
+    assert "0.1 px for 95 %" in known.note and "open ground 0.03" in known.note
+    assert exact.value == "0.021 px"
+
+
 def test_a_missed_gate_is_among_the_first_six():
-    found = headlines([ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"scenes": {}})
+    found = headlines(
+        [ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"quality": {"scenes": {}}}
+    )
     assert any(card.bad for card in found[:6])
 
 
@@ -120,7 +133,11 @@ def test_days_from_the_lidar_to_the_images_stand_beside_its_own(left, right, sai
 
 def test_a_doubt_stands_with_the_gates():
     quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
-    (gates,) = (c for c in headlines([ROW], {}, {}, [], quality) if c.title == "limits of quality")
+    (gates,) = (
+        c
+        for c in headlines([ROW], {}, {}, [], {"quality": quality})
+        if c.title == "limits of quality"
+    )
     assert gates.bad
     assert "images and labels disagree in A-1" in gates.note
 
@@ -132,7 +149,7 @@ def test_what_alignment_and_lidar_doubt_stands_there_too():
             "scenes": {"A-1": SCENE},
             "doubts": {"A-1": [told | {"explained_by_alignment": explained}]},
         }
-        every = headlines([ROW], {}, {}, [], quality)
+        every = headlines([ROW], {}, {}, [], {"quality": quality})
         (gates,) = (c for c in every if c.title == "limits of quality")
         assert gates.bad != explained
         assert ("alignment or LiDAR of A-1 in doubt" in gates.note) != explained

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereotruth.errors import InputError
 from stereotruth.evaluation.labels_against_truth import Comparison, SceneComparison
-from stereotruth.products.html_page import INDEX
-from stereotruth.report.index_page import pages_of, write_index
+from stereotruth.pages.page import INDEX
+from stereotruth.report.index_page import pages_of, pages_with, write_index
 
 from ...browser import look, needs_chromium
 
@@ -20,6 +21,7 @@ EXPORT = {
     "labelled_pairs": 4,
     "splits": {"realised": {"train": 2, "val": 1, "test": 1, "none": 0}},
     "share_of_pixels": {"labelled": 0.8, "labelled_between": 0.029, "no_points": 0.171},
+    "label_uncertainty": {"all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104}},
     "quality": {
         "scenes": {"A-1": {"sift_mean_absolute_error_px": 0.2416}},
         "flagged_tiles": {"A_1": "max_sift_error_px"},
@@ -58,22 +60,20 @@ def folder(tmp_path):
 
 def test_figures_are_those_of_the_files(folder):
     text = write_index(folder).read_text()
-    for words in (
-        "4 labelled pairs of 256 × 256 px (2 train, 1 val, 1 test)",
-        "82.9 % of their pixels labelled",
-        "SIFT disparity minus label: 0.24 px mean absolute",
-        "error against the exact truth: 0.021 px",
-        "1 tile beyond a limit of quality",
-    ):
-        assert words in text
     rows = [
         [re.sub("<.*?>", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)]
         for row in text.split("<tr>")
     ]
-    assert ["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"] in rows
-    assert rows.index(["own", "NET", "0.500 px", "4.21 % (3 px)", "90.0 %", "7"]) < rows.index(
-        ["own", "SGM", "1.250 px", "4.21 % (3 px)", "90.0 %", "7"]
+    city = ["4", "256", "82.9 %", "0.041", "0.1", "2", "1", "1", "0.021", "0.24", "1"]
+    assert ["A b", "where the tiles are", *city, "manifest.csv"] in rows
+    net, sgm = (
+        rows.index(["own", label, f"{epe} px", "4.21 % (&gt; 3 px)", "90.0 %", "7"])
+        for label, epe in (("NET", "0.500"), ("SGM", "1.250"))
     )
+    assert net < sgm
+    heads = dict(re.findall(r'<dt>(.*?)</dt><dd class="value">(.*?)</dd>', text))
+    assert heads["labelled pairs"] == "4" and heads["train, val, test"] == "2, 1, 1"
+    assert heads["labels known to"] == "0.041 px" and heads["labels"] == "0.2 million"
     assert ["own", "12", "9", "2", "1", "pairs.csv"] in rows
 
 
@@ -97,6 +97,21 @@ def test_without_pages_there_is_no_index(tmp_path):
     put(tmp_path / INDEX, "of pages that were deleted since")
     assert write_index(tmp_path) is None
     assert not (tmp_path / INDEX).exists()
+
+
+def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="stereotruth run report"):
+        pages_with([])
+    there = [Path("audit/us3d/index.html"), Path("results/report/A/index.html")]
+    for page in there:
+        page.parent.mkdir(parents=True)
+        page.touch()
+    assert pages_with([]) == [INDEX, *there]  # the index first, which is what opens
+    assert "us3d" in INDEX.read_text(encoding="utf-8")
+    assert pages_with(["A"]) == there[1:]
+    with pytest.raises(InputError, match="no page of B"):
+        pages_with(["B"])
 
 
 @needs_chromium

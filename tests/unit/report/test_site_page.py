@@ -6,19 +6,24 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from stereotruth.report.site_page import Pair, SiteImage, write_site_page
+import numpy as np
+
+from stereotruth.epipolar.pair_quality import rate
+from stereotruth.numerics.degrees import metres_per_degree
+from stereotruth.report.site_page import write_site_page
+from stereotruth.simulate.sites import drawn_site
 
 from ...browser import look, needs_chromium
+from ...synthetic.site_sensors import exact_image
 
-IMAGES = [
-    SiteImage("A", "2024-01-02", [(10.0, 50.01), (10.02, 50.01), (10.02, 50.0), (10.0, 50.0)]),
-    SiteImage("<b>", "", [(10.01, 50.01), (10.03, 50.01), (10.03, 50.0), (10.01, 50.0)]),
-]
-PAIRS = [
-    Pair("A", "<b>", 0.9, 20.0, 0.0, "alike", "A-b"),
-    Pair("A", "C", 0.5, 10.0, 40.0, "shadows", ""),
-    Pair("A", "D", 0.1, 30.0, None, "unknown", ""),
-]
+SITE = drawn_site(3, 11, images=3, side_px=160)
+NAMES = "A", "<b>", "C"
+A, B, C = (replace(exact_image(SITE, of), name=name) for name, of in zip(NAMES, SITE.images))
+IMAGES = [A, B, replace(C, time=None, sun=None)]
+PAIRS = rate(IMAGES)
+SCENES = {"A-b": ("<b>", "A")}
+
+
 ADJUSTED = {
     "images": {
         "A": {
@@ -36,11 +41,11 @@ CLOSURE = {"site": {"labels": FIGURES}, "images": {"A": {"labels": FIGURES}, "C"
 
 
 def written(
-    folder: Path, adjusted: dict, closure: dict, page: str | None, images: list = IMAGES
+    folder: Path, adjusted: dict, closure: dict, page: str | None, scenes: dict = SCENES
 ) -> Path:
     out = folder / "index.html"
     given = {"adjusted": adjusted, "closure": closure, "page": page, "index": None}
-    write_site_page("City", images, PAIRS, out, **given)
+    write_site_page("City", IMAGES, PAIRS, out, scenes=scenes, **given)
     return out
 
 
@@ -58,35 +63,38 @@ def test_residuals_and_closure_are_shown_as_they_are(tmp_path):
     (site, image) = cells(text, "closure")
     assert (site[0], image[0]) == ("all triplets", "A")
     assert site[1:5] == ["90", "−0.001", "0.015", "0.016"]
-    assert text.count('<a href="report.html#scene-A-b"><circle') == 1  # of the pair that is a scene
+    assert text.count('<a href="report.html#scene-A-b"><use') == 1  # of the pair that is a scene
     assert '<a href="report.html#scene-A-b">A-b</a>' in text
     assert "&lt;b&gt;" in text and "<b>" not in text.partition("</header>")[2]
+    (first, _, last) = cells(text, "images")
+    assert first[0] == "A" and first[1] == f"{A.time:%Y-%m-%d %H:%M}"
+    assert first[3:] == [f"{angle:.1f}" for angle in A.sun] and last[1:] != first[1:]
+    assert last[1] == last[3] == ""
+    assert len(cells(text, "pairs")) == len(PAIRS) == 3
 
 
-def test_the_map_has_true_proportions_and_its_scale(tmp_path):
+def test_the_map_has_true_proportions(tmp_path):
     text = written(tmp_path, {}, {}, None).read_text()
-    first, second = re.findall(r'<polygon points="([^"]*)"', text)
-    x, y = zip(*(map(float, spot.split(",")) for spot in first.split()))
-    wide, high = max(x) - min(x), max(y) - min(y)
-    assert 1.27 < wide / high < 1.30  # 0.02 by 0.01 degrees at 50 degrees north
-    assert min(x) == 0 and float(second.split(",")[0]) > 0  # east is right
-    assert y[0] < y[2]  # north is up
-    metres = float(re.search(r">(\d+) m</text>", text)[1])
-    bar = float(re.search(r"v10h([\d.]+)v-10", text)[1])
-    assert abs(metres / bar - 0.02 * 71_700 / wide) < 0.05
+    path = re.search(r'<path d="([^"]*)" [^>]*/>\s*<title>A', text)[1]
+    shown = np.array(re.findall(r"[ML] ([\d.]+) ([\d.]+)", path), float)[:4] * [1, -1]
+    col, row = np.array([[0, 159, 159, 0], [0, 0, 159, 159]], float)
+    lon, lat = A.sensor.localize(col, row, float(A.sensor.rpc.height_off))
+    metres = np.stack([lon, lat], axis=1) * metres_per_degree(float(lat.mean()))
+    sides, drawn = (np.diff(ring, axis=0) for ring in (metres, shown))
+    scale = np.linalg.norm(drawn) / np.linalg.norm(sides)
+    np.testing.assert_allclose(drawn, sides * scale, atol=0.02 * np.abs(drawn).max())
 
 
 def test_sections_without_input_are_left_out(tmp_path):
     text = written(tmp_path, {}, {}, None).read_text()
-    assert re.findall(r'<section id="(\w+)"', text) == ["map", "pairs"]
-    assert "in the table alone: 1." in text
+    assert re.findall(r'<section id="(\w+)"', text) == ["map", "images", "pairs"]
+    assert "in the table alone: 2." in text
 
 
 def test_images_that_no_scene_uses_are_named(tmp_path):
-    assert 'class="alarm"' not in written(tmp_path, {}, {}, None).read_text()
-    images = [*IMAGES, replace(IMAGES[0], name="C")]
-    text = written(tmp_path, {}, {}, None, images).read_text()
-    assert "<li>1 image in no pair: C</li>" in text
+    assert "<li>1 image in no pair: C</li>" in written(tmp_path, {}, {}, None).read_text()
+    linked = written(tmp_path, {}, {}, None, SCENES | {"A-C": ("A", "C")}).read_text()
+    assert 'class="alarm"' not in linked
 
 
 @needs_chromium

@@ -28,9 +28,9 @@ from ...config.methods import Audit, AuditLimits
 from ...dataset.split_names import SPLITS
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
+from ...pages.page import way
 from ...products.files import atomic_file, atomic_folder, write_table
 from ...products.finished_pieces import Ledger
-from ...products.html_page import way
 from ...products.inputs import marks, refuse_replaced
 from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image

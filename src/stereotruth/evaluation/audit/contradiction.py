@@ -21,9 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...epipolar.one_surface import BEND, SURFACE_PX
-from ...kernels import inner, kernel
-from ...numerics.cubic_convolution import four_point_weights
+from ...epipolar.surface_windows import shifted_correlations
 from .estimates import Estimate, cells, ratio
 
 Bools = NDArray[np.bool_]
@@ -78,133 +76,17 @@ def _beats(there: Floats, here: Floats) -> Bools:
         return (there >= CLEAR) & (there - here >= MARGIN)
 
 
-@inner
-def _correlate(
-    right: Picture, values: Floats, rows: NDArray, first: NDArray, taps: Floats, n: int, shift: int
-) -> float:
-    """Correlation of n left ``values`` with the right image, ``shift`` columns on; NaN outside."""
-    sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
-    width = right.shape[1]
-    for k in range(n):
-        i = first[k] + shift
-        if i < 0 or i + 4 > width:
-            return np.nan
-        row = right[rows[k]]
-        b = (
-            taps[k, 0] * row[i]
-            + taps[k, 1] * row[i + 1]
-            + taps[k, 2] * row[i + 2]
-            + taps[k, 3] * row[i + 3]
-        )
-        a = values[k]
-        sa += a
-        sb += b
-        saa += a * a
-        sbb += b * b
-        sab += a * b
-    va, vb = saa - sa * sa / n, sbb - sb * sb / n
-    if va <= 1e-6 * saa or vb <= 1e-6 * sbb:
-        return 0.0
-    return (sab - sa * sb / n) / np.sqrt(va * vb)
-
-
-@inner
-def _best(
-    right: Picture,
-    values: Floats,
-    rows: NDArray,
-    first: NDArray,
-    taps: Floats,
-    n: int,
-    low: int,
-    high: int,
-    work: Floats,
-) -> tuple[float, int]:
-    """The best peak at column shifts low … high beyond APART_PX: correlation (NaN none), shift."""
-    best, at = np.nan, 0
-    for shift in range(low - 1, high + 2):
-        work[shift - low + 1] = _correlate(right, values, rows, first, taps, n, shift)
-    for shift in range(low, high + 1):
-        if abs(shift) < APART_PX:
-            continue
-        k = shift - low + 1
-        c = work[k]
-        peak = c >= work[k - 1] and c >= work[k + 1]  # false beside NaN
-        if peak and not c <= best:
-            best, at = c, shift
-    return best, at
-
-
-@kernel
-def _scan(
-    left: Picture,
-    right: Picture,
-    labels: Picture,
-    xs: NDArray,
-    ys: NDArray,
-    low: float,
-    high: float,
-    decoys: NDArray,
-    out: Floats,
-) -> None:
-    """Fill ``out`` [n, 4]: here, there, shift, decoy."""
-    height, width = left.shape
-    most = (2 * HALF + 1) ** 2
-    values, rows, first = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
-    other = np.empty(most, np.int64)
-    taps, between = np.empty((most, 4)), np.empty((most, 4))
-    before = np.empty(most, np.int64)
-    work = np.empty(2 * REACH_PX + 3)
-    for s in range(xs.size):
-        out[s] = np.nan
-        x0, y0 = xs[s], ys[s]
-        middle = labels[y0, x0]
-        n = 0
-        for y in range(max(y0 - HALF, 0), min(y0 + HALF + 1, height)):
-            for x in range(max(x0 - HALF, 0), min(x0 + HALF + 1, width)):
-                d = labels[y, x]
-                away = max(abs(x - x0), abs(y - y0))
-                if not abs(d - middle) <= SURFACE_PX + BEND * away:
-                    continue
-                at = x - d
-                i = int(np.floor(at))
-                values[n], rows[n], first[n] = left[y, x] - left[y0, x0], y, i - 1
-                four_point_weights(at - i, taps[n])
-                at += 0.5
-                i = int(np.floor(at))
-                before[n] = i - 1
-                four_point_weights(at - i, between[n])
-                n += 1
-        if n < MIN_SUPPORT:
-            continue
-        here = np.nan
-        for shift in range(-NEAR_PX, NEAR_PX + 1):
-            c = _correlate(right, values, rows, first, taps, n, shift)
-            if not c <= here:
-                here = c
-            if shift < NEAR_PX:
-                c = _correlate(right, values, rows, before, between, n, shift)
-                if not c <= here:
-                    here = c
-        if np.isnan(here):
-            continue
-        # a column further right is a smaller disparity
-        least = max(int(np.ceil(middle - high)), -REACH_PX)
-        most_right = min(int(np.floor(middle - low)), REACH_PX)
-        if most_right <= least:
-            continue
-        decoy = decoys[s]
-        inside = True
-        for k in range(n):
-            other[k] = rows[k] + decoy
-            inside = inside and other[k] >= 0 and other[k] < height
-        if not inside:
-            for k in range(n):
-                other[k] = rows[k] - decoy
-        out[s, 0] = here
-        out[s, 1], shift = _best(right, values, rows, first, taps, n, least, most_right, work)
-        out[s, 2] = -shift
-        out[s, 3], shift = _best(right, values, other, first, taps, n, least, most_right, work)
+def _best_peak(correlation: Floats) -> tuple[Floats, Floats]:
+    """The best peak of each row [n, odd] beyond APART_PX of the middle: correlation (NaN for none),
+    shift."""
+    middle = correlation.shape[1] // 2
+    shift = np.arange(-middle + 1, middle)
+    here = correlation[:, 1:-1]
+    peak = (here >= correlation[:, :-2]) & (here >= correlation[:, 2:])  # false beside NaN
+    score = np.where(peak & (np.abs(shift) >= APART_PX), here, -np.inf)
+    best = np.argmax(score, axis=1)
+    most = score[np.arange(len(score)), best]
+    return np.where(np.isfinite(most), most, np.nan), shift[best].astype(float)
 
 
 def scan_labels(
@@ -215,20 +97,28 @@ def scan_labels(
     ``reach``: least and largest disparity that may be right in this tile, px. Labels whose window
     leaves the right image, or holds too few labels of one surface, are not tried.
     """
-    ys, xs = (v.ravel() for v in np.mgrid[0 : left.shape[0] : STEP_PX, 0 : left.shape[1] : STEP_PX])
-    there = np.isfinite(labels[ys, xs])
-    xs, ys = xs[there], ys[there]
-    decoys = np.resize(np.array(DECOY_ROWS), xs.size)
-    out = np.empty((xs.size, 4))
-    _scan(
-        np.ascontiguousarray(left, np.float32),
-        np.ascontiguousarray(right, np.float32),
-        np.ascontiguousarray(labels, np.float32),
-        xs,
-        ys,
-        *reach,
-        decoys,
-        out,
-    )
-    tried = np.isfinite(out[:, 0])
-    return Scan(xs[tried].astype(float), ys[tried].astype(float), *out[tried].T)
+    y, x = (v.ravel() for v in np.mgrid[0 : left.shape[0] : STEP_PX, 0 : left.shape[1] : STEP_PX])
+    # a column further right is a smaller disparity
+    first = np.maximum(np.ceil(labels[y, x] - reach[1]), -REACH_PX)
+    last = np.minimum(np.floor(labels[y, x] - reach[0]), REACH_PX)
+    wide = first < last  # false without a label
+    x, y = x[wide], y[wide]
+    # and one more, beside which a peak is lower
+    limits = np.column_stack([first[wide] - 1, last[wide] + 1]).astype(np.int64)
+
+    def correlations(down: Any, limits: NDArray[np.int64], ahead: float = 0.0) -> Floats:
+        places = np.column_stack([x, y, np.broadcast_to(down, x.shape)])
+        return shifted_correlations(
+            left, right, labels, places, limits, ahead, half=HALF, least=MIN_SUPPORT
+        )
+
+    near = np.broadcast_to([-NEAR_PX, NEAR_PX], limits.shape)
+    halfway = correlations(0, near - [0, 1], 0.5)[:, :-1]
+    here = np.concatenate([correlations(0, near), halfway], axis=1).max(axis=1, initial=-1.0)
+    decoy = np.resize(np.array(DECOY_ROWS), x.size)
+    inside = (y - HALF + decoy >= 0) & (y + HALF + decoy < len(left))
+    decoy = np.where(inside, decoy, -decoy)
+    there, shift = _best_peak(correlations(0, limits))
+    by_chance, _ = _best_peak(correlations(decoy, limits))
+    out = np.stack([x, y, here, there, -shift, by_chance]).astype(float)
+    return Scan(*out[:, np.isfinite(here)])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...epipolar.one_surface import BEND, SURFACE_PX
+from ...epipolar.window_sums import BEND, SURFACE_PX
 from ...kernels import kernel
 from .estimates import Estimate, cells, ratio, share
 from .matches import Matches

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...epipolar.surface_correlation import surface_correlation
+from ...epipolar.surface_windows import surface_correlation
 from ...epipolar.warping import warp_rows
 from ...kernels import kernel
 from .estimates import Estimate, cells, location

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from ...config.methods import AuditLimits
 from ...dataset.stereo_dataset import StereoDataset
-from ...products import pictures
-from ...products.charts import HEIGHT, SHAPES, WIDTH, Axis, Chart, Point, Series
-from ...products.html_page import write_page
-from ...products.html_tables import Cell, Column, Headline, Table, minus, table, words
-from ...products.pictures import SERIES, encode, gradient
+from ...pages import pictures
+from ...pages.figures import AXES, Chart, Plot, look, styled
+from ...pages.page import write_page
+from ...pages.pictures import Scale, encode
+from ...pages.tables import Cell, Headline, Table, minus, table, value_cell, words
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX, estimate
@@ -28,11 +28,10 @@ Picture = pictures.Picture
 
 SIDE, BYTES = 460, 60_000  # of a picture
 DOT_PX = 3  # radius in the shown picture
-LIMIT_PX = 3.0  # ends of the colours of label less match
+LIMIT_PX = 3.0  # ends of the colours of label − match
 ROW_LIMIT_PX = 1.5  # and of the vertical parallax
-ERRORS = "RdYlBu_r"
+WORDS = {GOOD: "good", FAULT: "failed", UNDECIDED: "too few matches"}
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
-LOOKS = {GOOD: (SERIES[0], 0), UNDECIDED: ("#8a8a8a", 1), FAULT: (SERIES[1], SHAPES - 1)}
 COLUMNS = (
     "pair",
     "city",
@@ -88,8 +87,6 @@ def write_audit(
         ],
         "tiles": [_tile(dataset, a) for a in chosen],
         "pairs": _pairs(audited, shown),
-        "errors": gradient(ERRORS),
-        "disparities": gradient(pictures.DISPARITIES),
     }
     write_page(path, TEMPLATE, values)
 
@@ -99,12 +96,12 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     verdicts, pooled = summary["verdicts"], summary["pooled"]
     faulty = verdicts[FAULT]
     value = f"{verdicts[GOOD]} of {summary['pairs']}"
-    note = f"{faulty} faulty, {verdicts[UNDECIDED]} undecided"
+    note = f"{faulty} failed, {verdicts[UNDECIDED]} with too few matches"
     found = [Headline("pairs without fault", value, note, faulty > 0)]
     limits = summary["limits"]
     for name, title, tolerance, share in (
         ("parallax_px", "vertical parallax", limits["parallax_px"], False),
-        ("label_bias_px", "labels less matches", limits["label_bias_px"], False),
+        ("label_bias_px", "label − match", limits["label_bias_px"], False),
         ("contradicted_share", "labels contradicted", limits["contradicted_share"], True),
         ("hidden_share", "labels on hidden pixels", limits["hidden_share"], True),
     ):
@@ -119,72 +116,65 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     return found
 
 
+@styled
 def all_pairs(audited: Sequence[Audited], limits: AuditLimits, linked: set[str]) -> Chart | None:
     """All pairs that have both: label bias over vertical parallax, px; the box is tolerated.
 
     ``linked``: names of pairs that the page shows in large.
     """
-    at = {
-        a.pair.name: tuple(
-            estimate(a.figures, *where).value for where in (("rows", "parallax"), ("bias", "bias"))
-        )
-        for a in audited
-    }
+    where = ("rows", "parallax"), ("bias", "bias")
+    at = {a.pair.name: [estimate(a.figures, *of).value for of in where] for a in audited}
     at = {name: values for name, values in at.items() if np.isfinite(values).all()}
     if not at:
         return None
-    tolerances = limits.parallax_px, limits.label_bias_px
-    ends = [
-        1.3 * max(3 * tolerance, *(abs(values[k]) for values in at.values()))
-        for k, tolerance in enumerate(tolerances)
-    ]
-    x = Axis(-ends[0], ends[0], WIDTH, linear_to=tolerances[0] / 3)
-    y = Axis(-ends[1], ends[1], HEIGHT, turned=True, linear_to=tolerances[1] / 3)
-    series = []
-    for word, (colour, shape) in LOOKS.items():
-        points = tuple(
-            Point(
-                x.at(at[a.pair.name][0]),
-                y.at(at[a.pair.name][1]),
-                minus(
-                    f"{a.pair.name}: parallax {at[a.pair.name][0]:+.2f} px, "
-                    f"labels less matches {at[a.pair.name][1]:+.2f} px"
-                ),
-                href=f"#pair-{a.pair.name}" if a.pair.name in linked else "",
-            )
-            for a in audited
-            if a.verdict.word == word and a.pair.name in at
-        )
-        if points:
-            series.append(Series(f"{word}: {len(points)}", colour, shape, points=points))
-    left, right = x.at(-tolerances[0]), x.at(tolerances[0])
-    top, bottom = y.at(tolerances[1]), y.at(-tolerances[1])
     without = len(audited) - len(at)
-    return Chart(
-        title="all pairs: labels less matches over vertical parallax",
-        caption="A mark is a pair; within the box both are tolerated (faults of other kinds may "
-        "lie there, too). Linear near zero, logarithmic beyond."
+    plot = Plot.of(
+        "label − match over vertical parallax",
+        "A mark is a pair; within the box both are tolerated (faults of other kinds may lie there, "
+        "too). Linear near zero, logarithmic beyond."
         + (f" {without} pairs have not both figures." if without else ""),
-        x_title="vertical parallax, px",
-        y_title="labels less matches, px",
-        x_ticks=x.ticks(),
-        y_ticks=y.ticks(),
-        series=tuple(series),
-        band=(left, top, round(right - left, 1), round(bottom - top, 1)),
+        (6.4, 4.6),
     )
+    tolerances = limits.parallax_px, limits.label_bias_px
+    corner, size = [-t for t in tolerances], [2 * t for t in tolerances]
+    plot.axis.add_patch(Rectangle(corner, *size, facecolor=AXES, alpha=0.25))
+    values = []
+    for number, (verdict, word) in enumerate(WORDS.items()):
+        of = [a for a in audited if a.verdict.word == verdict and a.pair.name in at]
+        if not of:
+            continue
+        names = [a.pair.name for a in of]
+        x, y = zip(*(at[name] for name in names))
+        style = look(number) | {"linestyle": "none"}
+        (marks,) = plot.axis.plot(x, y, label=f"{word}: {len(of)}", **style)
+        texts = [
+            minus(f"{name}: parallax {a:+.2f} px, label - match {b:+.2f} px")
+            for name, a, b in zip(names, x, y)
+        ]
+        plot.hover(marks, texts, [f"#pair-{name}" if name in linked else "" for name in names])
+        values += [
+            {"pair": name, "verdict": word, "parallax_px": a, "label_bias_px": b}
+            for name, a, b in zip(names, x, y)
+        ]
+    for set_scale, tolerance in zip((plot.axis.set_xscale, plot.axis.set_yscale), tolerances):
+        set_scale("symlog", linthresh=tolerance)
+    for axis in (plot.axis.xaxis, plot.axis.yaxis):
+        axis.set_major_formatter(lambda value, _: minus(f"{value:g}"))
+    plot.axis.set(xlabel="vertical parallax, px", ylabel="label − match, px")
+    plot.figure.legend(loc="outside lower center", ncols=3)
+    return plot.chart(values)
 
 
-def _checks(summary: Mapping[str, Any]) -> Table:
-    lines = tuple(
+def _checks(summary: Mapping[str, Any]) -> Table | None:
+    lines = [
         (
             Cell(CHECKS[name], CHECKS[name]),
-            Cell(str(counts[FAULT]), str(counts[FAULT]), bad=counts[FAULT] > 0),
-            Cell(str(counts[UNDECIDED]), str(counts[UNDECIDED])),
+            value_cell(counts[FAULT], "d", bad=counts[FAULT] > 0),
+            value_cell(counts[UNDECIDED], "d"),
         )
         for name, counts in summary["checks"].items()
-    )
-    titles = ("what a pair must have", "pairs without", "undecided")
-    return Table(tuple(Column(t, k > 0) for k, t in enumerate(titles)), (("", lines),))
+    ]
+    return Table.of(("what a pair must have", "failed", "too few matches"), lines)
 
 
 def _shared(summary: Mapping[str, Any]) -> Table | None:
@@ -202,19 +192,13 @@ def _shared(summary: Mapping[str, Any]) -> Table | None:
     return table(rows)
 
 
-def _pairs(audited: Sequence[Audited], shown: set[str]) -> Table:
+def _pairs(audited: Sequence[Audited], shown: set[str]) -> Table | None:
     """The table of all pairs; each fault has its line, and a click leads to the pictures."""
     rows = table_rows(audited)
     for row, a in zip(rows, audited):
         row["faults"] = minus("\n".join(f.text.replace("; ", "\n") for f in a.verdict.of(FAULT)))
-    found = table(rows, COLUMNS)
-    assert found is not None
-    ((heading, lines),) = found.groups
-    linked = (
-        (replace(name, href=f"#pair-{name.text}" if name.text in shown else ""), *others)
-        for name, *others in lines
-    )
-    return Table(found.columns, ((heading, tuple(linked)),))
+        row["verdict"] = WORDS[a.verdict.word]
+    return table(rows, COLUMNS, {"pair": {name: f"#pair-{name}" for name in shown}})
 
 
 def _pooled_rows(summary: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -230,7 +214,7 @@ def _dots(picture: Picture, x: NDArray, y: NDArray, values: NDArray, limit: floa
     scale = SIDE / max(picture.shape)
     shown = pictures.shrink(picture, SIDE)
     canvas = np.ascontiguousarray(np.repeat((shown * 0.6).astype(np.uint8)[..., None], 3, axis=2))
-    colours = pictures.colours(values[None, :], (-limit, limit), ERRORS)[0]
+    colours = pictures.colours(values[None, :], (-limit, limit), pictures.DIFFERENCES)[0]
     order = np.argsort(np.abs(values))  # the worst on top
     for k in order:
         centre = (round(float((x[k] + 0.5) * scale)), round(float((y[k] + 0.5) * scale)))
@@ -247,7 +231,8 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         "name": a.pair.name,
         "city": a.pair.city,
         "split": a.pair.split,
-        "word": a.verdict.word,
+        "verdict": a.verdict.word,
+        "word": WORDS[a.verdict.word],
         "findings": [
             (f.level, minus(text))
             for level in (FAULT, UNDECIDED, NOTE)
@@ -257,28 +242,31 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         "pictures": [],
     }
 
-    def add(title: str, picture: Picture, scale: tuple[str, str, str] | None = None) -> None:
+    def add(title: str, picture: Picture, scale: Scale | None = None) -> None:
         uri = encode(pictures.shrink(picture, SIDE), BYTES)
         found["pictures"].append({"title": title, "uri": uri, "scale": scale})
+
+    def differences(limit: float) -> Scale:
+        return Scale.of(pictures.DIFFERENCES, f"−{limit:g} px", f"+{limit:g} px")
 
     add("left", grey_left)
     add("right", pictures.stretch(grey(right)))
     labels = None if a.pair.disparity is None else dataset.labels(a.pair)
     if labels is not None and np.isfinite(labels).any():
         low, high = (float(v) for v in np.nanpercentile(labels, (1, 99)))
+        ends = (minus(f"{value:.0f} px") for value in (low, high))
         coloured = pictures.colours(labels, (low, high))
-        add("labels", coloured, (minus(f"{low:.0f} px"), "labels", minus(f"{high:.0f} px")))
+        add("labels", coloured, Scale.of(pictures.DISPARITIES, *ends))
     if "rows" not in a.figures:
         return found
     reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
     matches = match_pair(left, right, reach, nodata=left.dtype != np.uint8)
     x, y = matches.x, matches.y
-    ends = minus(f"-{ROW_LIMIT_PX:g} px"), "errors", f"+{ROW_LIMIT_PX:g} px"
-    add("vertical parallax", _dots(grey_left, x, y, matches.parallax, ROW_LIMIT_PX), ends)
+    dots = _dots(grey_left, x, y, matches.parallax, ROW_LIMIT_PX)
+    add("vertical parallax", dots, differences(ROW_LIMIT_PX))
     if labels is not None:
         error = label_offsets(grey(left), grey(right), labels, matches)
         known = np.isfinite(error)
-        ends = minus(f"-{LIMIT_PX:g} px"), "errors", f"+{LIMIT_PX:g} px"
         dots = _dots(grey_left, x[known], y[known], error[known], LIMIT_PX)
-        add("labels less matches", dots, ends)
+        add("label − match", dots, differences(LIMIT_PX))
     return found

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ...products.pictures import stretch
+from ...pages.pictures import stretch
 from .matches import grey
 
 Floats = NDArray[np.float64]

@@ -189,14 +189,15 @@ def statements(summary: Mapping[str, Any]) -> list[str]:
     verdicts, of, limits = summary["verdicts"], summary["pooled"], summary["limits"]
     found = [
         f"{_pairs(summary['pairs'])}, {summary['labelled_pairs']} with labels: "
-        f"{verdicts[GOOD]} good, {verdicts[FAULT]} faulty, {verdicts[UNDECIDED]} undecided."
+        f"{verdicts[GOOD]} good, {verdicts[FAULT]} failed, "
+        f"{verdicts[UNDECIDED]} with too few matches."
     ]
     for check, counts in summary["checks"].items():
         if counts[FAULT]:
             found.append(f"{_pairs(counts[FAULT])} without {CHECKS[check]}.")
     for name, what in (
         ("parallax_px", "Vertical parallax"),
-        ("label_bias_px", "Labels less matches of the images"),
+        ("label_bias_px", "Label - match of the images"),
         ("contradicted_share", "Labels that the images contradict"),
         ("hidden_share", "Labels on pixels hidden in the right view"),
     ):
@@ -240,7 +241,7 @@ def in_words(summary: Mapping[str, Any]) -> str:
     lines += [
         "",
         "pairs.csv has a row per pair, index.html the pictures. Disparity is x_left - x_right in",
-        "px; parallax is y_right - y_left; bias is label less match. Limits are of 95 %.",
+        "px; parallax is y_right - y_left; bias is label - match. Limits are of 95 %.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -131,15 +131,15 @@ def _labels(figures: Mapping[str, Any], limits: AuditLimits, level: float) -> li
             text += f" ({100 * more.value:.0f} % of the matches more than as stated)"
             found.append(Finding("convention", FAULT, text))
     names = {
-        ("bias", "bias"): "labels less matches",
-        ("bias", "tilt_x"): "labels less matches, from the middle to the right edge",
-        ("bias", "tilt_y"): "labels less matches, from the middle to the lower edge",
+        ("bias", "bias"): "label - match",
+        ("bias", "tilt_x"): "label - match, from the middle to the right edge",
+        ("bias", "tilt_y"): "label - match, from the middle to the lower edge",
     }
     faults, open_ = _beyond(figures, names, limits.label_bias_px, level)
     if faults:
         found.append(Finding("bias", FAULT, "; ".join(faults)))
     elif open_:
-        text = f"labels less matches: {figures['bias']['matches']} matches do not tell"
+        text = f"label - match: {figures['bias']['matches']} matches do not tell"
         found.append(Finding("bias", UNDECIDED, text))
     gain = estimate(figures, "registration", "gain")
     if gain.interval(level / len(SHIFTS))[0] > GAIN:

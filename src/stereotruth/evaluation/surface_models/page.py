@@ -6,29 +6,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ...lidar.height_raster import HeightRaster
-from ...products.files import atomic_folder, write_json, write_table
-from ...products.html_page import way, write_page
-from ...products.html_tables import Headline, minus, table
-from ...products.pictures import (
+from ...pages.figures import AXES, Chart, Plot, styled
+from ...pages.page import way, write_page
+from ...pages.pictures import (
+    DIFFERENCES,
+    SERIES,
     Picture,
+    Scale,
     colours,
     encode,
-    encode_file,
-    gradient,
     hillshade,
-    save_figure,
     shrink,
 )
+from ...pages.tables import Headline, minus, table, texts
+from ...products.files import atomic_folder, write_json, write_table
 from .edges import HIGH, LOW, SHARP, S
 from .height_errors import OPEN
 from .score import Verdict
 
-MAP_BYTES, FIGURE_BYTES = 250_000, 60_000
+MAP_BYTES = 250_000
 MAP_PX = 700
-COLOURS = "RdYlBu_r"
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 
 
@@ -58,24 +57,24 @@ def write_verdict(
     with atomic_folder(folder) as scratch:
         write_json(scratch / "scores.json", figures)
         write_table(scratch / "errors.csv", rows)
-        _draw_profile(scratch / "edges.png", figures["edge_profile"])
-        values = _values(verdict, figures, rows, scratch)
+        values = _values(verdict, figures, rows)
         values |= {"title": title, "index": way(Path(folder) / "index.html", index)}
         write_page(scratch / "index.html", TEMPLATE, values)
     return figures
 
 
-def _draw_profile(path: Path, profile: list[float | None]) -> None:
+@styled
+def _profile(profile: list[float | None]) -> Chart:
     """The mean profile of the roofs' edges beside a sharp one."""
-    figure = Figure(figsize=(5.2, 3.0), layout="constrained")
-    axes = figure.subplots()
-    axes.step(S, SHARP, where="mid", color="0.6", label="reference")
+    plot = Plot.of("mean profile of the edges", "Beside a sharp edge (grey).", (5.6, 3.2))
+    plot.axis.step(S, SHARP, where="mid", color=AXES)
     values = [np.nan if v is None else v for v in profile]
-    axes.plot(S, values, marker=".", color="C3", label="surface model")
-    axes.set_xlabel("outward of the edge, m")
-    axes.set_ylabel(f"share of the step, {LOW:.0%} to {HIGH:.0%}")
-    axes.legend(frameon=False)
-    save_figure(path, figure)
+    (line,) = plot.axis.plot(S, values, marker=".", color=SERIES[0])
+    known = [(s, v) for s, v in zip(S, values) if np.isfinite(v)]
+    plot.hover(line, ["surface model"])
+    plot.axis.set_xlabel("outward of the edge, m")
+    plot.axis.set_ylabel(f"share of the step, {LOW:.0%} to {HIGH:.0%}")
+    return plot.chart([{"outward_m": float(s), "share": v} for s, v in known])
 
 
 def _shaded(model: HeightRaster) -> Picture:
@@ -91,23 +90,21 @@ def _limit(verdict: Verdict) -> float:
 
 
 def _values(
-    verdict: Verdict, figures: dict[str, Any], rows: list[dict[str, Any]], folder: Path
+    verdict: Verdict, figures: dict[str, Any], rows: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """What the page shows."""
     limit = _limit(verdict)
-    picture = colours(verdict.differences, (-limit, limit), COLOURS)
-    texts = [{k: "" if v is None else str(v) for k, v in row.items()} for row in rows]
+    picture = colours(verdict.differences, (-limit, limit), DIFFERENCES)
     return {
         "figures": figures,
-        "links": [(name, name, "") for name in ("scores.json", "errors.csv", "edges.png")],
+        "links": [(name, name, "") for name in ("scores.json", "errors.csv")],
         "registration": _registration(figures["registration"]),
         "edges": figures["edges"],
-        "table": table(texts),
+        "table": table([texts(row) for row in rows]),
         "shaded": encode(_shaded(verdict.model), MAP_BYTES),
         "map": encode(shrink(picture, MAP_PX), MAP_BYTES),
-        "profile": encode_file(folder / "edges.png", FIGURE_BYTES, 620),
-        "limit": limit,
-        "gradient": gradient(COLOURS),
+        "profile": _profile(figures["edge_profile"]),
+        "scale": Scale.of(DIFFERENCES, f"−{limit:.2f} m", f"+{limit:.2f} m"),
         "line": describe(figures),
     }
 
@@ -118,8 +115,8 @@ def _registration(found: dict[str, Any]) -> list[Headline]:
         ("moved east", "east_m", "m"),
         ("moved north", "north_m", "m"),
         ("moved up", "up_m", "m"),
-        ("tilt along east", "tilt_east_m_per_km", "m per km"),
-        ("tilt along north", "tilt_north_m_per_km", "m per km"),
+        ("tilt along east", "tilt_east_m_per_km", "m/km"),
+        ("tilt along north", "tilt_north_m_per_km", "m/km"),
     )
     cards = []
     for title, name, unit in figures:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...dataset.stereo_dataset import StereoDataset
 from ...products.rasters import read_image
-from .confidence_table import confidence_table, draw_curves
+from .confidence_table import confidence_table
 from .differences import differences
 from .page import write_benchmark
 from .panels import Column, draw_columns
@@ -37,7 +37,7 @@ def compare(
     seed: int,
     index: str | Path | None = None,
 ) -> None:
-    """Write tables, ``figure10.png``, ``confidence.png`` and ``index.html`` to ``out``.
+    """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
 
     ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
     intervals of differences come from; ``index``: the page of all pages, for a link.
@@ -71,8 +71,6 @@ def compare(
             )
         )
     draw_columns(out / "figure10.png", columns)
-    curves = out / "confidence.png"
-    shown = curves if draw_curves(curves, methods, scores) else None
     figure = out / "figure10.png"
     write_benchmark(
         out / "index.html",
@@ -81,7 +79,6 @@ def compare(
         tables,
         scores,
         figure,
-        shown,
         pairs=columns,
         index=index,
     )

@@ -6,11 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib import colormaps
-from matplotlib.figure import Figure
-
+from ...pages.figures import Chart, Plot, look, styled
 from ...products.files import read_table
-from ...products.pictures import save_figure
 from .scores import ALL
 from .tables import Table, nothing, plain_table
 
@@ -79,34 +76,46 @@ def read_curves(folder: str | Path) -> dict[str, Curve]:
     return found
 
 
-def draw_curves(path: str | Path, methods: Sequence[Row], folders: Sequence[str | Path]) -> bool:
-    """PNG of the sparsification curves; returns whether any method has one.
+@styled
+def confidence_chart(methods: Sequence[Row], folders: Sequence[str | Path]) -> Chart | None:
+    """The sparsification curves; None if no method states uncertainties.
 
-    ``folders``: of the methods' scores. Of synthetic cities, a plot of the visible pixels and one
-    of the hidden ones, by the exact truth; else one of all. The oracle's curves are thin.
+    ``folders``: of the methods' scores. Of synthetic cities, axes for the visible pixels and for
+    the hidden ones, by the exact truth; else for all. The oracle's curves are thin.
     """
     curves = {
         of["label"]: read_curves(folder) for of, folder in zip(methods, folders) if of["confidence"]
     }
+    if not curves:
+        return None
     names = [name for name in EXACT if any(name in of for of in curves.values())] or [ALL]
-    figure = Figure(figsize=(5.0 * len(names) + 1.0, 4.2), layout="constrained")
-    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names):
-        for place, (label, of) in enumerate(curves.items()):
+    plot = Plot.of(
+        "sparsification",
+        "Mean error of the pixels that are left when the most uncertain ones are taken away; thin: "
+        "by an oracle.",
+        (4.2 * len(names) + 1.0, 3.6),
+        columns=len(names),
+    )
+    values = []
+    for axis, name in zip(plot.axes[0], names):
+        for number, (label, of) in enumerate(curves.items()):
             if name in of:
-                colour = colormaps["viridis"](place / max(len(curves), 2))
+                style = look(number) | {"marker": "none"}
                 share, stated, oracle = of[name]
-                axis.plot(share, stated, color=colour, lw=1.8, label=label)
-                axis.plot(share, oracle, color=colour, lw=0.7)
-        axis.set(xlabel="most uncertain pixels taken away, %", ylabel="mean error of the rest, px")
-        axis.set_title(f"pixels: {name.replace('_', ' ')}", fontsize=10)
-        axis.set_xlim(0, 100)
+                (line,) = axis.plot(share, stated, linewidth=2, label=label, **style)
+                plot.hover(line, [label])
+                axis.plot(share, oracle, color=style["color"], linewidth=0.7)
+                columns = ("removed_percent", "epe_px", "oracle_epe_px")
+                values += [
+                    {"method": label, "pixels": name, **dict(zip(columns, row))}
+                    for row in zip(share, stated, oracle)
+                ]
+        axis.set(xlabel="most uncertain pixels taken away, %", xlim=(0, 100))
+        axis.set_title(f"pixels: {name.replace('_', ' ')}")
         axis.set_ylim(bottom=0)
-    if curves:
-        figure.axes[0].legend(title="thin: oracle", fontsize=8, title_fontsize=8, frameon=False)
-    else:
-        figure.axes[0].text(50, 0.5, NONE, ha="center")
-    save_figure(path, figure, dpi=120)
-    return bool(curves)
+    plot.axis.set_ylabel("mean error of the rest, px")
+    plot.axis.legend()
+    return plot.chart(values)
 
 
 def _form(value: float | None, form: str) -> str:

@@ -29,6 +29,8 @@ class Doubts:
     repeated: Counter[float] = field(default_factory=Counter)
     zeros: int = 0
     near_zero: int = 0  # within a px, and not zero
+    least: float = np.inf
+    most: float = -np.inf
 
     def add(self, disparity: NDArray[np.float32], truth: NDArray[Any]) -> None:
         """Add a pair: disparity and truth [h, w] px, NaN where there is none."""
@@ -38,6 +40,9 @@ class Doubts:
         self.error_px += float(np.abs(found - exact).sum())
         self.turned_error_px += float(np.abs(-found - exact).sum())
         values = disparity[np.isfinite(disparity)]
+        if values.size:
+            self.least = min(self.least, float(values.min()))
+            self.most = max(self.most, float(values.max()))
         low, high = self.disparity_range
         outside = values[(values < low) | (values >= high)]
         self.values += values.size
@@ -48,9 +53,16 @@ class Doubts:
             each, count = np.unique(outside, return_counts=True)
             self.repeated[float(each[count.argmax()])] += int(count.max())
 
+    @property
+    def constant_px(self) -> float | None:
+        """The one disparity that a method returns everywhere; None of more than one."""
+        return self.least if self.least == self.most else None
+
     def lines(self) -> list[str]:
         """A sentence for each doubt."""
         found = []
+        if self.constant_px is not None:
+            found.append(f"returns the constant {self.constant_px:g} px everywhere")
         if self.turned_error_px < TURNED * self.error_px:
             turned, epe = self.turned_error_px / self.scored, self.error_px / self.scored
             found.append(f"−d would score {turned:.3g} px, d scores {epe:.3g}: is the sign turned?")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ...products.pictures import (
+from ...pages.pictures import (
     DISPARITIES,
     ERRORS,
     NO_VALUE,
@@ -35,6 +36,7 @@ SIDE_PX = 400  # of a picture
 INCHES, DPI = 3.2, 120
 ERROR_PX = 6.0  # end of the scale of errors: twice the threshold of D1
 INVALID = (60, 190, 255)
+NAME_LETTERS = 18  # in a line of the names of rows
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,11 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
     grid = (len(columns), len(names)) if across else (len(names), len(columns))
     aspect = columns[0].left.shape[0] / columns[0].left.shape[1]
     size = INCHES if across else INCHES * 0.8
+    beside, below = (1.6, 1.7) if across else (3.4, 0.8)  # inches, of names and scales
     figure = Figure(
-        figsize=(size * grid[1] + 0.9, size * aspect * grid[0] + 1.2), layout="constrained"
+        figsize=(size * grid[1] + beside, size * aspect * grid[0] + below), layout="compressed"
     )
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
+    figure.get_layout_engine().set(w_pad=0.06, h_pad=0.02, wspace=0.0, hspace=0.0)
     axes = figure.subplots(*grid, squeeze=False)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
@@ -98,11 +101,13 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
             axis = by_name[n, c]
             if name in of:
                 axis.imshow(shrink(of[name], SIDE_PX), cmap="gray", vmin=0, vmax=255)
-            if c == 0:
-                (axis.set_title if across else axis.set_ylabel)(name, fontsize=9)
-            if n == 0:
-                (axis.set_ylabel if across else axis.set_title)(column.title, fontsize=9)
-    _legend(figure, dict(zip(names, by_name)), limits, "bottom" if across else "right")
+            if n == 0 if across else c == 0:  # level, so that a low row cuts nothing
+                row = wrap(column.title if across else name, NAME_LETTERS)
+                style = {"rotation": 0, "ha": "right", "va": "center", "fontsize": 9}
+                axis.set_ylabel("\n".join(row), **style)
+            if c == 0 if across else n == 0:
+                axis.set_title(name if across else column.title, fontsize=9)
+    _legend(figure, axes, names, limits, "bottom" if across else "right")
     save_figure(path, figure, dpi=DPI)
 
 
@@ -131,31 +136,20 @@ def _order(columns: Sequence[Column]) -> list[str]:
 
 
 def _legend(
-    figure: Figure, axes: Mapping[str, Any], limits: tuple[float, float], where: str
+    figure: Figure, axes: Any, names: Sequence[str], limits: tuple[float, float], where: str
 ) -> None:
-    """Both scales, each beside its pictures, and what the other colours mean."""
-    errors = [of for name, of in axes.items() if name.startswith("error of ")]
-    shown = [of for name, of in axes.items() if name not in ("left", "right")]
-    shown = shown[: len(shown) - len(errors)]
+    """Both scales, and what the other colours mean; ``names`` of the pictures."""
+    has_errors = any(name.startswith("error of ") for name in names)
+    scales = [(DISPARITIES, limits, "disparity, px", "both")]
     patches = [Patch(color=np.array(NO_VALUE) / 255, label="no value")]
-    if errors:
+    if has_errors:
         patches.append(Patch(color=np.array(INVALID) / 255, label="labelled, without disparity"))
-    for cmap, ends, label, of in (
-        (DISPARITIES, limits, "disparity, px", shown),
-        (ERRORS, (0.0, ERROR_PX), "absolute error, px", errors),
-    ):
-        if of:
-            mappable = ScalarMappable(cmap=cmap)
-            mappable.set_clim(*ends)
-            extend = "max" if cmap == ERRORS else "both"
-            figure.colorbar(
-                mappable,
-                ax=list(np.concatenate(of)),
-                location=where,
-                label=label,
-                extend=extend,
-                fraction=0.06,
-                aspect=30,
-                pad=0.02,
-            )
+        scales.append((ERRORS, (0.0, ERROR_PX), "absolute error, px", "max"))
+    for cmap, ends, label, extend in scales:
+        mappable = ScalarMappable(cmap=cmap)
+        mappable.set_clim(*ends)
+        figure.colorbar(
+            mappable, ax=axes, location=where, label=label, extend=extend,
+            fraction=0.05, aspect=30, shrink=0.6, pad=0.02,
+        )  # fmt: skip
     figure.legend(handles=patches, loc="outside lower left", ncols=2, frameon=False, fontsize=8)

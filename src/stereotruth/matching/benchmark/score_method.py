@@ -208,6 +208,7 @@ def score(
             "bootstrap": plan.bootstrap,
             "height_m_per_px": height_m_per_px(pairs, products),
             "doubts": sums.doubts.lines(),
+            "constant_px": sums.doubts.constant_px,
             **rows,
             "confidence": [{"stratum": name, **of.figures()} for name, of in confidences],
         }

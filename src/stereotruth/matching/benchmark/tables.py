@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, in_number
+from ...pages.tables import Cell, Column, metres, minus
+from ...pages.tables import Table as Shown
 from ...products.files import atomic_file, write_table
-from ...products.html_tables import Cell, Column, metres, minus
-from ...products.html_tables import Table as Shown
 from ..kinds import KINDS
 from . import published_scores
 from .training_data import COLUMNS as TRAINING
@@ -46,6 +46,8 @@ class Table:
     title: str
     rows: Sequence[Row]
     shown: Sequence[tuple[str, Shown]]
+    also: str = ""  # what the paper calls it
+    protocol: str = ""  # id of that by which the scores are made
 
     @property
     def columns(self) -> list[str]:
@@ -55,11 +57,12 @@ class Table:
     def by(self, protocol: str) -> Table:
         """The table with the id of the protocol that its scores are made by."""
         rows = [{"protocol": protocol, **row} for row in self.rows]
-        return replace(self, title=f"{self.title} ({protocol})", rows=rows)
+        return replace(self, rows=rows, protocol=protocol)
 
     def markdown(self) -> str:
         """What is to be read."""
-        parts = [f"# {self.title}"]
+        more = "".join(f" ({text})" for text in (self.also, self.protocol) if text)
+        parts = [f"# {self.title}{more}"]
         for caption, shown in self.shown:
             lines = [
                 [column.title for column in shown.columns],
@@ -84,14 +87,19 @@ class Figure:
     form: str = ".3f"
     more: bool = False
 
-    def cell(self, row: Row, best: float | None, *, interval: bool = False) -> Cell:
-        """The figure of a row; ``best`` of all rows, which stands with its interval."""
+    def cell(
+        self, row: Row, best: float | None, *, interval: bool = False, line: str = " "
+    ) -> Cell:
+        """The figure of a row; ``best`` of all rows, which stands with its interval.
+
+        ``line``: what stands between both.
+        """
         value = row.get(self.key)
         if value is None:
             return NOTHING
         is_best = best is not None and value == best
         text = with_interval(row, self.key, self.factor, self.form, shown=interval or is_best)
-        return Cell(minus(text), f"{value:.9g}", best=is_best)
+        return Cell(minus(text.replace(" ", line, 1)), f"{value:.9g}", best=is_best)
 
     def best(self, rows: Sequence[Row]) -> float | None:
         """The best of at least two values."""
@@ -150,9 +158,9 @@ def make_tables(
     """
     trained = set(trained)
     return [
-        table5(methods, beside_paper=beside_paper),
-        table6(methods, trained, beside_paper=beside_paper),
-        table7(methods, trained, beside_paper=beside_paper),
+        of_methods(methods, beside_paper=beside_paper),
+        by_city(methods, trained, beside_paper=beside_paper),
+        of_fine_tuned(methods, trained, beside_paper=beside_paper),
         by_strata(methods),
     ]
 
@@ -165,7 +173,7 @@ def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
             scratch.write_text(table.markdown(), encoding="utf-8")
 
 
-def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
+def of_methods(methods: Sequence[Row], *, beside_paper: bool) -> Table:
     """Accuracy, completeness, time and memory of the methods over all tiles."""
     rows = []
     for of in methods:
@@ -184,7 +192,9 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
             keys = ("paper_epe_px", "paper_d1_percent", "paper_ms")
             row |= dict(zip(keys, published))
         rows.append(row)
-    caption = f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {_what(methods)}"
+    caption = (
+        f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {dataset_in_words(methods)}"
+    )
     shown = [(caption, _accuracy(rows, methods))]
     if beside_paper:
         kinds = dict.fromkeys(_kind(of) for of in _plain(methods))
@@ -200,7 +210,7 @@ def table5(methods: Sequence[Row], *, beside_paper: bool) -> Table:
                 if kind in published_scores.TABLE5
             ],
         )
-    return Table("table5", "Table 5: accuracy, time and memory", rows, shown)
+    return Table("methods", "Accuracy, time and memory", rows, shown, "table 5 of the paper")
 
 
 def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
@@ -210,12 +220,12 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
     figures = [
         Figure("EPE, px", "filled_epe_px"),
         *(
-            Figure(f"D1, {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f")
+            Figure(f"> {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f")
             for limit in limits
         ),
         Figure("valid only: median, px", "median_px"),
         Figure("valid only: EPE, px", "epe_px"),
-        Figure(f"valid only: D1, {first:g} px, %", f"d1_{first:g}_px_share", 100, ".2f"),
+        Figure(f"valid only: > {first:g} px, %", f"d1_{first:g}_px_share", 100, ".2f"),
         Figure("valid, %", "valid_share", 100, ".2f", more=True),
         Figure("time, ms a pair", "median_seconds", 1000, ".0f"),
         Figure("memory, MB", "peak_memory_mb", 1, ".0f"),
@@ -250,7 +260,8 @@ def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
     labels = [of["label"] for of in methods]
     figures = [Figure("EPE, px", "filled_epe_px")]
     if methods:
-        figures.append(Figure("D1, %", f"filled_{_d1(methods[0])}", 100, ".2f"))
+        limit = methods[0]["thresholds_px"][0]
+        figures.append(Figure(f"> {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f"))
     groups = list(dict.fromkeys(row.get("group", "") for row in rows))
     found = []
     for group in groups:
@@ -273,15 +284,15 @@ def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
     return Shown(columns, tuple(found))
 
 
-def table6(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
+def by_city(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
     """Scores by city: generalisation within cities, extrapolation to others."""
-    title = "Table 6: accuracy by city"
-    return _by_city("table6", title, _plain(methods), trained, beside_paper=beside_paper)
+    table = Table("by_city", "Accuracy by city", [], [], "table 6 of the paper")
+    return _by_city(table, _plain(methods), trained, beside_paper=beside_paper)
 
 
-def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
+def of_fine_tuned(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
     """Fine-tuned methods by city, beside the same methods trained on this dataset alone."""
-    title = "Table 7: fine-tuned methods by city"
+    table = Table("fine_tuned", "Fine-tuned methods by city", [], [], "table 7 of the paper")
     by_name = {of["method"]: of for of in methods}
     columns: list[Row] = []
     for of in methods:
@@ -292,8 +303,8 @@ def table7(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> 
             columns.append(of)
     if not columns:
         text = "No method of the configuration has `fine_tuned_of`."
-        return nothing("table7", title, text)
-    return _by_city("table7", title, columns, trained, beside_paper=beside_paper)
+        return nothing(table.name, table.title, text)
+    return _by_city(table, columns, trained, beside_paper=beside_paper)
 
 
 def by_strata(methods: Sequence[Row]) -> Table:
@@ -312,13 +323,9 @@ def by_strata(methods: Sequence[Row]) -> Table:
 
 
 def _by_city(
-    name: str,
-    title: str,
-    methods: Sequence[Row],
-    trained: set[str],
-    *,
-    beside_paper: bool,
+    table: Table, methods: Sequence[Row], trained: set[str], *, beside_paper: bool
 ) -> Table:
+    """The table with the methods' scores by city, cities with training tiles first."""
     cities = list(dict.fromkeys(row["city"] for of in methods for row in of["cities"]))
     groups = [
         ("cities with training tiles", [city for city in cities if city in trained]),
@@ -338,7 +345,7 @@ def _by_city(
                 {"city": "all of group", "group": group, "method": of["label"], **row}
                 for of, row in zip(methods, pooled)
             ]
-    caption = f"Ours: EPE and D1 of {FILLED}. {_what(methods)}"
+    caption = f"Ours: EPE and D1 of {FILLED}. {dataset_in_words(methods)}"
     shown = [(caption, _by_method(rows, "city", methods))]
     if beside_paper:
         there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
@@ -350,7 +357,7 @@ def _by_city(
             if any(values):
                 known.append([city, *(text for of in values for text in _paper(of))])
         shown += _published(_heading("City", list(there.values())), known)
-    return Table(name, title, rows, shown)
+    return replace(table, rows=rows, shown=shown)
 
 
 def _published_of(of: Row, city: str) -> tuple[float, float] | None:
@@ -380,11 +387,6 @@ def _plain(methods: Sequence[Row]) -> list[Row]:
 
 def _kind(of: Row) -> str:
     return of["settings"]["kind"]
-
-
-def _d1(of: Row) -> str:
-    """Name of the figure of the first threshold."""
-    return f"d1_{of['thresholds_px'][0]:g}_px_share"
 
 
 def _city(of: Row, city: str) -> Row:
@@ -417,7 +419,7 @@ def _number(value: float | None, factor: float, form: str) -> str:
     return "–" if value is None else format(factor * value, form)
 
 
-def _what(methods: Sequence[Row]) -> str:
+def dataset_in_words(methods: Sequence[Row]) -> str:
     """Dataset, split, pairs and range."""
     if not methods:
         return ""

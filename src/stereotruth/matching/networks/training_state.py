@@ -214,7 +214,7 @@ def device_name(device: torch.device) -> str:
 def _draw(curve: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
-    from ...products.pictures import save_figure
+    from ...pages.pictures import save_figure
 
     figure = Figure(figsize=(7, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)

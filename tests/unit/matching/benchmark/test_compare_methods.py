@@ -16,12 +16,16 @@ def test_the_page_is_whole_and_needs_no_network(compared, tmp_path):
     seen = look(
         compared / "compared/index.html",
         tmp_path,
-        "return [document.images.length, [...document.images].every((i) => i.naturalWidth > 0),"
+        "const dead = [...document.querySelectorAll('a[href^=\"#\"]')].filter("
+        "(a) => !document.getElementById(a.getAttribute('href').slice(1))).length;"
+        "return [dead, document.images.length,"
+        " [...document.images].every((i) => i.naturalWidth > 0),"
         " document.querySelectorAll('table').length, document.body.innerText]",
     )
     assert seen.wrong == [] and seen.requests == []
-    count, loaded, tables, text = seen.found
-    assert count == 5 + 6 and loaded and tables == 5
+    dead, count, loaded, tables, text = seen.found
+    assert dead == 0
+    assert count == 5 + 6 + 2 and loaded and tables == 6
     for word in ("Accuracy, time and memory", "table 5 of the paper", "Half", "Kunming", "EPE"):
         assert word in text
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import matplotlib.pyplot as plt
+import re
+
 import numpy as np
 import pytest
 
 from stereotruth.matching.benchmark.confidence import Confidence
 from stereotruth.matching.benchmark.confidence_table import (
     NONE,
+    confidence_chart,
     confidence_table,
-    draw_curves,
     read_curves,
 )
 from stereotruth.products.files import write_table
@@ -51,11 +52,9 @@ def test_the_table_has_methods_by_stratum():
     assert lines[0][3] == lines[1][3] and float(lines[1][5]) < 40
 
 
-def test_without_uncertainties_it_says_so(tmp_path):
+def test_without_uncertainties_it_says_so():
     silent = [{"label": "Silent", "confidence": []}]
     assert confidence_table(silent).shown[0][0] == NONE
-    assert not draw_curves(tmp_path / "none.png", silent, [tmp_path])
-    assert (tmp_path / "none.png").exists()
 
 
 def test_the_curves_are_drawn(tmp_path):
@@ -68,17 +67,11 @@ def test_the_curves_are_drawn(tmp_path):
     (share, stated, oracle) = read_curves(tmp_path)["all"]
     assert share == pytest.approx(np.arange(100)) and len(stated) == 100
     assert stated == pytest.approx(found.curves()[0]) and oracle == pytest.approx(found.curves()[1])
-    assert draw_curves(tmp_path / "curves.png", [one], [tmp_path])
-    assert draw_curves(tmp_path / "again.png", [one], [tmp_path])
-    assert (tmp_path / "curves.png").read_bytes() == (tmp_path / "again.png").read_bytes()
-    silent = [{"label": "Silent", "confidence": []}]
-    draw_curves(tmp_path / "none.png", silent, [tmp_path])
-    lines = plt.imread(tmp_path / "curves.png")[150:400, 100:400, :3]  # left of the legend
-    assert np.ptp(lines, axis=2).max() > 0.2  # of colour
-    assert np.ptp(plt.imread(tmp_path / "none.png")[..., :3], axis=2).max() == 0
+    chart = confidence_chart([one], [tmp_path])
+    assert re.findall("<title>(.*?)</title>", chart.svg) == ["Calibrated"]
+    assert confidence_chart([{"label": "Silent", "confidence": []}], [tmp_path]) is None
 
 
 def test_pages_of_methods_without_uncertainties_have_no_curves(compared):
     text = (compared / "compared/index.html").read_text()
-    assert NONE not in text and 'id="sparsification"' not in text
-    assert (compared / "compared/confidence.png").exists()
+    assert NONE not in text and 'id="confidence"' not in text

@@ -25,6 +25,15 @@ def test_good_results_raise_no_doubt(truth):
     assert said(np.nan_to_num(truth) + np.float32(0.4), truth) == []
 
 
+def test_a_constant_is_named(truth):
+    doubts = Doubts((-64, 128))
+    doubts.add(np.full_like(truth, 3.0), truth)
+    assert doubts.constant_px == 3.0
+    assert "constant 3 px" in doubts.lines()[0]
+    doubts.add(np.full_like(truth, 4.0), truth)
+    assert doubts.constant_px is None
+
+
 def test_no_values_raise_no_doubt(truth):
     assert said(np.full_like(truth, np.nan), truth) == []
 

@@ -8,11 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.matching.benchmark.page import headlines
-from stereotruth.matching.benchmark.page_charts import cumulative_chart, strata_chart
-from stereotruth.matching.benchmark.page_tables import sections
-from stereotruth.matching.benchmark.tables import Table, plain_table, read_scores
-from stereotruth.products.charts import HEIGHT
+from stereotruth.matching.benchmark.page import cumulative_chart, ranking, strata_chart
+from stereotruth.matching.benchmark.tables import read_scores
 
 from ....browser import look, needs_chromium
 from ....synthetic.toy_benchmark import rows
@@ -36,12 +33,14 @@ def scores(compared) -> dict[str, dict]:
 def cells(text: str, section: str) -> list[list[str]]:
     """Cells of the section's first table, by rows; those of the best as ``*text*``."""
     part = re.search(rf'<section id="{section}">.*?</table>', text, re.DOTALL)[0]
-    part = re.sub(r'<td class="[^"]*best[^"]*"[^>]*>(.*?)</td>', r"<td>*\1*</td>", part)
-    return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in part.split("<tr>")[2:]]
+    part = re.sub(
+        r'<td class="[^"]*best[^"]*"[^>]*>(.*?)</td>', r"<td>*\1*</td>", part, flags=re.DOTALL
+    )
+    return [re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL) for row in part.split("<tr>")[2:]]
 
 
 def test_the_best_is_bold_and_has_its_interval(text, scores):
-    two, half = cells(text, "table5")
+    two, half = cells(text, "methods")
     row = scores["half"]["all"]
     ends = f"[{row['filled_epe_px_low']:.3f}, {row['filled_epe_px_high']:.3f}]"
     best, worse = sorted(
@@ -71,36 +70,29 @@ def test_by_what_pixels_show_the_best_of_each_row_is_bold(text, scores):
             assert cell.startswith("*") == (values[name] == min(values.values()))
 
 
-def test_headings_come_before_table_numbers(text):
-    headings = re.findall(r"<h2>(.*?)</h2>", text)
-    accuracy = r"Accuracy, time and memory <small>table 5 of the paper</small>"
-    assert any(re.fullmatch(accuracy, heading) for heading in headings)
-    assert not any(heading.startswith("Table") for heading in headings)
+def test_the_page_opens_with_the_ranking(text, scores):
+    assert re.search(r'<section id="(\w+)"', text)[1] == "ranking"
     (protocol,) = re.findall(r"Protocol of all scores: <code>(own-\w+)</code>", text)
     assert text.count(protocol) == 1
+    lines = cells(text, "ranking")
+    by_epe = sorted(scores.values(), key=lambda of: of["all"]["filled_epe_px"])
+    assert [line[0] for line in lines] == [of["label"] for of in by_epe]
+    for line, of in zip(lines, by_epe):
+        row = of["all"]
+        ends = [row[f"filled_epe_px_{end}"] for end in ("low", "high")]
+        assert "data:image/webp" in line[1]
+        expected = f"{row['filled_epe_px']:.3f}\n[{ends[0]:.3f}, {ends[1]:.3f}]"
+        assert line[2].strip("*") == expected
+        for cell, limit in zip(line[3:], ("3", "1")):
+            share = 100 * row[f"filled_d1_{limit}_px_share"]
+            assert cell.strip("*").startswith(f"{share:.2f}\n[")
 
 
-def test_the_cards_say_who_is_best_and_by_how_much(compared, scores):
-    methods = read_scores(compared / "benchmark" / name for name in ("two", "half"))
-    (row,) = rows(compared / "compared/differences.csv")
-    table = Table("differences", "", [{k: _number(v) for k, v in row.items()}], [])
-    cards = headlines(methods, [table])
-    assert len(cards) <= 6
-    least = min(scores.values(), key=lambda of: of["all"]["filled_epe_px"])
-    assert cards[0].title == "least EPE" and cards[0].note.startswith(least["label"])
-    assert cards[0].value == f"{least['all']['filled_epe_px']:.3f} px"
-    (following,) = (card for card in cards if card.title.startswith("next"))
-    between = abs(
-        scores["two"]["all"]["filled_epe_px"] - scores["half"]["all"]["filled_epe_px"]
-    )  # the same tiles of both: the difference of the pooled figures
-    assert following.value == f"+{between:.3f} px"
-
-
-def _number(value: str) -> str | float | None:
-    try:
-        return float(value) if value else None
-    except ValueError:
-        return value
+def test_a_constant_is_named_where_methods_are_ranked(scores):
+    methods = [scores["two"], scores["half"] | {"constant_px": -3.0}]
+    shown = ranking(methods, None)
+    named = {cells[0].key: cells[0].text for cells in shown.groups[0][1]}
+    assert named == {"Two": "Two", "Half": "Half\nconstant −3 px"}
 
 
 def test_a_method_s_distribution_of_errors_agrees_with_its_d1(compared, scores):
@@ -120,32 +112,14 @@ def test_a_method_s_distribution_of_errors_agrees_with_its_d1(compared, scores):
 def test_charts_have_a_line_and_a_point_where_the_files_say(compared):
     folders = [compared / "benchmark" / name for name in ("two", "half")]
     methods = read_scores(folders)
-    chart = cumulative_chart(methods, folders)
-    assert [series.name for series in chart.series] == ["Two", "Half"]
-    first, last = (chart.series[0].path[1:].split("L")[k].split()[1] for k in (0, -1))
-    assert (float(first), float(last)) == (HEIGHT, 0)  # 0 % at the left, 100 % at the right
-    strata = strata_chart(methods)
-    for of, series in zip(methods, strata.series):
-        assert len(series.points) == len(of["strata"])
-        for row, point in zip(of["strata"], series.points):
-            assert f"{row['filled_epe_px']:.3f} px" in point.text
-            if point.low is not None:
-                assert point.low <= point.x <= point.high
-
-
-def test_another_table_is_shown_as_it_is_written():
-    lines = [["A", "1.5 [1.0, 2.0]", "–"], ["B", "-0.5", "7"]]
-    shown = plain_table(["Name", "One", "Two"], lines)
-    table = Table("more", "More: of it (own-1)", [{"x": 1}], [("A `caption`", shown)])
-    empty = Table("none", "None (own-1)", [], [("No scores", plain_table(["Name"], []))])
-    (section,) = sections([table, empty], "own-1")
-    assert (section.heading, section.also) == ("More: of it", "")
-    ((caption, shown),) = section.shown
-    assert caption == "A caption"
-    assert [column.numeric for column in shown.columns] == [False, True, True]
-    (_, ((_, one, dash), (name, other, _))) = shown.groups[0]
-    assert (one.text, one.key, dash.key) == ("1.5 [1.0, 2.0]", "1.5", "")
-    assert (name.key, other.text, other.key) == ("B", "−0.5", "-0.5")
+    lines = re.findall(r"<title>(.*?)</title>", cumulative_chart(methods, folders).svg)
+    assert lines == ["Two", "Half"]
+    said = re.findall(r"<title>(.*?)</title>", strata_chart(methods).svg)
+    assert len(said) == sum(len(of["strata"]) for of in methods)
+    for of in methods:
+        for row in of["strata"]:
+            name = f"{of['label']}, {row['stratum'].replace('_', ' ')}"
+            assert any(f"{name}: {row['filled_epe_px']:.3f}" in text for text in said)
 
 
 SORT = """
@@ -168,22 +142,24 @@ def test_a_click_on_a_heading_sorts(compared, tmp_path):
     assert found["wide"] <= 0
 
 
-SWIPE = """
-const swipe = document.querySelector(".swipe"), [left, right] = swipe.querySelectorAll("select");
-const seen = () => [...swipe.querySelectorAll("img")].filter((i) => i.offsetParent).map(
+SLIDE = """
+const slider = document.querySelector(".slider"), [left, right] = slider.querySelectorAll("select");
+const seen = () => [...slider.querySelectorAll("img")].filter((i) => i.offsetParent).map(
   (i) => [i.dataset.name, i.className, i.naturalWidth > 0]);
+const corners = () => [...slider.querySelectorAll(".corner")].map((c) => c.textContent);
 const found = { names: [...left.options].map((o) => o.value), first: seen() };
 left.value = "truth"; right.value = "Two";
 right.dispatchEvent(new Event("change"));
-return { ...found, then: seen() };
+return { ...found, then: seen(), corners: corners() };
 """
 
 
 @needs_chromium
-def test_two_methods_can_be_swiped_over_each_other(compared, tmp_path):
-    seen = look(Path(compared / "compared/index.html"), tmp_path, SWIPE)
+def test_two_methods_can_be_laid_over_each_other(compared, tmp_path):
+    seen = look(Path(compared / "compared/index.html"), tmp_path, SLIDE)
     assert seen.wrong == []
     names = ["left image", "truth", "Two", "Half", "error of Two", "error of Half"]
     assert seen.found["names"] == names
     assert seen.found["first"] == [["error of Two", "over", True], ["error of Half", "under", True]]
     assert seen.found["then"] == [["truth", "over", True], ["Two", "under", True]]
+    assert seen.found["corners"] == ["truth", "Two"]

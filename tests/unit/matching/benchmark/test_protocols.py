@@ -94,10 +94,10 @@ def test_a_dataset_or_split_that_a_protocol_does_not_have_is_refused():
 
 def test_tables_show_one_id_and_refuse_two(compared, tmp_path):
     """The second method scored with other thresholds is of another protocol."""
-    five = rows(compared / "compared/table5.csv")
+    five = rows(compared / "compared/methods.csv")
     (protocol,) = {row["protocol"] for row in five}
     assert protocol.startswith("own-")
-    for name in ("table5", "table6", "strata", "differences", "published"):
+    for name in ("methods", "by_city", "strata", "differences", "published"):
         assert f"({protocol})" in (compared / f"compared/{name}.md").read_text().splitlines()[0]
     assert protocol in (compared / "compared/index.html").read_text()
     dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))

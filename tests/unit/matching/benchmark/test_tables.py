@@ -14,19 +14,19 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 
 
 def test_tables_have_the_paper_s_form(compared):
-    five = rows(compared / "compared/table5.csv")
+    five = rows(compared / "compared/methods.csv")
     assert [row["method"] for row in five] == ["Two", "Half"]
     assert float(five[0]["filled_epe_px"]) == pytest.approx(2, abs=1e-5)
     assert float(five[0]["filled_d1_3_px_share"]) == 0
     assert float(five[0]["filled_d1_1_px_share"]) == 1
-    six = rows(compared / "compared/table6.csv")
+    six = rows(compared / "compared/by_city.csv")
     assert [(row["city"], row["group"], row["method"]) for row in six] == [
         ("Kunming", "cities with training tiles", "Two"),
         ("Wuhan", "cities without", "Two"),
     ]
-    seven = rows(compared / "compared/table7.csv")
+    seven = rows(compared / "compared/fine_tuned.csv")
     assert [row["method"] for row in seven] == ["Two", "Half"] * 2
-    text = (compared / "compared/table5.md").read_text()
+    text = (compared / "compared/methods.md").read_text()
     assert "| Two | 2.000 [2.000, 2.000] | **0.00 [0.00, 0.00]** | 100.00 |" in text
     assert "6 pairs, disparities [-8, 8) px" in text
     assert "| near step |" in (compared / "compared/strata.md").read_text()
@@ -72,7 +72,13 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     assert texts(five.shown[0][1])[0][-5:-3] == ["506", "700"]
     assert "paper_epe_px" not in five.rows[2]  # the paper's StereoNet was not fine-tuned
     (_, ours), (_, published) = six.shown
-    assert titles(ours) == ["city", "Sgm: EPE, px", "Sgm: D1, %", "Net: EPE, px", "Net: D1, %"]
+    assert titles(ours) == [
+        "city",
+        "Sgm: EPE, px",
+        "Sgm: > 3 px, %",
+        "Net: EPE, px",
+        "Net: > 3 px, %",
+    ]
     assert [heading for heading, _ in ours.groups] == [
         "cities with training tiles",
         "cities without",
@@ -93,8 +99,8 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     five, six, seven, _ = make_tables(methods[:2], [], beside_paper=False)
     assert len(five.shown) == len(six.shown) == 1
     write_tables([seven], tmp_path)
-    assert "fine_tuned_of" in (tmp_path / "table7.md").read_text()
-    assert (tmp_path / "table7.csv").read_text() == "method\n"
+    assert "fine_tuned_of" in (tmp_path / "fine_tuned.md").read_text()
+    assert (tmp_path / "fine_tuned.csv").read_text() == "method\n"
 
 
 def test_a_city_that_the_paper_lacks_has_no_line_among_its_figures():

@@ -1,7 +1,8 @@
 """Arrays to 8-bit pictures, pictures to data URIs, figures to files.
 
-Disparities are drawn in ``DISPARITIES``, differences in ``DIFFERENCES``: maps of colours that tell
-without red and green, and whose lightness alone tells in print. Pixels without a value are light
+Disparities are drawn in ``DISPARITIES``, errors in ``ERRORS``, differences in ``DIFFERENCES``: what
+is judged minus what it is judged by, red below and blue above. These maps of colours tell without
+red and green. Pixels without a value are light
 grey.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
-from .files import atomic_file
+from ..products.files import atomic_file
 
 Picture = NDArray[np.uint8]
 
@@ -30,8 +32,8 @@ NO_VALUE = (226, 229, 233)
 SUN = (
     np.array([-1.0, -1.0, math.sqrt(2.0)]) / 2.0
 )  # of a hillshade: from the top left, 45 degrees high
-# Of methods, kinds and the like: apart for all eyes, on white as on black, and by lightness
-SERIES = ("#0259cb", "#bc6e19", "#5db6f9", "#f9be00", "#2a643c", "#914f8b")
+# Of methods, kinds and the like: apart for all eyes, with a contrast of 3:1 on white as on black
+SERIES = ("#4693fa", "#c68505", "#653bfd", "#59a090", "#8b5a2e", "#226c95")
 
 
 def stretch(
@@ -81,15 +83,20 @@ def round_length(value: float) -> float:
     return max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power
 
 
+def show_texts(figure: Figure) -> None:
+    """Texts of a figure are shown as they are; powers of ten of logarithmic axes are formulas."""
+    ticks = {id(label) for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
+    for text in figure.findobj(Text):
+        text.set_parse_math(id(text) in ticks)
+
+
 def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     """Write a matplotlib figure without any global state; no time or version goes into the file.
 
     Texts are shown as they are: a ``$`` in a name begins no formula.
     """
     FigureCanvasAgg(figure)
-    ticks = {id(label) for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
-    for text in figure.findobj(Text):
-        text.set_parse_math(id(text) in ticks)  # powers of ten of logarithmic axes
+    show_texts(figure)
     # a layout that leaves room for all needs no first drawing that finds what the texts take
     bounds = "tight" if figure.get_layout_engine() is None else None
     with atomic_file(path) as scratch:
@@ -134,6 +141,28 @@ def gradient(cmap: str, stops: int = 13) -> str:
     """The colours of a matplotlib map as a CSS gradient, left to right."""
     rgb = (colormaps[cmap](np.linspace(0, 1, stops))[:, :3] * 255 + 0.5).astype(int)
     return f"linear-gradient(90deg,{','.join(f'rgb({r},{g},{b})' for r, g, b in rgb)})"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A scale of colours: what stands at its ends, and the colours as a CSS gradient."""
+
+    low: str
+    high: str
+    colours: str
+
+    @classmethod
+    def of(cls, cmap: str, low: str, high: str) -> Scale:
+        """Of a matplotlib map."""
+        return cls(low, high, gradient(cmap))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A picture of a slider: a data URI, and the scale of its colours."""
+
+    uri: str
+    scale: Scale | None = None
 
 
 def hillshade(disparity: NDArray[np.floating], base_to_height: float) -> Picture:

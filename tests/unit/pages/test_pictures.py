@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from stereotruth.products import pictures
+from stereotruth.pages import pictures
 
 from ...synthetic.colour_vision import EYES, lab, nearest, rgb
 from ...synthetic.project import ROOT

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stereotruth.products.html_page import PAPER, way, write_page
+from stereotruth.pages.page import PAPER, way, write_page
 
 TEMPLATE = """{% extends "base.html.jinja" %}
 {% from "parts.html.jinja" import cards with context %}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.products import html_tables
-
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+from stereotruth.pages import tables
 
 
 @pytest.mark.parametrize(
@@ -25,4 +23,4 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
     ],
 )
 def test_values_are_shown_as_people_read_them(name, text, shown):
-    assert html_tables.show(name, text) == shown
+    assert tables.show(name, text) == shown

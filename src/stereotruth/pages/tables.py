@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,8 @@ class Headline:
 class Cell:
     """A value of a table: what is shown, what it is sorted by, whether it misses a limit.
 
-    ``best``: whether it is the best of its kind; ``href``: where a click leads.
+    ``best``: whether it is the best of its kind; ``href``: where a click leads; ``pictures``: data
+    URIs, shown instead of the text.
     """
 
     text: str
@@ -34,6 +35,10 @@ class Cell:
     bad: bool = False
     best: bool = False
     href: str = ""
+    pictures: tuple[str, ...] = ()
+
+
+EMPTY = Cell("–", "")
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,15 @@ class Table:
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]
+
+    @classmethod
+    def of(
+        cls, titles: Sequence[str], lines: Iterable[Sequence[Cell]], words: Collection[int] = (0,)
+    ) -> Table | None:
+        """One group of lines; ``words``: columns that are no numbers. None of no line."""
+        group = tuple(map(tuple, lines))
+        columns = tuple(Column(title, k not in words) for k, title in enumerate(titles))
+        return cls(columns, (("", group),)) if group else None
 
 
 def words(name: str) -> str:
@@ -109,18 +123,54 @@ def show(name: str, text: str) -> str:
     return minus(f"{value:.3f}")
 
 
+def value_cell(
+    value: float | None, form: str, factor: float = 1, unit: str = "", **more: Any
+) -> Cell:
+    """A number's cell, sorted by its value; a dash of None."""
+    if value is None:
+        return EMPTY
+    return Cell(minus(f"{factor * value:{form}}{unit}"), f"{value:.9g}", **more)
+
+
+def link_cell(text: str, href: str | None, **more: Any) -> Cell:
+    """A text that leads somewhere."""
+    return Cell(text, text, href=href or "", **more)
+
+
+def joined(*parts: str | None) -> str:
+    """Those parts of a remark that there are."""
+    return "; ".join(part for part in parts if part)
+
+
 def cell(name: str, text: str, bad: bool = False) -> Cell:
     """A table's cell of a value as it stands in a CSV file."""
     value = number(text)
     return Cell(show(name, text), text if value is None else f"{value:.9g}", bad)
 
 
-def table(rows: Sequence[Mapping[str, str]], columns: Sequence[str] | None = None) -> Table | None:
-    """A table of CSV rows, with the given columns or all; None of no rows."""
+def table(
+    rows: Sequence[Mapping[str, str]],
+    columns: Sequence[str] | None = None,
+    links: Mapping[str, Mapping[str, str]] | None = None,
+) -> Table | None:
+    """A table of CSV rows, with the given columns or all; None of no rows.
+
+    ``links``: by column, where its texts lead.
+    """
     if not rows:
         return None
     names = list(rows[0]) if columns is None else [c for c in columns if c in rows[0]]
-    return Table(columns_of(names, rows), (("", tuple(cells_of(names, row) for row in rows)),))
+    of = [(links or {}).get(name, {}) for name in names]
+    lines = tuple(
+        tuple(replace(c, href=to.get(c.text, "")) for c, to in zip(cells_of(names, row), of))
+        for row in rows
+    )
+    return Table(columns_of(names, rows), (("", lines),))
+
+
+def texts(row: Mapping[str, Any]) -> dict[str, str]:
+    """A record's values as a CSV file has them: nothing of None."""
+    return {key: "" if value is None else str(value) for key, value in row.items()}
 
 
 def columns_of(names: Iterable[str], rows: Sequence[Mapping[str, str]]) -> tuple[Column, ...]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import jinja2
 
-from .files import atomic_file
-from .html_tables import gate, minus, words
+from ..products.files import atomic_file
+from .tables import gate, minus, words
 
 SHARED = Path(__file__).parent  # of what all pages share
 INDEX = Path("results/report/index.html")  # of all pages of a folder
