@@ -25,7 +25,8 @@ from warped_panels import draw_panels
 from stereotruth import sheets
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
+from stereotruth.config.section import merged
 from stereotruth.dataset import warped_tile
 from stereotruth.dataset.manifest import labelled_tiles
 from stereotruth.epipolar.fit import fit_epipolar
@@ -38,8 +39,8 @@ from stereotruth.numerics.error_sums import LIMITS, ErrorSum
 from stereotruth.products.files import read_table
 from stereotruth.products.grids import require_complete
 from stereotruth.project import read_mapping
-from stereotruth.settings import merged
 from stereotruth.simulate.cities import CITIES
+from stereotruth.status import carries_label
 
 PROJECT = Path(__file__).resolve().parents[1]
 GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to its unit
@@ -150,7 +151,7 @@ def status_rows(comparisons: Mapping[str, labels_against_truth.ByClass]) -> list
             return ", ".join(
                 f"{state} {100 * n / total:.2f}"
                 for state, n in sorted(found.items(), key=lambda item: -item[1])
-                if not state.startswith("labelled")
+                if not carries_label(state)
             )
 
         def surfaces(group: str, has_label: bool, figures: Mapping[str, Any] = figures) -> str:

@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from stereotruth.config.methods import DATASETS, Audit
 from stereotruth.dataset.manifest import Tile
 from stereotruth.dataset.stereo_dataset import Pair, StereoDataset
 from stereotruth.evaluation.audit import sharing
 from stereotruth.evaluation.audit.conventions import label_values
 from stereotruth.evaluation.audit.matches import Matches, match_pair
 from stereotruth.evaluation.audit.pair import EXTRA_PX, measure_arrays
-from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, UNDECIDED, judge
-from stereotruth.matching.benchmark.settings import DATASETS
 from stereotruth.products.files import atomic_file
 from stereotruth.products.grids import require_complete
 from stereotruth.products.rasters import read_image
@@ -196,7 +195,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e9, help="start no pair after this time")
     arguments = parser.parse_args()
     dataset = StereoDataset.of("own", DATASETS["synthetic"] | {"root": str(arguments.dataset)})
-    limits = Settings()
+    limits = Audit()
     pairs = dataset.pairs(labelled=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
@@ -224,7 +223,7 @@ def main() -> None:
         print(shared.read_text())
 
 
-def report(done: list[dict[str, Any]], limits: Settings, pairs: int) -> None:
+def report(done: list[dict[str, Any]], limits: Audit, pairs: int) -> None:
     """A row per fault: pairs, found by its check, found by any, undecided."""
     names = {name: of["check"] for found in done for name, of in found.items()}
     print("\n| fault | pairs | found by its check | by any | undecided |\n|---|---|---|---|---|")

@@ -51,12 +51,13 @@ from stereotruth.disparity.crowns import with_crowns
 from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.learned_evidence import LEARNED, learned
 from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.status import WATER_CLASS, is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
+from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.numerics.decision_trees import LEAF, DecisionTrees
 from stereotruth.products.files import atomic_file
 from stereotruth.simulate.changes import REASONS, TEXTURE
+from stereotruth.status import is_labelled
 
 Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]

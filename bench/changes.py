@@ -28,10 +28,9 @@ from synthetic_pairs import gain, noise, rectify_by
 from twin_places import Place, add_place, place_given
 
 from stereotruth.alignment.align import align
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.lidar.ingest import ingest
@@ -53,6 +52,7 @@ from stereotruth.simulate.control_points import simulate_points
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE, WATER
+from stereotruth.status import Status, is_labelled
 
 FIRST_CITY = 4000  # of the numbers of cities
 SIDE_PX = 800
@@ -263,9 +263,9 @@ class Labelled:
         return cls({name: grid[name][:] for name in grid.array_keys()}, arrays, changes)
 
 
-def settings_of(case: Case) -> Settings:
+def settings_of(case: Case) -> LabelSettings:
     """How points become labels."""
-    return Settings(diachronic=case.apart)
+    return LabelSettings(diachronic=case.apart)
 
 
 @dataclass

@@ -23,9 +23,9 @@ from synthetic_pairs import VIEWS, rectify_by
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.site_adjustment import adjust_site
 from stereotruth.alignment.site_pair import ScenePair, pair_alignment
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.shown_ground import GroundOfImages
 from stereotruth.evaluation.closure import PairFiles, closure_of_labels, figures, triplets_of
 from stereotruth.lidar.point_store import open_stores
@@ -53,7 +53,7 @@ def labelled(
             inputs = SceneInputs.of(
                 *rectified,
                 stores,
-                Settings(),
+                LabelSettings(),
                 alignment=scratch / "alignment.json",
                 surface=surface,
             )

@@ -14,7 +14,7 @@ from wooded_scenes import MIXED, Draw, Scene
 
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
-from stereotruth.disparity.settings import Settings
+from stereotruth.config.labels import LabelSettings
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.evaluation.labels_against_truth import SceneComparison, compare_scene
 from stereotruth.numerics.error_sums import ErrorSum
@@ -50,7 +50,7 @@ class Compared:
     alignments: dict[str, tuple[ErrorSum, ErrorSum]]
 
 
-def compare_drawn(name: str, density: float, settings: Settings, workers: int) -> Compared:
+def compare_drawn(name: str, density: float, settings: LabelSettings, workers: int) -> Compared:
     """Labels and alignment of a city of NAMED at a density of its LiDAR."""
     scene = Scene(replace(NAMED[name], density=density), FOLDER)
     return _compared(
@@ -58,14 +58,16 @@ def compare_drawn(name: str, density: float, settings: Settings, workers: int) -
     )
 
 
-def compare_twin(place: Place, density: float, settings: Settings, workers: int) -> Compared:
+def compare_twin(place: Place, density: float, settings: LabelSettings, workers: int) -> Compared:
     """The same of the twin of a place."""
     scene = Scene(TwinDraw(place, TWIN_SEED, density), FOLDER)
     title = f"twin of {place.file.stem}, {density:g} points/m²"
     return _compared(scene, f"{place.key}-{density:g}", title, settings, workers)
 
 
-def _compared(scene: Scene, key: str, title: str, settings: Settings, workers: int) -> Compared:
+def _compared(
+    scene: Scene, key: str, title: str, settings: LabelSettings, workers: int
+) -> Compared:
     """Labels and alignment of a scene, made once in a folder that has its ``key``."""
     alone = scene.align(GCPS)
     code = source_digest("alignment.refine", "disparity.project")[:8]

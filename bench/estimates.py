@@ -16,9 +16,9 @@ from labelled_block import Block
 from synthetic_pairs import Pair, fresh_pair
 
 from stereotruth.command.check_tiles import pixel_m2
-from stereotruth.disparity.status import is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.labels_against_truth import WATER
+from stereotruth.status import is_labelled
 
 PROJECT = Path(__file__).resolve().parents[1]
 TABLE = PROJECT / "src/stereotruth/command/estimates.json"

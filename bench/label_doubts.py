@@ -21,15 +21,14 @@ from wooded_scenes import Draw, Scene
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.label_uncertainty import LabelUncertainty
 from stereotruth.alignment.refine import refine
+from stereotruth.config.labels import LabelSettings, Limits
 from stereotruth.dataset.label_doubts import PARALLAX, Bias, SceneMatches, doubts
 from stereotruth.dataset.scene_stores import SceneFiles, SceneStores, open_stores
-from stereotruth.dataset.settings import Limits
 from stereotruth.dataset.sift_matches import TileMatches, match_tile
 from stereotruth.dataset.tile_files import LabelsKnown
 from stereotruth.dataset.windows import cell_step, choose_windows, scan_scene
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.products.files import atomic_folder
@@ -75,7 +74,7 @@ def labelled(scene: Scene, gcps: int, refined: bool) -> SceneStores:
                 rectify(
                     *opened, model, made / "epipolar.json", *stores, workers=1, left_attrs=attrs
                 )
-            inputs = SceneInputs.of(*stores, scene.stores, Settings())
+            inputs = SceneInputs.of(*stores, scene.stores, LabelSettings())
             inputs = inputs.with_surface(made)
             project_scene(inputs, made / "disparity.zarr", code="", workers=1)
     files = [folder / f"{kind}.zarr" for kind in ("disparity", *VIEWS)]

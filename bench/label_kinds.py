@@ -25,14 +25,14 @@ from wooded_scenes import MIXED, Draw, Scene
 
 from stereotruth.alignment.align import align
 from stereotruth.alignment.refine import refine
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import is_labelled
+from stereotruth.config.labels import LabelSettings
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import open_grid, require_complete
 from stereotruth.simulate.surfaces import TREE, WATER
+from stereotruth.status import is_labelled
 
 DENSITIES = (4.0, 1.0)  # points/m²
 GCPS = 15
@@ -92,7 +92,7 @@ def training_pairs(number: int, side_px: int, folder: Path) -> dict[str, Labelle
             with atomic_folder(made) as scratch:
                 alone = scene.align(GCPS)
                 refined, _ = refine(alone, *scene.images, scene.stores, provenance={})
-                label_by(refined, scene.images, scene.stores, scratch, Settings(), workers=2)
+                label_by(refined, scene.images, scene.stores, scratch, LabelSettings(), workers=2)
         model = EpipolarModel.load(made / "epipolar.json")
         images = _images(made)
         labels = open_grid(made / "disparity.zarr")

@@ -11,8 +11,8 @@ from labelled_block import Block
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.evaluation.labels_against_truth import CLASSES, WATER
+from stereotruth.status import Status, is_labelled
 
 OFF_PX = 1.0  # a label further away is off
 STEP_PX = 1.0  # of disparity between neighbouring pixels: more is an edge

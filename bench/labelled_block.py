@@ -11,10 +11,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from synthetic_pairs import Pair
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import MAX_POINTS, SHARD
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.evaluation.labels_against_truth import Truth
@@ -97,7 +97,7 @@ class Block:
 
     def job(self, points_per_m2: float | None, recipe: str = "surface") -> SceneInputs:
         """What labels the block; ``points_per_m2`` None, or more than there are: all points."""
-        settings = Settings(recipe=recipe)
+        settings = LabelSettings(recipe=recipe)
         images = (self.rectified / f"{view}.zarr" for view in ("left", "right"))
         alignment = self.pair.alignment(self.rectified)
         job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)

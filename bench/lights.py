@@ -79,7 +79,7 @@ def main() -> None:
                 inputs, truth = inputs_of(case, given.folder), dated_truth(case, given.folder)
                 light = case.light(inputs)
                 for apart, row in rows.items():
-                    settings = replace(inputs.settings, diachronic=apart)
+                    settings = inputs.settings.model_copy(update={"diachronic": apart})
                     out = given.folder / "labels.zarr"
                     project_scene(replace(inputs, settings=settings), out, code="bench", workers=2)
                     grid = require_complete(out)

@@ -30,6 +30,7 @@ from scipy.ndimage import (
     uniform_filter,
 )
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.change_evidence import LabelledWindow
 from stereotruth.disparity.change_probability import change_probability
 from stereotruth.disparity.crowns import with_crowns
@@ -37,12 +38,12 @@ from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import WATER_CLASS, Status, is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.products.files import atomic_folder
+from stereotruth.status import Status, is_labelled
 from stereotruth.surface.make_surface import make_surface
 
 Floats = NDArray[np.float64]
@@ -262,7 +263,7 @@ class RealScene:
         ]
         views = (results / "rectify" / Path(*parts) / f"{view}.zarr" for view in ("left", "right"))
         inputs = SceneInputs.of(
-            *views, stores, Settings(diachronic=self.diachronic),
+            *views, stores, LabelSettings(diachronic=self.diachronic),
             alignment=next(path for path in aligned if path.is_file()),
         )  # fmt: skip
         surface = stores[0].parent / "made.surface"

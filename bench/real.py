@@ -33,12 +33,11 @@ from numpy.typing import NDArray
 from warped_panels import draw_panels
 
 from stereotruth.alignment.control_points import ControlPoints
+from stereotruth.config.labels import LabelSettings
 from stereotruth.dataset.sift_matches import match_tile
 from stereotruth.dataset.warped_tile import WarpedTile
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
@@ -47,6 +46,7 @@ from stereotruth.epipolar.warping import warp_rows
 from stereotruth.evaluation.scene_warping import warp_scene
 from stereotruth.numerics.degrees import metres_per_degree
 from stereotruth.products.grids import require_complete
+from stereotruth.status import Status, is_labelled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -208,7 +208,11 @@ class Pair:
         surface = (results / "surface" / self.site.city).glob("*.surface")
         stores = (self.product("rectify", f"{view}.zarr") for view in ("left", "right"))
         inputs = SceneInputs.of(
-            *stores, list(points), Settings(), alignment=_alignment(self), surface=next(surface)
+            *stores,
+            list(points),
+            LabelSettings(),
+            alignment=_alignment(self),
+            surface=next(surface),
         )
         rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
         found = lidar_labels(inputs, *read_window(inputs, rows, cols))

@@ -14,13 +14,13 @@ from synthetic_pairs import rectify_by
 from wooded_scenes import Scene
 
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.labels_against_truth import CLASSES, WATER
 from stereotruth.products.files import atomic_folder
 from stereotruth.simulate.render import prepare
 from stereotruth.simulate.surfaces import GROUND, TREE, terrain_heights
 from stereotruth.simulate.truth import truth_at
+from stereotruth.status import Status, is_labelled
 
 SIZE_PX = 768  # of the block in the middle of the grid
 SLOPES_DEG = {"0–5°": (0.0, 5.0), "5–15°": (5.0, 15.0), "> 15°": (15.0, 90.0)}

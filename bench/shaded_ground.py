@@ -27,10 +27,10 @@ from stereotruth.disparity.image_agreement import least_probability
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.recipe import lidar_labels
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.status import is_labelled
 from stereotruth.disparity.window_points import read_window
 from stereotruth.epipolar.image_noise import EQUAL, ROUNDING, NoiseCurve, pair_noise
 from stereotruth.pages.pictures import save_figure
+from stereotruth.status import is_labelled
 
 SHADE_DN, LIGHT_DN = 3.5, 0.7  # noise at the darkest and at the brightest
 BLUR_PX = 0.55  # of the noise: neighbours correlate by 0.4

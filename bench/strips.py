@@ -20,7 +20,7 @@ from synthetic_pairs import SEED, VIEWS, label_by
 
 from stereotruth.alignment.align import align
 from stereotruth.alignment.refine import refine
-from stereotruth.disparity.settings import Settings
+from stereotruth.config.labels import LabelSettings
 from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
@@ -116,7 +116,7 @@ def main() -> None:
             out.mkdir(exist_ok=True)
             alone = align(*images, folder / "gcps.csv", provenance={})
             alignment, _ = refine(alone, *images, points, provenance={})
-            label_by(alignment, images, points, out, Settings(), workers=given.threads)
+            label_by(alignment, images, points, out, LabelSettings(), workers=given.threads)
             truth = out / "epipolar.json", out / "truth.zarr"
             write_grid_truth(city, city.scenes[0], *truth, workers=given.threads)
             print(f"city {number}, {name}:", {k: round(v, 4) for k, v in judge(out).items()})

@@ -18,10 +18,10 @@ from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
@@ -87,9 +87,9 @@ def sun_an_hour_later(city: CitySpec) -> tuple[float, float]:
     return math.degrees(math.atan2(east, north)) % 360.0, math.degrees(math.asin(up))
 
 
-def labels_of(config: Configuration) -> Settings:
+def labels_of(config: Configuration) -> LabelSettings:
     """How points become labels by a configuration."""
-    return Settings(**{name: getattr(config.project, name) for name in vars(Settings())})
+    return LabelSettings(**{name: getattr(config.project, name) for name in vars(LabelSettings())})
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def label_by(
     images: Sequence[Path],
     stores: Sequence[Path],
     folder: Path,
-    settings: Settings,
+    settings: LabelSettings,
     *,
     workers: int = 1,
 ) -> Path:

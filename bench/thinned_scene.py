@@ -15,9 +15,9 @@ from checkpoints import evaluate_checkpoints
 from label_tables import print_table, shown
 from synthetic_pairs import VIEWS, rectify_pair
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.lidar.ingest import ingest
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
@@ -62,7 +62,7 @@ def main() -> None:
         for recipe in options.recipe:
             store = options.folder / f"every_{every}_{recipe}.zarr"
             images = (pair / f"{view}.zarr" for view in VIEWS)
-            settings, alignment = Settings(recipe=recipe), pair / "alignment.json"
+            settings, alignment = LabelSettings(recipe=recipe), pair / "alignment.json"
             inputs = SceneInputs.of(*images, stores, settings, alignment=alignment)
             inputs = inputs.with_surface(pair)
             project_scene(inputs, store, code=source_digest("disparity.project"))

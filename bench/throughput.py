@@ -22,7 +22,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +35,12 @@ from rasterio.transform import RPCTransformer
 import stereotruth
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.paper_correlation import correlate
 from stereotruth.disparity.pixel_points import Collection
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify, rectify_image
@@ -75,10 +74,10 @@ PROJECT_JOB = """
 import json, os, sys
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
+from stereotruth.config.labels import LabelSettings
 from stereotruth.job import job
 left, right, points, out, log, alignment, settings, options = sys.argv[1:]
-points, settings = json.loads(points), Settings(**json.loads(settings))
+points, settings = json.loads(points), LabelSettings(**json.loads(settings))
 inputs = SceneInputs.of(left, right, points, settings, alignment=alignment)
 with job(log, "project"):
     inputs = inputs.with_surface(os.path.dirname(out), json.loads(options).get("workers", 1))
@@ -291,7 +290,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     alignment, options = folder / "alignment.json", {"code": code}
 
     def inputs(points: Sequence[Path]) -> SceneInputs:
-        return SceneInputs.of(left, right, points, Settings(**settings), alignment=alignment)
+        return SceneInputs.of(left, right, points, LabelSettings(**settings), alignment=alignment)
 
     project_scene(inputs([smallest_store]).with_surface(out.parent), out, **options)
 
@@ -724,7 +723,7 @@ def main() -> int:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.workers])
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    settings = asdict(Settings())
+    settings = LabelSettings().model_dump()
     report: dict[str, Any] = {"machine": machine(arguments.workers)}
     print(", ".join(f"{k} {v}" for k, v in report["machine"].items()))
     if not arguments.kernels:

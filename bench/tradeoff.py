@@ -11,7 +11,6 @@ import logging
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -30,10 +29,10 @@ from accuracy import (
 from matplotlib.figure import Figure
 from synthetic_pairs import labels_of
 
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import SHARD, project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.evaluation.labels_against_truth import (
     ByClass,
@@ -73,7 +72,7 @@ def measure(
         with patch("stereotruth.disparity.project.blocks", lambda *_: list(windows)):
             alignment = made.refined if made.refined.is_file() else made.aligned
             inputs = SceneInputs.of(
-                made.left, made.right, made.points, Settings(**settings), alignment=alignment
+                made.left, made.right, made.points, LabelSettings(**settings), alignment=alignment
             )
             inputs = inputs.with_surface(made.exact, workers)
             code = source_digest("disparity.project")
@@ -96,7 +95,7 @@ def rows_of_city(
         truth = made.truth(made.exact, made.disparity, arguments.workers)
         windows = fullest(truth, arguments.blocks)
         for recipe, threshold in product(COLOURS, THRESHOLDS):
-            settings = asdict(labels_of(config))
+            settings = labels_of(config).model_dump()
             settings |= {"recipe": recipe, "correlation_threshold": threshold}
             part = measure(made, windows, truth, settings, arguments.workers)
             found.setdefault((recipe, threshold), ByClass()).merge(part)

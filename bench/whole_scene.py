@@ -23,6 +23,7 @@ from whole_images import match
 
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
+from stereotruth.config.methods import SceneMatching
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
@@ -30,7 +31,6 @@ from stereotruth.evaluation.epipolar_truth import truth_window
 from stereotruth.matching.benchmark.predictions import peak_memory_mb
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes.predict_scene import predict_scene
-from stereotruth.matching.scenes.settings import Settings
 from stereotruth.matching.scenes.surface_model import Raster, write_dsm
 from stereotruth.numerics.error_sums import ErrorSum
 from stereotruth.numerics.robust import median_and_nmad
@@ -405,7 +405,7 @@ def main() -> None:
     for method, settings in methods.items():
         store, tiff = folder / f"{method}.zarr", folder / f"{method}_dsm.tif"
         margin = None if settings["kind"] == "sgm" else given.margin
-        of = Settings(RANGE, block_px=BLOCK, overlap_px=OVERLAP, margin_px=margin)
+        of = SceneMatching(RANGE, block_px=BLOCK, overlap_px=OVERLAP, margin_px=margin)
         options = {"method": method, "entry": settings, "settings": of, "workers": 2}
         summary, seconds, peak = measured(predict_scene, *stores, store, **options)
         _, dsm_seconds, dsm_peak = measured(write_dsm, store, tiff, workers=2)

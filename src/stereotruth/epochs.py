@@ -12,10 +12,10 @@ from contextlib import suppress
 from datetime import date
 
 from . import sheets
+from .dates import decimal_year, epoch_year
 from .epipolar.acquisition import read_acquisition
 from .lidar.frames import DEFAULT_EPOCH, Epoch
 from .project import is_synthetic, names_in_pair
-from .settings import decimal_year, epoch_year
 
 LOOKED_AT = 10  # scenes of a city whose deliveries are looked into
 ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place

@@ -13,7 +13,8 @@ from typing import Any
 import yaml
 
 from . import sheets
-from .configuration import Configuration
+from .config.configuration import Configuration
+from .config.section import merged
 from .errors import InputError, in_words, told_by_system
 from .lidar.catalogue_list import (
     EPT,
@@ -34,7 +35,6 @@ from .products.remote_files import (
     place_of,
     stand_in,
 )
-from .settings import merged
 from .simulate.cities import FOLDER as SYNTHETIC_FOLDER
 from .simulate.cities import city_of, lidar_files, synthetic_city
 
@@ -205,7 +205,7 @@ def here_or_shipped(path: str) -> str:
 def sheet(settings: Configuration, name: str) -> str:
     """Path of the sheet ``name`` (scenes, cities); the package's own serves where none is named."""
     path = getattr(settings, name)
-    return here_or_shipped(path) if path == getattr(Configuration, name) else path
+    return here_or_shipped(path) if path == Configuration.model_fields[name].default else path
 
 
 @in_words()

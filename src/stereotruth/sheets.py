@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
+from pydantic.dataclasses import dataclass
 
-from .errors import InputError
-from .settings import (
+from .config.section import (
+    CHECKED,
     LONGEST_NAME,
     PATTERN,
     REPEATED,
@@ -28,12 +29,11 @@ from .settings import (
     Number,
     Text,
     Whole,
-    acquisition_time,
-    epoch_year,
+    check,
     name_of,
-    settings,
 )
-from .settings_text import check
+from .dates import acquisition_time, epoch_year
+from .errors import InputError
 from .tables import Mistakes, Table, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
@@ -46,7 +46,7 @@ Count = Annotated[Whole, Field(ge=0)]
 Given = Annotated[FilePath, StringConstraints(min_length=1)]
 
 
-@settings
+@dataclass(frozen=True, config=CHECKED)
 class City:
     """One row of the cities sheet; the counts are those of the paper's table 3."""
 
@@ -72,7 +72,7 @@ class City:
     frame of their own are of this epoch. See docs/explanation/frames.md"""
 
 
-@settings
+@dataclass(frozen=True, config=CHECKED)
 class Scene:
     """One row of the scenes sheet: a stereo pair, its LiDAR and its ground control points."""
 
@@ -133,7 +133,7 @@ class Scene:
     the images sheet nor the deliveries know it, as `project.diachronic` says"""
 
 
-@settings
+@dataclass(frozen=True, config=CHECKED)
 class Image:
     """One row of the images sheet: an image of a site, which any scene of its city may name."""
 

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity import project
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.simulate.__main__ import make_scene
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
@@ -233,7 +233,7 @@ def test_dask_workers_come_and_go_while_project_runs(
     surface = made / "surface/East/East-1.surface"
 
     def label(out: Path, **how: object) -> None:
-        inputs = SceneInputs.of(*images, points, Settings(), surface=surface)
+        inputs = SceneInputs.of(*images, points, LabelSettings(), surface=surface)
         project.project_scene(inputs, out, code="the same", **how)
 
     label(tmp_path / "threads.zarr", workers=2)

@@ -10,9 +10,9 @@ import numpy as np
 import pyproj
 
 from stereotruth.alignment.aligned_pair import Alignment, ViewFit
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.lidar.ingest import ingest
@@ -158,7 +158,7 @@ def project_with(left: Path, right: Path, stores: list[Path], out: Path, **optio
     settings."""
     run = {name: options.pop(name) for name in RUN if name in options}
     pair = {name: options.pop(name) for name in PAIR if name in options}
-    inputs = SceneInputs.of(left, right, stores, Settings(**options), **pair)
+    inputs = SceneInputs.of(left, right, stores, LabelSettings(**options), **pair)
     if inputs.point_stores and inputs.surface is None:
         inputs = inputs.with_surface(out.parent / "surfaces")
     return project_scene(inputs, out, **{"code": "test", **run})
@@ -181,7 +181,7 @@ class Scene:
         xy = self.model.ground_to_epipolar(LON + east / METRES[0], LAT + north / METRES[1], height)
         self.truth = (xy[0] - xy[2]).reshape(self.model.shape)
 
-    def inputs(self, settings: Settings, view: str = "left") -> SceneInputs:
+    def inputs(self, settings: LabelSettings, view: str = "left") -> SceneInputs:
         """What the scene's labels are made of."""
         inputs = SceneInputs.of(*self.images, [self.store], settings, view)
         return inputs.with_surface(self.folder / "surfaces")

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError

@@ -15,10 +15,10 @@ from unittest.mock import patch
 
 import numpy as np
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity import recipe
 from stereotruth.disparity.facet_labels import facet_labels
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status
+from stereotruth.status import Status
 
 from .box_scene import Scene
 
@@ -35,7 +35,7 @@ def of_facets(seen, own, *rest):
 
 def row(scene: Scene, name: str, how) -> str:
     """Errors of the labels by facets and own points, and the share within σ and 2 σ."""
-    inputs = scene.inputs(Settings())
+    inputs = scene.inputs(LabelSettings())
     rows, cols = scene.model.shape
     with patch.object(recipe, "facet_labels", how):
         layers, _ = recipe.label_window(inputs, slice(0, rows), slice(0, cols))

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
+from stereotruth.config.labels import Export, Limits
 from stereotruth.dataset.export import City, Extras, export_city
 from stereotruth.dataset.scene_stores import SceneFiles
-from stereotruth.dataset.settings import Limits, Settings
 from stereotruth.epipolar.colours import COLOURS
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
@@ -150,19 +150,19 @@ def make_scene(
     return SceneFiles(folder.name, *stores)
 
 
-NO_LIMITS = Limits(*[None] * 7)
+NO_LIMITS = Limits(**dict.fromkeys(Limits.model_fields))
 TOWN = City("Town", "TN", training=600, validation=80, testing=200)
 
 
 def run(scenes, out: Path, **options) -> dict:
     """Export with other settings than the configuration's; ``options``: settings and the rest."""
     given = {"size": SIZE, "min_labelled": 0.6, "quality": NO_LIMITS, "seed": 1} | options
-    known = Settings.__dataclass_fields__
+    known = Export.model_fields
     settings = {name: given.pop(name) for name in list(given) if name in known}
     city = {name: given.pop(name) for name in list(given) if name in TOWN.__dataclass_fields__}
     extras = {n: given.pop(n) for n in list(given) if n in Extras.__dataclass_fields__}
     return export_city(
-        replace(TOWN, **city), scenes, out, Settings(**settings), extras=Extras(**extras), **given
+        replace(TOWN, **city), scenes, out, Export(**settings), extras=Extras(**extras), **given
     )
 
 

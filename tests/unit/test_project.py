@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
+from stereotruth.config.section import merged
 from stereotruth.errors import InputError
 from stereotruth.project import (
     FILES,
@@ -20,7 +21,6 @@ from stereotruth.project import (
     read_scenes,
     stores_of,
 )
-from stereotruth.settings import merged
 from stereotruth.sheets import Image, Scene
 
 

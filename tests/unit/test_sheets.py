@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from stereotruth import sheets
-from stereotruth.configuration import REPLACED, Configuration, defaults_text, with_tables
+from stereotruth.dates import acquisition_time
 from stereotruth.errors import InputError
-from stereotruth.settings import acquisition_time
 from stereotruth.tables import SheetError
 
 ROOT = Path(__file__).parents[2]
@@ -99,146 +98,6 @@ def test_a_count_that_is_no_number_is_refused(tmp_path):
     file = write(tmp_path / "cities.tsv", CITIES.replace("600", "many"))
     with pytest.raises(InputError, match="training is 'many'"):
         sheets.read_cities(file)
-
-
-def test_an_unknown_key_is_refused_with_a_guess():
-    config = {"tiles": {"sise": 512}}
-    with pytest.raises(InputError) as refusal:
-        Configuration.of({**default_config(), **config})
-    assert "unknown key 'sise' under 'tiles'" in str(refusal.value)
-    assert "did you mean 'size'?" in str(refusal.value)
-
-
-def test_a_value_out_of_range_is_refused_with_its_meaning():
-    config = default_config()
-    config["project"]["window"] = 8
-    with pytest.raises(InputError, match=r"project.window.*odd"):
-        Configuration.of(config)
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "remedy"),
-    [
-        ("occlusion.method", "geometric", "project.recipe: surface"),
-        ("occlusion.window", 9, "project.window"),
-        ("occlusion.correlation_threshold", 0.5, "project.correlation_threshold"),
-        ("project.representative", "top", "project.recipe: surface"),
-        ("project.fill", "surface_and_images", "project.recipe: surface"),
-    ],
-)
-def test_a_key_of_earlier_versions_is_refused_with_what_takes_its_place(path, value, remedy):
-    assert path in REPLACED
-    with pytest.raises(InputError) as refusal:
-        Configuration.of(with_key(path, value), "mine.yaml")
-    assert f"mine.yaml: {path}" in str(refusal.value)
-    assert remedy in refusal.value.remedy
-    section, key = path.split(".")
-    assert not hasattr(getattr(Configuration(), section, None), key), "replaced and known"
-
-
-def default_config() -> dict:
-    import yaml
-
-    return yaml.safe_load((ROOT / "config" / "config.yaml").read_text())
-
-
-def test_the_default_configuration_is_valid_and_documented():
-    config = default_config()
-    Configuration.of(config)
-    guide = (ROOT / "config" / "README.md").read_text()
-    for key, value in config.items():
-        for name in [f"{key}.{sub}" for sub in value] if isinstance(value, dict) else [key]:
-            assert f"`{name}`" in guide, name
-
-
-def test_the_file_of_defaults_follows_from_the_classes():
-    text = (ROOT / "config" / "config.yaml").read_text()
-    assert defaults_text() == text, "run: python -m stereotruth.configuration"
-    assert Configuration.of(default_config()) == Configuration()
-
-
-def test_entries_by_name_lie_over_those_that_are_not_written():
-    mine = {"kind": "sgm", "mode": "hh", "training": {"epochs": 3}}
-    methods = {"mine": mine, "psmnet": None}
-    datasets = {"synthetic": {"methods": ["mine"]}}
-    found = Configuration.of({"benchmark": {"methods": methods, "datasets": datasets}}).benchmark
-    assert list(found.methods) == ["sgm", "stereonet", "psmnet", "hmsmnet", "mine"]
-    assert found.methods["psmnet"] is None
-    assert found.methods["mine"].entry == mine
-    assert found.methods["sgm"].entry == {"kind": "sgm"}
-    assert found.datasets["synthetic"].root == "dataset"
-    assert found.datasets["synthetic"].methods == ("mine",)
-
-
-def test_the_reference_follows_from_the_classes():
-    guide = (ROOT / "config" / "README.md").read_text()
-    assert with_tables(guide) == guide, "run: python -m stereotruth.configuration"
-    assert guide.count("<!-- keys: ") == guide.count("<!-- end -->") == 5
-
-
-def with_key(path: str, value: object) -> dict:
-    config = inside = default_config()
-    *sections, key = path.split(".")
-    for section in sections:
-        inside = inside.setdefault(section, {})
-    inside[key] = value
-    return config
-
-
-MINE = {"root": "mine", "layout": "whu", "disparity_range": [-64, 64]}
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "words"),
-    [
-        ("tile", 3, ["unknown key 'tile'.", "did you mean 'tiles'?"]),
-        ("tiles", None, ["tiles: None has no keys", "size, stride"]),
-        ("seed", "x", ["seed: 'x' should be a valid integer", "whole number"]),
-        ("seed", True, ["seed: True"]),
-        ("strict", "yes", ["strict: 'yes'", "true, false"]),
-        ("tiles.stride", "z", ["tiles.stride: 'z'", "px, null"]),
-        ("tiles.min_labelled", 1.5, ["tiles.min_labelled: 1.5", "share, 0 … 1"]),
-        ("project.window", 33, ["33 should be less than or equal to 31", "odd, 3 … 31"]),
-        ("project.recipe", "papr", ["'papr'", "surface, paper"]),
-        ("ingest.drop_classes", [300], ["ingest.drop_classes.0: 300"]),
-        ("ingest.drop_classes", [7, 7], ["ingest.drop_classes", "a value twice"]),
-        ("alignment.fixed", {"S-1": 3}, ["alignment.fixed.S-1: 3", "scene or image: path"]),
-        ("strips", 0, ["strips: 0", "1 … 1000"]),
-        ("strips", {"S-1": 0}, ["strips.S-1: 0", "1 … 1000"]),
-        ("predict.offset", "best", ["predict.offset: 'best'", "px, auto"]),
-        ("predict.block_px", 1000, ["1000 should be a multiple of 256"]),
-        ("predict.overlap_px", 600, ["predict: blocks of 1024 px with an overlap of 600 px"]),
-        ("predict.dsm.resolution", 1, ["'resolution' under 'predict.dsm'", "'resolution_m'?"]),
-        ("benchmark.thresholds_px", [], ["benchmark.thresholds_px: [] should have"]),
-        ("benchmark.datasets.x", {"root": "r"}, ["benchmark.datasets.x.", "is required"]),
-        ("benchmark.datasets.x", MINE | {"nodatta": 0}, ["'nodatta' under 'benchmark.datasets.x'"]),
-        ("benchmark.datasets.x y", MINE, ["benchmark.datasets.x y: 'x y' should match"]),
-        ("benchmark.methods.x", {"kind": "raft"}, ["'raft'", "hmsmnet"]),
-        ("benchmark.methods.x", {"kind": "sgm", "training": {"epoch": 1}}, ["'epochs'?"]),
-        ("training.crop_px", [64], ["training.crop_px.1: is required"]),
-        ("training.augmentation.noise", -1, ["training.augmentation.noise: -1"]),
-    ],
-)
-def test_a_wrong_value_is_refused_by_its_key_with_what_it_may_be(path, value, words):
-    with pytest.raises(InputError) as refusal:
-        Configuration.of(with_key(path, value))
-    for word in ["config: ", "Remedy", *words]:
-        assert word in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("benchmark.datasets.x", MINE | {"methods": None}),
-        ("benchmark.datasets.synthetic", None),
-        ("benchmark.methods.sgm", {"kind": "sgm", "block_size": 5, "label": "mine"}),
-        ("strips", {"Wuhan-1": 8}),
-        ("predict.offset", -40),
-        ("tiles.nodata", -9999.5),
-    ],
-)
-def test_what_a_key_may_be_is_taken(path, value):
-    assert Configuration.of(with_key(path, value))
 
 
 def scene_with_lidar(lidar: Path | str) -> sheets.Scene:

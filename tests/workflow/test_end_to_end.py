@@ -18,17 +18,16 @@ from stereotruth.alignment.align import align
 from stereotruth.alignment.refine import refine
 from stereotruth.command.check import check_project
 from stereotruth.command.findings import Level
-from stereotruth.dataset.sure_labels import TOO_UNCERTAIN
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings as ProjectSettings
-from stereotruth.disparity.status import Status
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.status import Status
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
@@ -182,7 +181,7 @@ def test_the_store_of_a_scene_opens_by_xarray_alone(made):
             wanted = here.disparity.values.astype(np.float64) - int(row["right_offset_px"])
             status = here.status.values.copy()
             unsure = (status == Status.LABELLED_CROWN) & (here.uncertainty.values > 0.5)
-            wanted[unsure], status[unsure] = np.nan, TOO_UNCERTAIN
+            wanted[unsure], status[unsure] = np.nan, Status.TOO_UNCERTAIN
             for kind, values in (("disp", wanted), ("status", status)):
                 path = made.folder / "tiles/Tiny" / row[kind]
                 found = rioxarray.open_rasterio(path, masked=kind == "disp")[0].values
@@ -388,7 +387,7 @@ def run_stages(row: dict[str, str], good: Project, folder: Path) -> None:
             outputs = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
             rectify(left, right, model, *outputs, provenance={})
     sides = (rectified / "left.zarr", rectified / "right.zarr")
-    inputs = SceneInputs.of(*sides, stores, ProjectSettings()).with_surface(folder)
+    inputs = SceneInputs.of(*sides, stores, LabelSettings()).with_surface(folder)
     project_scene(inputs, folder / "labels.zarr", code="")
 
 

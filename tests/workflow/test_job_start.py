@@ -18,7 +18,7 @@ STARTS = {
     "simulate_lidar": {"laspy", "numba", "pyproj"},
     "simulate_truth": {"numba", "rasterio", "scipy.spatial", "scipy.special", "zarr"},
     "ingest": {"laspy", "numba", "pyproj"},
-    "align": {"cv2", "numba", "pydantic", "pyproj", "rasterio"},
+    "align": {"cv2", "numba", "pyproj", "rasterio"},
     "refine": {"cv2", "numba", "pydantic", "pyproj", "rasterio", "scipy.special"},
     "adjust": {"cv2", "numba", "pydantic", "pyproj", "rasterio", "scipy.special"},
     "adjusted_alignment": {"numba"},

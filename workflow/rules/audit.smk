@@ -19,7 +19,7 @@ rule audit:
         sources=upstream("audit"),
         script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
-        settings=asdict(SETTINGS.audit),
+        settings=SETTINGS.audit.model_dump(),
         measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),
         code=source_digest("evaluation.audit.audit"),
         templates=templates_of("evaluation", "audit", "page.html.jinja"),

@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
 from stereotruth.epochs import epoch_of_city
 from stereotruth.errors import InputError, in_words
 from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
@@ -23,7 +23,7 @@ from stereotruth.project import (
     stores_of,
     surfaces_of,
 )
-from stereotruth.settings import epoch_year
+from stereotruth.dates import epoch_year
 from stereotruth.simulate import cities
 
 CONDA = FILES / "envs" / "workflow.yaml"

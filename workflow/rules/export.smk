@@ -47,9 +47,9 @@ rule export:
         acquired=lambda w: [days_of_pair(IMAGE_NAMES[s.scene], IMAGES) for s in scenes_of(w.city)],
         city=lambda w: {k: v for k, v in asdict(CITIES[w.city]).items() if k != "epoch"},
         settings={
-            **asdict(SETTINGS.tiles),
-            **asdict(SETTINGS.evaluation),
-            "quality": asdict(SETTINGS.quality),
+            **SETTINGS.tiles.model_dump(),
+            **SETTINGS.evaluation.model_dump(),
+            "quality": SETTINGS.quality.model_dump(),
             "seed": SETTINGS.seed,
             "strict": SETTINGS.strict,
         },

@@ -198,7 +198,7 @@ def surface_of(wildcards):
 
 def surface_of_labels(wildcards):
     """The surface that a scene's labels follow from; the recipe paper needs none."""
-    return surface_of(wildcards) if SETTINGS.project.on_surface else []
+    return surface_of(wildcards) if SETTINGS.project.recipe == "surface" else []
 
 
 def adjustment_of(wildcards):

@@ -6,7 +6,7 @@ from functools import cache
 from snakemake.logging import logger
 
 from stereotruth.matching.kinds import KINDS, kind_of
-from stereotruth.matching.scenes.settings import Settings as PredictionSettings
+from stereotruth.config.methods import SceneMatching
 
 
 def dataset_settings(name):
@@ -22,9 +22,7 @@ def dataset_settings(name):
 
 def dataset_entry(name):
     """What a dataset is: its entry without the methods that are compared on it, and how."""
-    asked = ("methods", "protocol")
-    entry = asdict(dataset_settings(name)).items()
-    return {key: value for key, value in entry if key not in asked}
+    return dataset_settings(name).model_dump(exclude={"methods", "protocol"})
 
 
 def dataset_folder(name):
@@ -91,8 +89,8 @@ def method_entry(name, dataset):
 
     A network without weights takes those that it is trained to on the dataset.
     """
-    names = ("label", "fine_tuned_of", "training")
-    entry = {key: value for key, value in method_settings(name).entry.items() if key not in names}
+    names = {"label", "fine_tuned_of", "training"}
+    entry = method_settings(name).model_dump(exclude_defaults=True, exclude=names)
     if KINDS[entry["kind"]].is_network:
         entry["weights"] = entry.get("weights") or f"results/train/{dataset}/{name}/best.pt"
     return entry
@@ -104,7 +102,7 @@ def method_files(name, dataset):
     Ends the plan if the method has settings that its kind does not know.
     """
     try:
-        kind = kind_of(name, method_settings(name).entry)
+        kind = kind_of(name, method_settings(name).model_dump(exclude_defaults=True))
         return [given(file) for file in kind.files(method_entry(name, dataset))]
     except InputError as error:
         raise Refused(f"benchmark.methods.{name}: {error}")
@@ -112,7 +110,8 @@ def method_files(name, dataset):
 
 def training_of(name):
     """How a network is trained: section training, and what the method's entry has other."""
-    return {"seed": SETTINGS.seed, **asdict(SETTINGS.training), **method_settings(name).training}
+    own = method_settings(name).training
+    return {"seed": SETTINGS.seed, **SETTINGS.training.model_dump(), **own}
 
 
 def method_modules(name):
@@ -143,7 +142,6 @@ def prediction_dataset():
 
 def scene_prediction():
     """How methods go over whole scenes; the disparity range is that of their dataset."""
-    settings = asdict(SETTINGS.predict)
+    own = SETTINGS.predict.model_dump(include=set(SceneMatching.model_fields))
     known = dataset_settings(prediction_dataset()).disparity_range
-    own = {key: settings[key] for key in PredictionSettings.__dataclass_fields__}
     return own | {"disparity_range": own["disparity_range"] or known}

@@ -51,7 +51,7 @@ rule dsm:
     params:
         sources=upstream("dsm"),
         script=content_of("../scripts/dsm.py"),
-        settings=asdict(SETTINGS.predict.dsm),
+        settings=SETTINGS.predict.dsm.model_dump(),
         code=source_digest("matching.scenes.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"

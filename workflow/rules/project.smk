@@ -1,4 +1,4 @@
-PROJECTION = {key: of for key, of in asdict(SETTINGS.project).items() if key != "right_view"}
+PROJECTION = SETTINGS.project.model_dump(exclude={"right_view"})
 
 
 rule project:

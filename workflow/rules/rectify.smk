@@ -23,7 +23,7 @@ rule rectify:
     params:
         sources=upstream("rectify"),
         script=content_of("../scripts/rectify.py"),
-        bands=asdict(SETTINGS.rectify),
+        bands=SETTINGS.rectify.model_dump(),
         code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
     message:
         "Making epipolar images of scene {wildcards.scene}"
@@ -54,7 +54,7 @@ rule rectify_strip:
         sources=upstream("rectify_strip"),
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
-        bands=asdict(SETTINGS.rectify),
+        bands=SETTINGS.rectify.model_dump(),
         code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"

@@ -30,7 +30,7 @@ rule refine:
         script=content_of("../scripts/refine.py"),
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
-        bands=asdict(SETTINGS.rectify),
+        bands=SETTINGS.rectify.model_dump(),
         code=source_digest("alignment.refine", "alignment.refine_report", "alignment.tie_equations"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"

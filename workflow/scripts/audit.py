@@ -1,8 +1,8 @@
 """What the images and labels of a dataset say of each other."""
 
+from stereotruth.config.methods import Audit
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.evaluation.audit.audit import audit
-from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.job import job
 from stereotruth.pages.page import INDEX
 from stereotruth.products.making import making
@@ -17,7 +17,7 @@ if __name__ == "__main__":
         audit(
             StereoDataset.of(name, params.dataset),
             snakemake.output[0],
-            Settings(**params.settings),
+            Audit(**params.settings),
             work=f"results/audit/{name}",
             workers=snakemake.threads,
             code=params.measuring,

@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
+from stereotruth.config.labels import Export
 from stereotruth.dataset.export import City, Extras, export_city
 from stereotruth.dataset.scene_stores import SceneFiles
-from stereotruth.dataset.settings import Settings
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.job import job
 from stereotruth.products.files import atomic_file
@@ -33,7 +33,7 @@ if __name__ == "__main__":
             City(**city),
             scenes,
             made.tiles,
-            Settings(**snakemake.params.settings),
+            Export(**snakemake.params.settings),
             extras=Extras(made.coverage, made.contact_sheet, made.matches, made.ground_looks),
             code=snakemake.params.code,
             workers=snakemake.threads,

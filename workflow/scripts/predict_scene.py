@@ -1,8 +1,8 @@
 """A stereo method over a whole scene."""
 
+from stereotruth.config.methods import SceneMatching
 from stereotruth.job import dask_scheduler, job
 from stereotruth.matching.scenes.predict_scene import predict_scene
-from stereotruth.matching.scenes.settings import Settings
 from stereotruth.products.making import making
 
 if __name__ == "__main__":
@@ -19,7 +19,7 @@ if __name__ == "__main__":
             snakemake.output.disparity,
             method=method,
             entry=snakemake.params.method,
-            settings=Settings(**snakemake.params.settings),
+            settings=SceneMatching(**snakemake.params.settings),
             workers=snakemake.threads,
             scheduler=scheduler,
             code=snakemake.params.code,

@@ -1,8 +1,8 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.grids import Strip
 from stereotruth.products.making import making
@@ -17,7 +17,7 @@ if __name__ == "__main__":
             snakemake.input.left,
             snakemake.input.right,
             snakemake.input.points,
-            Settings(**snakemake.params.settings),
+            LabelSettings(**snakemake.params.settings),
             snakemake.params.view,
             snakemake.input.alignment,
             snakemake.input.surface or None,

@@ -1,10 +1,10 @@
 """One aligned pair to epipolar images."""
 
 from stereotruth.alignment.aligned_pair import Alignment
+from stereotruth.config.labels import Rectify
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.epipolar.settings import Settings
 from stereotruth.job import job
 from stereotruth.products.making import making
 from stereotruth.products.provenance import checksums, describe
@@ -19,7 +19,7 @@ if __name__ == "__main__":
         making(snakemake.input, snakemake.output),
     ):
         alignment = Alignment.load(snakemake.input.alignment)
-        bands = Settings(**snakemake.params.bands)
+        bands = Rectify(**snakemake.params.bands)
         with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(
                 alignment.left,

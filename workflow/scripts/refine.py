@@ -4,7 +4,7 @@ from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
 from stereotruth.alignment.refine_report import write_refinement
 from stereotruth.alignment.tie_equations import write_equations
-from stereotruth.epipolar.settings import Settings
+from stereotruth.config.labels import Rectify
 from stereotruth.job import job
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.products.making import making
@@ -27,7 +27,7 @@ if __name__ == "__main__":
             given.right[0],
             given.points,
             masks=masks,
-            bands=Settings(**snakemake.params.bands),
+            bands=Rectify(**snakemake.params.bands),
             strict=snakemake.params.strict,
             alone=snakemake.params.alone,
             provenance=describe(inputs, {}, snakemake.params.code),

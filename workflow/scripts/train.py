@@ -19,7 +19,7 @@ if __name__ == "__main__":
         from stereotruth.matching.networks.training_state import model_of
 
         dataset = StereoDataset.of(of.dataset, params.dataset)
-        training = TrainingSettings.of(params.training)
+        training = TrainingSettings(**params.training)
         train(
             model_of(params.kind, dataset, training),
             dataset,

@@ -45,7 +45,6 @@ from .robust_fit import (
     find_blunders,
     leave_one_out_residuals,
 )
-from .settings import Settings
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
@@ -142,7 +141,7 @@ def align(
     gcps_csv: str | Path,
     *,
     names: tuple[str, str] | None = None,
-    model: str = Settings.model,
+    model: str = "affine",
     scene: str = "",
     seed: int = 0,
     strict: bool = False,
@@ -306,7 +305,7 @@ def from_rpcs(
     left_image: str | Path,
     right_image: str | Path,
     *,
-    model: str = Settings.model,
+    model: str = "affine",
     scene: str = "",
     provenance: Mapping[str, Any] | None = None,
 ) -> Alignment:

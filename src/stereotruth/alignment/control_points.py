@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
+from ..dates import epoch_year
 from ..errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
 from ..numerics.decimal_numbers import decimal_number
 from ..numerics.degrees import continuous
 from ..products.files import of_text
-from ..settings import epoch_year
 from ..tables import Table
 
 Floats = NDArray[np.float64]

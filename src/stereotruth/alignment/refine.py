@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from ..config.labels import Rectify
 from ..epipolar.image_reader import Source, open_pair
-from ..epipolar.settings import Settings as Bands
 from ..errors import InputError
 from ..lidar.point_store import PointStore, open_stores
 from ..numerics.robust import robust_sigma
@@ -347,7 +347,7 @@ def refine(
     point_stores: Sequence[str | Path],
     *,
     masks: tuple[str | Path | None, str | Path | None] = (None, None),
-    bands: Bands | None = None,
+    bands: Rectify | None = None,
     strict: bool = False,
     alone: bool = True,
     provenance: Mapping[str, Any] | None = None,

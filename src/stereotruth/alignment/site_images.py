@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
 
+from ..dates import acquisition_time
 from ..epipolar.acquisition import Acquisition, by_sheet, read_acquisition
 from ..epipolar.site_pairs import SiteImage
-from ..settings import acquisition_time
 from .gcp_checks import open_view
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from time import monotonic
 
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from ..dataset.windows import cell_step
 from ..epochs import epoch_of_city
 from ..errors import InputError

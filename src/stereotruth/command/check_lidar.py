@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from ..dates import epoch_year
 from ..errors import InputError, in_number, in_words
 from ..lidar.footprint import Footprint
 from ..lidar.frames import Epoch, Epochs
 from ..lidar.geoid_candidates import candidates_at, named
 from ..lidar.survey import SurveyedFile, survey
 from ..products.remote_files import url_of
-from ..settings import epoch_year
 from ..sheets import Scene
 from .findings import Findings, Level
 

@@ -18,7 +18,7 @@ from ..alignment.aligned_pair import Alignment
 from ..alignment.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..alignment.gcp_checks import open_view
 from ..alignment.pair_ground import footprint_of
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.image_reader import MAX_PIXELS, Source, bands_of
 from ..epipolar.model import EpipolarModel

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from ..dataset.windows import cell_step
 from ..epipolar.model import EpipolarModel
 from ..errors import in_number

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..alignment.control_points import COLUMNS, read_gcps
+from ..dates import epoch_year
 from ..errors import InputError
 from ..lidar.declared_crs import parse_crs
 from ..lidar.frames import WGS84_NAME, Epoch, Epochs
@@ -23,7 +24,6 @@ from ..lidar.height_raster import Floats, HeightRaster
 from ..lidar.to_wgs84 import ToWGS84, check_area, transformation
 from ..numerics.degrees import metres_per_degree, turn
 from ..products.files import as_text
-from ..settings import epoch_year
 from ..tables import Lines, Table
 
 EPOCHS = Epochs(Epoch(2020.0, "the import"))  # of what is computed, not of what is written

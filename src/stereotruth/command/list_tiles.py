@@ -13,13 +13,13 @@ from pyproj.exceptions import CRSError
 
 from .. import sheets
 from ..alignment.pair_ground import footprint_of
-from ..configuration import Configuration
+from ..config.configuration import Configuration
+from ..config.labels import Ingest
 from ..errors import InputError, in_number, without_secrets
 from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
 from ..lidar.declared_crs import LidarCRS, interpret
 from ..lidar.footprint import CELL_DEG, Footprint
-from ..lidar.settings import Settings as Ingest
 from ..products.remote_files import bring_image, is_remote, state_of
 from ..project import configured, read_images, sheet
 from .check import chosen
@@ -67,7 +67,7 @@ def list_of_scenes(
 def margin_of(settings: Configuration) -> float:
     """Metres around the ground of scenes; where a run takes all points, those of the default."""
     margin_m = settings.ingest.margin_m
-    return float(Ingest.margin_m or 0.0) if margin_m is None else float(margin_m)
+    return float(Ingest().margin_m) if margin_m is None else float(margin_m)
 
 
 def _here(image: str) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .. import sheets
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from ..epipolar.linked_images import Links, Names, new_links
 from ..epipolar.pair_light import DIACHRONIC_DAYS
 from ..epipolar.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate

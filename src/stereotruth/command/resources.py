@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from .estimates import estimates
 from .findings import Findings, Level
 from .run_workflow import duration

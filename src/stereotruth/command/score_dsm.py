@@ -6,13 +6,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from ..dates import epoch_year
 from ..errors import InputError
 from ..evaluation.surface_models.page import describe, write_verdict
 from ..evaluation.surface_models.reference import LidarReference, RasterReference
 from ..evaluation.surface_models.score import score_surface_model
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, Epochs
 from ..lidar.ingest import ingest
-from ..settings import epoch_year
 from ..sheets import lidar_files, store_names
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..alignment.control_points import images_measured
 from ..alignment.site_images import GivenImage, open_image
-from ..configuration import Configuration
+from ..config.configuration import Configuration
 from ..epipolar.acquisition import Acquisition, near
 from ..epipolar.linked_images import Links, Names
 from ..epipolar.site_pairs import SiteImage, pair_of

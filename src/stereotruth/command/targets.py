@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..config.methods import DATASETS
 from ..errors import InputError
-from ..matching.benchmark.settings import DATASETS
 from ..project import FILES, configured, names_scenes, read_scenes
 
 TARGETS = {

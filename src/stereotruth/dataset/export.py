@@ -24,13 +24,14 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import Export, Limits
 from ..errors import InputError
 from ..job import progress
 from ..products.files import atomic_file, atomic_folder, growing_table, write_table
@@ -48,7 +49,6 @@ from .quick_looks import (
     write_status_colours,
 )
 from .scene_stores import SceneFiles, SceneStores, open_stores
-from .settings import Limits, Settings
 from .sift_matches import MATCH_COLUMNS, match_rows
 from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
@@ -189,7 +189,7 @@ class _Windows:
     pictures: dict[str, tuple[NDArray[np.uint16], NDArray[np.bool_], int]]
 
     @classmethod
-    def of(cls, scenes: Iterable[SceneFiles | tuple], settings: Settings, workers: int) -> _Windows:
+    def of(cls, scenes: Iterable[SceneFiles | tuple], settings: Export, workers: int) -> _Windows:
         """Open the scenes and choose their windows; labelled ones come first."""
         stride = settings.stride or settings.size
         step = cell_step(settings.size, stride)
@@ -221,7 +221,7 @@ def export_city(
     city: City,
     scenes: Iterable[SceneFiles | tuple],
     out_dir: str | Path,
-    settings: Settings,
+    settings: Export,
     *,
     extras: Extras | None = None,
     code: str = "",
@@ -276,7 +276,7 @@ def export_city(
     return summary
 
 
-def _refuse_nodata(settings: Settings) -> None:
+def _refuse_nodata(settings: Export) -> None:
     dtype, nodata = settings.disparity_dtype, settings.nodata
     if float(np.dtype(dtype).type(nodata)) != float(nodata):
         raise InputError(
@@ -285,7 +285,7 @@ def _refuse_nodata(settings: Settings) -> None:
         )
 
 
-def _parameters(settings: Settings, city: City) -> dict[str, Any]:
+def _parameters(settings: Export, city: City) -> dict[str, Any]:
     """What the tiles follow from besides the scenes, for their record."""
     parameters = {
         "size": settings.size,
@@ -297,7 +297,7 @@ def _parameters(settings: Settings, city: City) -> dict[str, Any]:
         "max_uncertainty_px": settings.max_uncertainty_px,
         "split_counts": city.split_counts,
         "seed": settings.seed,
-        "quality": asdict(settings.quality),
+        "quality": settings.quality.model_dump(),
         "building_share": settings.building_share,
     }
     return parameters | ({"layers": list(settings.layers)} if settings.layers else {})
@@ -309,7 +309,7 @@ def _write_tiles(
     cut: Cut,
     beside: _ExtrasBeingWritten,
     parameters: Mapping[str, Any],
-    settings: Settings,
+    settings: Export,
     workers: int,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write tiles, manifest, footprints and extras; the summary, and the manifest's rows."""
@@ -439,7 +439,7 @@ def _gates(
     for problem in problems + explained:
         log.warning("%s: %s", city, problem)
     return {
-        "limits": asdict(limits),
+        "limits": limits.model_dump(),
         "scenes": found,
         "surfaces": {s: surface_figures(of.matches.biases) for s, of in scenes.items()},
         "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},

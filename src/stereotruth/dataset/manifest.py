@@ -119,8 +119,3 @@ def labelled_tiles(folder: Path, scene: str) -> list[Tile]:
     """A scene's labelled tiles. Raises InputError if there is no manifest."""
     tiles = map(Tile.of, read_manifest(folder))
     return [tile for tile in tiles if tile.scene == scene and tile.labelled]
-
-
-def carries_label(status: str) -> bool:
-    """Whether pixels of a status have a label: measured by points in them, or between points."""
-    return status.startswith("labelled")

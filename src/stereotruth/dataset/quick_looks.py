@@ -16,6 +16,7 @@ from ..errors import in_number
 from ..pages import pictures
 from ..pages.pictures import colours, save_figure
 from ..products.rasters import read_disparity, read_image
+from ..status import BY_LABEL
 
 Picture = NDArray[np.uint8]
 
@@ -63,30 +64,15 @@ def draw_contact_sheet(
 
 
 STATUS_COLOURS_FILE = "status_colours.txt"
-STATUS_COLOURS = {  # apart for all eyes, and what carries a label light
-    "labelled": "#eef3f7",
-    "no_points": "#1c1c22",
-    "hidden_in_left": "#d09230",
-    "hidden_in_right": "#a2006a",
-    "low_correlation": "#5e41ed",
-    "changed": "#effa51",
-    "out_of_frame": "#b7928d",
-    "masked": "#172d93",
-    "below_minimum_count": "#6a6028",
-    "edge_in_pixel": "#2183d5",
-    "labelled_between": "#aab1dc",
-    "labelled_by_images": "#ffe9b8",
-    "labelled_crown": "#cce674",
-    "too_uncertain": "#204020",
-}
 SPLIT_COLOURS = {"train": "#0072b2", "val": "#e69f00", "test": "#6f0952", "none": "#8a8a8a"}
 
 
 def status_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour, #rrggbb, for each reason; reasons that are not known get one of their own."""
-    unknown = [name for name in names if name not in STATUS_COLOURS]
+    known = {name: BY_LABEL[name].colour for name in names if name in BY_LABEL}
+    unknown = [name for name in names if name not in known]
     other = {name: pictures.SERIES[k % len(pictures.SERIES)] for k, name in enumerate(unknown)}
-    return {name: STATUS_COLOURS.get(name) or other[name] for name in names}
+    return known | other
 
 
 def write_status_colours(path: Path, flags: Mapping[int, str]) -> None:

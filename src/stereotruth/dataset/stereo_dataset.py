@@ -38,7 +38,6 @@ from ..products.rasters import read_disparity, read_labels
 from .layer_kinds import column as column_of
 from .manifest import PATHS, SUM, manifest_rows
 from .split_names import NO_TRUTH, NONE, SPLITS
-from .stereo_dataset_settings import Settings
 
 LAYOUTS = ("stereotruth", "whu", "kitti", "us3d")
 LEFT_NAMES = {"us3d": "*_LEFT_RGB.tif", "kitti": "image_2/*_10.png"}
@@ -102,21 +101,21 @@ class StereoDataset:
     root: str | Path
     layout: str
     disparity_range: tuple[int, int]
-    nodata: float = float(Settings.nodata)
-    grows_with_height: bool = Settings.grows_with_height
+    nodata: float = -999.0
+    grows_with_height: bool = True
 
     @classmethod
     def of(cls, name: str, settings: Mapping[str, Any]) -> StereoDataset:
         """From an entry of ``benchmark.datasets``."""
-        given = Settings(**settings)
-        low, high = given.disparity_range
+        given = dict(settings)
+        low, high = given["disparity_range"]
         if low >= high:
             raise InputError(
                 f"benchmark.datasets.{name}.disparity_range: [{low}, {high}] is empty",
                 remedy="give the smallest disparity first",
             )
-        root, nodata = Path(given.root), float(given.nodata)
-        return cls(name, root, given.layout, (low, high), nodata, given.grows_with_height)
+        more = {key: given[key] for key in ("nodata", "grows_with_height") if key in given}
+        return cls(name, Path(given["root"]), given["layout"], (low, high), **more)
 
     def pairs(self, split: str | None = None, *, labelled: bool = False) -> list[Pair]:
         """The pairs of a split (None: all), only those with labels if ``labelled``.

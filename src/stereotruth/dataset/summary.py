@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import in_number
-from .manifest import carries_label
+from ..status import HIDDEN, Status, carries_label
 from .sift_matches import SIFT_NOISE_PX
 
 
@@ -61,14 +61,14 @@ def summarise(
     }
 
 
-HIDDEN = ("hidden_in_left", "hidden_in_right", "out_of_frame")  # pixels that one image has alone
+ALONE = (*HIDDEN, Status.OUT_OF_FRAME.label)  # pixels that one image has alone
 
 
 def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
     """What was made and where to look, for the end of a run."""
     shares = summary["share_of_pixels"]
     labelled = sum(share for name, share in shares.items() if carries_label(name))
-    hidden = sum(shares.get(name, 0.0) for name in HIDDEN)
+    hidden = sum(shares.get(name, 0.0) for name in ALONE)
     in_both = max(1.0 - hidden, 1e-9)
     low, high = summary["disparity_px"]["min"], summary["disparity_px"]["max"]
     lines = [

@@ -14,21 +14,18 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-CROWN = "labelled_crown"
-TOO_UNCERTAIN, NAME = 13, "too_uncertain"
+from ..status import Status
 
 
 @dataclass(frozen=True, eq=False)
 class SureLabels:
     """The array ``name`` of a disparity store, as the tiles have it; sliced as a Zarr array is.
 
-    ``crown``: the status of rough surfaces, of whose labels those with an uncertainty above
-    ``limit`` px are left out.
+    Of the labels of rough surfaces, those with an uncertainty above ``limit`` px are left out.
     """
 
     store: zarr.Group
     name: str
-    crown: int
     limit: float
 
     @property
@@ -38,10 +35,10 @@ class SureLabels:
 
     def __getitem__(self, key: Any) -> NDArray[Any]:
         values = np.array(self.store[self.name][key])
-        doubtful = self.store["status"][key] == self.crown
+        doubtful = self.store["status"][key] == Status.LABELLED_CROWN
         if doubtful.any():
             doubtful &= ~(self.store["uncertainty"][key] <= self.limit)
-            values[doubtful] = TOO_UNCERTAIN if self.name == "status" else np.nan
+            values[doubtful] = Status.TOO_UNCERTAIN if self.name == "status" else np.nan
         return values
 
 
@@ -51,14 +48,14 @@ Labels = zarr.Array | SureLabels
 def tile_labels(store: zarr.Group, flags: Mapping[int, str], limit: float) -> dict[str, Labels]:
     """``disparity`` and ``status`` of a store as its tiles have them; ``flags``: names of its
     status values."""
-    crown = next((value for value, name in flags.items() if name == CROWN), None)
     names = "disparity", "status"
-    if crown is None:
+    if Status.LABELLED_CROWN.label not in flags.values():
         return {name: store[name] for name in names}
-    return {name: SureLabels(store, name, crown, limit) for name in names}
+    return {name: SureLabels(store, name, limit) for name in names}
 
 
 def tile_flags(flags: Mapping[int, str]) -> dict[int, str]:
     """Names of the status values of tiles, from those of their store."""
-    more = {TOO_UNCERTAIN: NAME} if CROWN in flags.values() else {}
-    return dict(flags) | more
+    more = Status.LABELLED_CROWN.label in flags.values()
+    added = {int(Status.TOO_UNCERTAIN): Status.TOO_UNCERTAIN.label} if more else {}
+    return dict(flags) | added

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import Limits
 from ..epipolar.warping import CorrelationSum
 from ..numerics.error_sums import ErrorSum
 from .label_doubts import SceneMatches, agreement
 from .label_surfaces import LabelSurface
 from .quality_limits import flag, missed
-from .settings import Limits
 from .sift_matches import FIGURES, TileMatches
 
 SIGMA_ENDS_PX = np.geomspace(1e-3, 10.0, 257)  # of the bins in which uncertainties are counted

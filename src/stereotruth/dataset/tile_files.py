@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import Limits
 from ..epipolar.warping import agreement, warp_rows
 from ..errors import InputError
 from ..numerics.degrees import turn
@@ -22,7 +23,6 @@ from .label_surfaces import label_surfaces
 from .layer_kinds import column
 from .orientation import orientation, save
 from .scene_stores import SceneStores
-from .settings import Limits
 from .sift_matches import match_tile
 from .split_names import NONE
 from .tile_checks import TileChecks, check_cells, count_sigma

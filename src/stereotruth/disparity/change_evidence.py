@@ -28,11 +28,11 @@ from ..epipolar.surface_windows import (
     surface_means,
 )
 from ..epipolar.window_sums import wanted_runs
+from ..lidar.point_store import VEGETATION_CLASSES
 from ..numerics.box_max import box_max
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
-from .status import VEGETATION_CLASSES
 from .young_crowns import beside_young_crowns
 
 Singles = NDArray[np.float32]

@@ -24,15 +24,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
 from ..numerics.box_max import box_max
 from ..numerics.summed_area import window_sums
+from ..status import Reason, Status
 from .change_evidence import WINDOW_PX
 from .image_agreement import Comparison
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import OwnPoints
-from .reason import Reason
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
-from .status import VEGETATION_CLASSES, WATER_CLASS, Status
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

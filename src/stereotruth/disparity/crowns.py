@@ -24,8 +24,10 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from ..lidar.lattice import LATTICE_M
+from ..lidar.point_store import WATER_CLASS
 from ..numerics.box_max import box_max
 from ..numerics.summed_area import window_sums
+from ..status import Status, is_labelled
 from ..surface.facet_values import Facets, PixelValues
 from ..surface.raster import (
     FACET_IN_RIGHT,
@@ -41,7 +43,6 @@ from ..surface.scale import FACET_RESIDUAL_PX
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
 from .pixel_scale import PixelScale
-from .status import WATER_CLASS, Status, is_labelled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..status import Status, is_labelled
 from ..surface.raster import VISIBLE, SeenSurface
 from ..surface.scale import FACET_RESIDUAL_PX
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels, OwnLabels
 from .pixel_scale import PixelScale
-from .status import Status, is_labelled
 
 # Points farther apart than this, px, show what lies lower between them.
 SEEN_THROUGH_PX = 1.25

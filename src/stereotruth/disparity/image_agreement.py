@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.window_sums import SURFACE_PX
+from ..lidar.point_store import WATER_CLASS
+from ..status import Status, is_labelled
 from .change_evidence import LabelledWindow
 from .change_probability import CHANGED, CROWN_CHANGED, YOUNG_CHANGED, change_probability
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import Labels
-from .status import WATER_CLASS, Status, is_labelled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

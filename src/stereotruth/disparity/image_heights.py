@@ -29,7 +29,7 @@ from ..epipolar.shown_ground import GroundOfImages
 from ..errors import InputError
 from ..job import progress
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..lidar.point_store import PointStore, open_stores
+from ..lidar.point_store import VEGETATION_CLASSES, PointStore, open_stores
 from ..numerics.box_max import box_max
 from ..numerics.degrees import DEGREE_M
 from ..products.grids import Layer, atomic_store, blocks, create_grid
@@ -42,7 +42,6 @@ from ..surface.surface_store import Box, SurfaceStore
 from ..surface.vertices import Vertices
 from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
 from .pixel_scale import PixelScale
-from .status import VEGETATION_CLASSES
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

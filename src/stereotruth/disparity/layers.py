@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import LabelSettings
 from ..products.grids import Layer
+from ..status import Reason, Status, is_labelled, statuses_of
 from .pair_window import PairWindow, WindowLabels
-from .reason import Reason
 from .right_view import Pair
-from .settings import Settings
-from .status import Status, is_labelled
 
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
@@ -43,12 +42,12 @@ def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str,
     return layers
 
 
-def layers(settings: Settings, view: str, masked: bool = False) -> dict[str, Layer]:
+def layers(settings: LabelSettings, view: str, masked: bool = False) -> dict[str, Layer]:
     """The arrays of a disparity store of the ``view``, left or right.
 
     ``masked``: whether a mask hides something of an image.
     """
-    on_surface = settings.on_surface
+    on_surface = settings.recipe == "surface"
     used = "points whose image windows correlate"
     if on_surface:
         used = "points on the surface that the pixel's centre sees"
@@ -108,22 +107,22 @@ def _disparity(on_surface: bool, view: str) -> dict[str, str]:
     return attributes
 
 
-def _status(settings: Settings, view: str, masked: bool) -> dict[str, object]:
+def _status(settings: LabelSettings, view: str, masked: bool) -> dict[str, object]:
     """Attributes of the layer status."""
     other = _other(view)
-    statuses = [*settings.statuses, *([Status.MASKED] if masked else [])]
+    statuses = statuses_of(settings.recipe, masked)
     attributes = {
         "units": "1",
         "long_name": "why a pixel has a label or none",
         "flag_values": [int(status) for status in statuses],
-        "flag_meanings": " ".join(status.name.lower() for status in statuses),
+        "flag_meanings": " ".join(status.label for status in statuses),
         f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre sees",
         "changed": "LiDAR and images show different surfaces there, or water",
         "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other surfaces",
         "precedence": f"frame, {view} view, correlation of points; {other} view, edge, change, "
         "number of points of pixels",
     }
-    if settings.on_surface:
+    if settings.recipe == "surface":
         attributes |= {
             "labelled_crown": "a rough surface that both views must show; its uncertainty follows "
             "from the roughness of its points",
@@ -167,10 +166,10 @@ def _lidar_date(on_surface: bool) -> dict[str, object]:
     }
 
 
-def _correlation(settings: Settings, view: str) -> dict[str, str]:
+def _correlation(settings: LabelSettings, view: str) -> dict[str, str]:
     """Attributes of the layer correlation."""
     compared = "mean correlation coefficient of the image windows at the points used"
-    if settings.on_surface:
+    if settings.recipe == "surface":
         compared = (
             f"correlation coefficient of {view} and warped {_other(view)} image over the pixels of "
             f"the same surface in {settings.window} x {settings.window} px"
@@ -178,7 +177,7 @@ def _correlation(settings: Settings, view: str) -> dict[str, str]:
     return {"units": "1", "long_name": compared, "nodata": "NaN"}
 
 
-def _uncertainty(settings: Settings) -> dict[str, str]:
+def _uncertainty(settings: LabelSettings) -> dict[str, str]:
     """Attributes of the layer uncertainty."""
     attributes = {
         "units": "px",
@@ -189,11 +188,11 @@ def _uncertainty(settings: Settings) -> dict[str, str]:
         "the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey) errors of a ground "
         "point's disparity and place by the alignment, whose covariance is that of alignment.json",
     }
-    if settings.on_surface:
+    if settings.recipe == "surface":
         attributes["labelled_crown"] = (
             "v / n + p is what the roughness of the tops of the surface leaves between them"
         )
-    if settings.on_surface and settings.diachronic:
+    if settings.recipe == "surface" and settings.diachronic:
         attributes["diachronic"] = (
             "p has the probability, px², that the surface has changed though images of two lights "
             "do not contradict it"

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ..epipolar.image_noise import NoiseCurve
 from ..epipolar.warping import warp_rows
+from ..status import Status
 from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
-from .status import Status
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -110,7 +110,7 @@ def usable_at(patch: Patch, row: Ints, col: Ints) -> Bytes:
 class WindowLabels:
     """Labels of a window and why its other pixels have none; arrays [h, w], margin included.
 
-    ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
+    ``status`` (:class:`.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
     1970-01-01, 0 for not known; ``point_count``: points used; ``correlation``: coefficient of both
     images; ``change``: why a pixel has changed (:class:`.reason.Reason`); ``beyond``: which figures

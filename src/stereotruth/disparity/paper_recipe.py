@@ -15,13 +15,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.labels import LabelSettings
 from ..lidar.lattice import PER_DEG
+from ..status import Status
 from .pair_window import PairWindow, WindowLabels
 from .paper_correlation import correlate
 from .pixel_labels import Labels, condense, noise_variance
 from .pixel_points import PixelPoints
-from .settings import Settings
-from .status import Status
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ Ints = NDArray[np.int64]
 
 
 def paper_labels(
-    settings: Settings,
+    settings: LabelSettings,
     model: ViewGeometry,
     points: PixelPoints,
     window: PairWindow,

@@ -31,13 +31,13 @@ from ..lidar.overlap_check import apart, refuse_apart
 from ..products.grids import Strip, blocks, require_complete
 from ..products.provenance import checksums, describe, digest
 from ..products.resumable_grids import BlockStore, resumable_grid
+from ..status import Status, carries_label, is_labelled
 from .change_evidence import Evidence
 from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
 from .recipe import label_window
 from .scene_inputs import SceneInputs
-from .status import Status, is_labelled
 
 log = logging.getLogger("stereotruth")
 
@@ -62,7 +62,7 @@ def _log_density(inputs: SceneInputs) -> None:
     per_px = inputs.points_per_m2 * pixel**2
     share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
     density = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
-    if inputs.settings.on_surface or share > ENOUGH:
+    if inputs.on_surface or share > ENOUGH:
         log.info("%s", density)
         return
     log.warning(
@@ -170,7 +170,7 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     stores["right"] = require_complete(inputs.right_store).attrs
     epipolar = dict(stores["left"]["epipolar"])
     stores |= {f"points/{store.path.name}": store.attrs for store in inputs.stores}
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         stores["surface"] = inputs.ground.attrs
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
     if inputs.alignment is not None:
@@ -196,14 +196,14 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
 
 def _parameters(inputs: SceneInputs) -> dict[str, Any]:
     """Of a scene's labels: its view and the settings."""
-    return {"view": inputs.view} | asdict(inputs.settings)
+    return {"view": inputs.view} | inputs.settings.model_dump()
 
 
 def _content(inputs: SceneInputs, code: str) -> str:
     """Digest of all that the labels follow from but the points."""
     left, right = (require_complete(p).attrs for p in (inputs.left_store, inputs.right_store))
     parameters = _parameters(inputs)
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         parameters["scale"] = asdict(inputs.scale)
     return digest(
         {
@@ -276,7 +276,7 @@ def project_scene(
             )
             for number in unfinished.missing(part, keys, workers)
         ]
-        if tasks and inputs.settings.on_surface:
+        if tasks and inputs.on_surface:
             _ = inputs.noise  # once, and not by each of the threads
         with block_progress(len(tasks), "disparity"):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
@@ -292,7 +292,7 @@ def project_scene(
 
 def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
     """Of pixels by status and what is counted (see :meth:`_Blocks.make`)."""
-    pixels = {status.name.lower(): counts[status] for status in inputs.statuses}
+    pixels = {status.label: counts[status] for status in inputs.statuses}
     counted = dict(zip(COUNTED, counts[len(Status) :]))
     beyond = "no_points", "out_of_frame", "masked"
     reached = sum(n for name, n in pixels.items() if name not in beyond)
@@ -302,7 +302,7 @@ def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
         "points": {name: counted[name] for name in COUNTED[:3]},
         "labelled_share": round(labelled / max(reached, 1), 6),
     }
-    if inputs.settings.on_surface:
+    if inputs.on_surface:
         asked = max(counted["asked"], 1)
         out["asked"] = counted["asked"]
         out["beyond_learned"] = {n: round(counted[n] / asked, 4) for n in Evidence._fields}
@@ -315,7 +315,7 @@ def _log_summary(recipe: str, summary: Mapping[str, Any]) -> None:
     log.info(
         "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
         recipe,
-        sum(n for name, n in pixels.items() if is_labelled(Status[name.upper()])),
+        sum(n for name, n in pixels.items() if carries_label(name)),
         100.0 * share,
         ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
     )

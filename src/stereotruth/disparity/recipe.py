@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.image_noise import EQUAL
+from ..status import Status
 from ..surface.raster import ProjectedSurface
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons
@@ -43,7 +44,6 @@ from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
 from .pixel_labels import OwnPoints, own_labels
 from .scene_inputs import SceneInputs
-from .status import Status
 from .window_points import WindowPoints, read_window
 
 
@@ -59,7 +59,7 @@ def label_window(
     if inputs is None:
         return None
     window, points = inputs
-    recipe = surface_recipe if scene.settings.on_surface else paper_recipe
+    recipe = surface_recipe if scene.on_surface else paper_recipe
     labels = recipe(scene, window, points).within(window.inner)
     layers = layers_of(labels, scene.pair, window)
     in_frames = points.by_pixel.count[window.inner]

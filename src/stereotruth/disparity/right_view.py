@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..epipolar.model import EpipolarModel
+from ..status import Status
 from .image_patches import Array2D, MaskedImage
-from .status import Status
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]

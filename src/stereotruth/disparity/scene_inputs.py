@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ..alignment.aligned_pair import Alignment
 from ..alignment.label_uncertainty import LabelUncertainty
 from ..alignment.strip_uncertainty import with_strips
+from ..config.labels import LabelSettings
+from ..dates import acquisition_time
 from ..epipolar.acquisition import Acquisition, by_sheet
 from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
@@ -27,18 +29,20 @@ from ..lidar.point_store import PointStore, open_stores
 from ..lidar.strip_offsets import StripOffsets
 from ..products.grids import require_complete
 from ..products.provenance import digest
-from ..settings import acquisition_time
+from ..status import Status, statuses_of
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
+from .change_evidence import EVIDENCE_PX
+from .change_probability import MEANS_PX
+from .change_reasons import REASON_PX
+from .crowns import CROWN_REACH_PX
 from .ground_in_view import blocks_in_view
 from .image_patches import MaskedImage
 from .pixel_scale import PixelScale
 from .point_windows import PointWindows
 from .rays import Rays
 from .right_view import Pair, seen_from
-from .settings import Settings
-from .status import Status
 
 log = logging.getLogger("stereotruth")
 
@@ -60,7 +64,7 @@ class SceneInputs:
     left_store: Path
     right_store: Path
     point_stores: tuple[Path, ...]
-    settings: Settings
+    settings: LabelSettings
     view: str = "left"
     alignment: Path | None = None
     surface: Path | None = None
@@ -73,7 +77,7 @@ class SceneInputs:
         left_store: str | Path,
         right_store: str | Path,
         point_stores: Sequence[str | Path],
-        settings: Settings,
+        settings: LabelSettings,
         view: str = "left",
         alignment: str | Path | None = None,
         surface: str | Path | None = None,
@@ -89,7 +93,7 @@ class SceneInputs:
     def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
         """The same with the surface of all its points, which is made in a ``folder`` by the pixel
         of its left image: for a pair that is of no project."""
-        if not self.settings.on_surface:
+        if not self.on_surface:
             return self
         names = digest(list(map(str, self.point_stores)))[:12]
         out = Path(folder).absolute() / f"{names}.surface"
@@ -116,7 +120,7 @@ class SceneInputs:
         log.info(
             "%s, by the %s", "two lights" if light.diachronic else "one light", light.decided_by
         )
-        settings = replace(self.settings, diachronic=light.diachronic)
+        settings = self.settings.model_copy(update={"diachronic": light.diachronic})
         return replace(self, settings=settings, light=light)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -161,6 +165,26 @@ class SceneInputs:
         return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
 
     @property
+    def on_surface(self) -> bool:
+        """Whether labels follow from the surface of the points."""
+        return self.settings.recipe == "surface"
+
+    @property
+    def images_window(self) -> int:
+        """Side in px of the window that both images must hold around a label; 1: its pixel."""
+        return 1 if self.on_surface else self.settings.window
+
+    @property
+    def margin(self) -> int:
+        """Pixels around a window whose points have a say in it."""
+        if not self.on_surface:
+            return 1  # the points' noise is pooled over 3 x 3 pixels
+        # what may hide a crown, farther off than the plane and the noise of a pixel's own points
+        # reach, and what the images tell of a pixel, and of those around
+        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
+        return reach + REASON_PX  # of changes
+
+    @property
     def has_masks(self) -> bool:
         """Whether a mask hides something of an image."""
         return any(isinstance(image, MaskedImage) for image in self.pair.images)
@@ -168,7 +192,7 @@ class SceneInputs:
     @property
     def statuses(self) -> list[Status]:
         """Those that occur."""
-        return [*self.settings.statuses, *([Status.MASKED] if self.has_masks else [])]
+        return statuses_of(self.settings.recipe, self.has_masks)
 
     @cached_property
     def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
@@ -210,7 +234,7 @@ class SceneInputs:
     @cached_property
     def points_per_m2(self) -> float:
         """Over the ground that the points cover, as far as the site's images show it."""
-        return self.ground.points_per_m2 if self.settings.on_surface else points_per_m2(self.stores)
+        return self.ground.points_per_m2 if self.on_surface else points_per_m2(self.stores)
 
     @cached_property
     def ground(self) -> SurfaceStore:
@@ -221,17 +245,17 @@ class SceneInputs:
     def windows(self) -> PointWindows:
         """Where the points of windows of the pair's left image are."""
         reach = (0.0, 0.0)
-        if self.settings.on_surface:
+        if self.on_surface:
             scale = self.ground.scale
             reach = tuple(scale.height_reach / PART * side * LATTICE_DEG for side in scale.cell)
-        return PointWindows(self.pair.model, self.rays, self.stores, self.settings.margin, reach)
+        return PointWindows(self.pair.model, self.rays, self.stores, self.margin, reach)
 
     def surface_blocks(self, rows: slice, cols: slice) -> tuple[Block, ...]:
         """Blocks of the surface that a window shows, or that may hide this."""
         footprint = self.windows.footprint(rows, cols)
-        if footprint is None or not self.settings.on_surface:
+        if footprint is None or not self.on_surface:
             return ()
-        margin = self.settings.margin
+        margin = self.margin
         first = rows.start - margin, cols.start - margin
         shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
         return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)

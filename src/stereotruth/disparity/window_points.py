@@ -41,7 +41,7 @@ def read_window(
     surface = None
     if blocks := scene.surface_blocks(rows, cols):
         surface = scene.ground.window(blocks)
-    elif scene.settings.on_surface:
+    elif scene.on_surface:
         return None
     points = _points(scene, scene.windows.strips(rows, cols, footprint), window, surface)
     return None if points is None else (window, points)
@@ -50,7 +50,7 @@ def read_window(
 def _window(scene: SceneInputs, rows: slice, cols: slice, footprint: Footprint) -> PairWindow:
     """Of the left image, the window with its margin; of the right one, all that its points can be
     seen in."""
-    margin, size = scene.settings.margin, scene.settings.images_window
+    margin, size = scene.margin, scene.images_window
     rows = slice(rows.start - margin, rows.stop + margin)
     cols = slice(cols.start - margin, cols.stop + margin)
     x, y, height = (

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lidar.point_store import VEGETATION_CLASSES
 from ..numerics.box_max import box_max
 from ..numerics.summed_area import summed_area
-from .status import VEGETATION_CLASSES
 
 Bools = NDArray[np.bool_]
 

@@ -16,10 +16,10 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
+from ..config.labels import Rectify
 from ..errors import InputError
 from ..products.raster_values import MASK, Hidden, refuse_bands
 from ..products.ungeoreferenced import open_raster
-from .settings import Settings
 from .tiff_blocks import damaged_block
 
 log = logging.getLogger("stereotruth")
@@ -287,7 +287,26 @@ def _colour_of(path: str | Path) -> tuple[int, ...] | None:
     return None if None in found else found
 
 
-def bands_of(paths: Sequence[str | Path], bands: Settings) -> list[dict[str, Any]]:
+def band_weights(
+    panchromatic: int | Mapping[int, float] | None, colour: Sequence[int] | None
+) -> dict[int, float]:
+    """Weights, of sum 1, of the bands that are mixed, as ``rectify.panchromatic`` names them.
+
+    ``colour``: the bands of a pair that are coloured, None for grey.
+    """
+    given = panchromatic
+    if given is None:
+        given = dict.fromkeys(colour, 1.0) if colour else 1
+    if isinstance(given, int):
+        given = {given: 1.0}
+    if not given:
+        raise InputError(
+            "rectify.panchromatic: no band", remedy="name a band, or bands with their weights"
+        )
+    return {band: weight / sum(given.values()) for band, weight in given.items()}
+
+
+def bands_of(paths: Sequence[str | Path], bands: Rectify) -> list[dict[str, Any]]:
     """``mix`` and ``colour`` of each of both images, as :class:`Source` takes them."""
     colours = [bands.colour] * 2
     if bands.colour == "auto":
@@ -297,7 +316,10 @@ def bands_of(paths: Sequence[str | Path], bands: Settings) -> list[dict[str, Any
             colours = [None, None]  # who opens the image says what is wrong with it
     if None in colours:
         colours = [None, None]
-    return [{"mix": bands.mix(colour), "colour": colour or ()} for colour in colours]
+    return [
+        {"mix": band_weights(bands.panchromatic, colour), "colour": colour or ()}
+        for colour in colours
+    ]
 
 
 @contextmanager
@@ -307,10 +329,10 @@ def open_pair(
     left_mask: str | Path | None = None,
     right_mask: str | Path | None = None,
     *,
-    bands: Settings | None = None,
+    bands: Rectify | None = None,
 ) -> Iterator[tuple[Source, Source]]:
     """Both images of a pair, of which GDAL keeps CACHE_MB decoded at most."""
-    of_left, of_right = bands_of((left, right), bands or Settings())
+    of_left, of_right = bands_of((left, right), bands or Rectify())
     # GDAL's default, 5 % of the machine's memory, can be more than a job may use
     with (
         rasterio.Env(GDAL_CACHEMAX=CACHE_MB),

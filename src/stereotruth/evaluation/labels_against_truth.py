@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..dataset.manifest import Tile, carries_label, labelled_tiles
+from ..dataset.manifest import Tile, labelled_tiles
 from ..dataset.sure_labels import tile_flags
 from ..errors import InputError
 from ..job import progress
@@ -26,6 +26,7 @@ from ..numerics.error_sums import LIMITS, Calibration, ErrorSum
 from ..products.files import write_json, write_table
 from ..products.grids import blocks, open_grid
 from ..products.rasters import read_tile
+from ..status import carries_label
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]

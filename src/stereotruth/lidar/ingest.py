@@ -48,6 +48,7 @@ Integers = NDArray[np.int64]
 
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
+NOISE_CLASSES = (7, 18)  # low, high
 COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
 COARSEST_CELL_M = 30.0  # of a surface model
 MARKED_SHARE = 1e-3  # of points that are marked as synthetic, beyond which labels are in doubt
@@ -141,7 +142,7 @@ def ingest(
     geoid: str | Path | None = None,
     epochs: Epochs | None = None,
     acquired: Sequence[str] = (),
-    drop_classes: Sequence[int] | None = None,
+    drop_classes: Sequence[int] = NOISE_CLASSES,
     provenance: Mapping[str, Any] | None = None,
     chunk_points: int = 100_000,
 ) -> dict[str, Any]:
@@ -153,8 +154,8 @@ def ingest(
     where it has more points, the others pass through a scratch file without a name, 16 bytes each,
     on the disk of the store.
 
-    Withheld points are dropped, and those of ``drop_classes``: by default (None) those of the
-    settings, noise, 7 (low) and 18 (high). Synthetic points, overlap points and producers' own
+    Withheld points are dropped, and those of ``drop_classes``: by default noise,
+    7 (low) and 18 (high). Synthetic points, overlap points and producers' own
     classes (65 and 67 mark artefacts in IGN's files) are kept unless listed.
     ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv (:mod:`.to_wgs84`);
     None or "" where not needed; ``epochs`` of the images, and of the coordinates where files state
@@ -176,10 +177,6 @@ def ingest(
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
     area of the coordinate system; coordinates quantised too coarsely; all points dropped.
     """
-    if drop_classes is None:
-        from .settings import Settings  # a sixth of the start of a job, which knows the classes
-
-        drop_classes = Settings.drop_classes
     file = Path(lidar_file)
     points = open_points(file, by_nodes=footprint is not None)
     header = points.header

@@ -87,6 +87,7 @@ ARRAYS = {  # what the files' attributes would say if they had any
     },
     STRIPS: {"long_name": "code of the strip that each point was measured in"},
 }
+WATER_CLASS, VEGETATION_CLASSES = 9, (3, 4, 5)  # ASPRS
 _PIECE = 1 << 16  # points that are read at once, so that they stay in the cache
 
 

@@ -20,8 +20,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from ..config.section import PATTERN
 from ..errors import InputError, install_extra
-from ..settings import PATTERN
 
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 from zarr.abc.buffer import Buffer
-from zarr.codecs import BloscCodec, BloscShuffle
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import LocalStore
 
 from ..errors import InputError
@@ -49,13 +49,13 @@ class Layer:
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
 
-def compressor() -> BloscCodec:
-    """The lossless codec of every grid: the same bytes on every machine.
+def compressors() -> tuple[BloscCodec, Crc32cCodec]:
+    """The lossless codecs of every grid: the same bytes on every machine.
 
     Ten times as fast as zstd 3 with byte shuffle (0.8-1.2 GB/s), images no larger, floats by a
-    quarter.
+    quarter. Each chunk carries a checksum: one that is damaged cannot be read.
     """
-    return BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.bitshuffle)
+    return BloscCodec(cname="lz4", clevel=5, shuffle=BloscShuffle.bitshuffle), Crc32cCodec()
 
 
 class PlainStore(LocalStore):
@@ -119,7 +119,7 @@ def create_grid(
             chunks=(chunk, chunk),
             shards=(shard, shard),
             fill_value=layer.fill,
-            compressors=compressor(),
+            compressors=compressors(),
             dimension_names=("y", "x"),
             attributes=dict(layer.attrs),
         )
@@ -129,6 +129,7 @@ def create_grid(
             shape=(size,),
             dtype="int32",
             chunks=(size,),
+            compressors=compressors(),
             dimension_names=(name,),
             attributes={"units": "px", "long_name": f"{axis} of the {of}"},
         )

@@ -34,9 +34,9 @@ def making(inputs: Iterable[str | Path], outputs: Sequence[str | Path]) -> Itera
         except (InputError, OSError):
             raise
         except Exception as error:
-            from .damaged_chunks import damage_behind  # few jobs fail, and not all need Zarr
+            from .damaged_store import damaged_store  # few jobs fail, and not all need Zarr
 
-            if damage := damage_behind(error, inputs):
+            if damage := damaged_store(error, inputs):
                 raise damage from error
             raise
         finally:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..config.section import LONGEST_NAME
 from ..errors import InputError
-from ..settings import LONGEST_NAME
 
 LONGEST_PATH = 1000  # bytes of a path below a folder
 

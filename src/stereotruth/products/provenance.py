@@ -18,6 +18,7 @@ from typing import Any
 from .. import __version__
 
 PACKAGE = Path(__file__).parents[1]
+CONFIG = "stereotruth.config."  # declares keys: what a rule takes of them stands in its parameters
 # whose versions may decide bytes of products
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs")
 LIBRARIES = (*LIBRARIES, "rasterio", "pyproj", "laspy", "lazrs")
@@ -83,7 +84,7 @@ def _imported_modules(tree: ast.Module, package: str) -> set[str]:
         else:
             continue
         for name in names:
-            if name.startswith("stereotruth."):
+            if name.startswith("stereotruth.") and not name.startswith(CONFIG):
                 found.add(name.removeprefix("stereotruth."))
     return {name for name in found if _module_file(name) is not None}
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..dataset.manifest import carries_label, read_manifest
+from ..dataset.manifest import read_manifest
 from ..dataset.split_names import SPLITS
 from ..errors import InputError
 from ..pages.page import INDEX, way, write_page
@@ -22,6 +22,7 @@ from ..pages.pictures import colours, encode, shrink, stretch
 from ..pages.tables import EMPTY, Cell, Column, Headline, Table, link_cell, spread, value_cell
 from ..products.locks import exclusive
 from ..products.rasters import read_image, read_tile
+from ..status import carries_label
 
 PAGES = (
     "results/report/*/index.html",

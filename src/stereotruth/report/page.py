@@ -30,7 +30,6 @@ from ..products.files import read_table
 from . import tile_pictures
 from .headlines import headlines
 from .maps import calibration, histograms, tile_map
-from .settings import Settings
 
 Place = str | Path
 Row = Mapping[str, str]
@@ -111,7 +110,7 @@ def write_report(
     out: Place,
     *,
     index: Place | None = None,
-    sliders: int = Settings.sliders,
+    sliders: int = 0,
     workers: int = 1,
     code: str = "",
 ) -> None:

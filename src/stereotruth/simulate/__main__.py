@@ -13,12 +13,12 @@ import sys
 import time
 from pathlib import Path
 
+from ..config.labels import Simulate
 from ..errors import InputError
 from .cities import CITIES, CitySpec, SceneSpec, lidar_files, read_city
 from .control_points import simulate_points, write_gcps
 from .lidar import simulate_lidar_tile
 from .render import simulate_image
-from .settings import Settings
 from .truth import simulate_truth
 from .twin_world import twin_city
 
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path, help="where to write <scene>/… (or <scene>.csv)")
     parser.add_argument(
-        "--spacing-m", type=float, default=Settings.lidar_spacing_m, help="LiDAR pulse spacing"
+        "--spacing-m", type=float, default=Simulate().lidar_spacing_m, help="LiDAR pulse spacing"
     )
     parser.add_argument("--seed", type=int, default=SEED, help="draws all measurement noise")
     parser.add_argument("--crs", default="", help="of a place's points, if they declare none")

@@ -281,14 +281,14 @@ def simulate_lidar_tile(
     tile_name: str,
     out_laz: str | Path,
     *,
-    spacing_m: float | None = None,
+    spacing_m: float = 0.4,
     seed: int,
     built: str | Path | None = None,
 ) -> dict[str, int]:
     """Fly one LiDAR tile and write it as the city's LAS format says.
 
-    ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together; None is that
-    of the settings. ``seed`` draws noise, jitter and which pulses pass a crown. ``built``: the
+    ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together.
+    ``seed`` draws noise, jitter and which pulses pass a crown. ``built``: the
     city's surfaces in a file, see :func:`.built_city.surfaces_of`. Returns the number of points by
     class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
@@ -298,10 +298,6 @@ def simulate_lidar_tile(
             f"scene {scene.name} has no LiDAR file {tile_name}",
             remedy="use one of " + ", ".join(lidar_files(city, scene)),
         )
-    if spacing_m is None:
-        from .settings import Settings  # a sixth of the start of a job, which knows the spacing
-
-        spacing_m = Settings.lidar_spacing_m
     if not 0.1 <= spacing_m <= 5:
         raise InputError(f"LiDAR spacing of {spacing_m} m", remedy="choose 0.1 to 5 m")
     s: Surfaces = world_of(city, surfaces_of(city, built), "lidar")

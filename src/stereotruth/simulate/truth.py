@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import zarr
-from zarr.codecs import BloscCodec, BloscShuffle
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 
 from ..job import progress
 from ..kernels import inlined, kernel
@@ -230,7 +230,10 @@ def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> di
             arrays[name] = group.create_array(
                 name, shape=(left.rows, left.cols), dtype=dtype, chunks=(CHUNK, CHUNK),
                 fill_value=np.nan if dtype == "float64" else 0,
-                compressors=BloscCodec(cname="zstd", clevel=1, shuffle=BloscShuffle.shuffle),
+                compressors=(
+                    BloscCodec(cname="zstd", clevel=1, shuffle=BloscShuffle.shuffle),
+                    Crc32cCodec(),
+                ),
                 dimension_names=("row", "col"), attributes=attributes,
             )  # fmt: skip
         strips = range(0, left.rows, CHUNK)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from stereotruth.command.main import app
 from stereotruth.command.new_project import KEYS, begin, configuration_text
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.project import configured
 from stereotruth.sheets import read_cities, read_scenes

@@ -17,7 +17,7 @@ from stereotruth.command.targets import (
     refuse_unknown,
     rules,
 )
-from stereotruth.configuration import Configuration
+from stereotruth.config.configuration import Configuration
 from stereotruth.errors import InputError
 from stereotruth.project import FILES
 

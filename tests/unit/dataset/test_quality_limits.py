@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from stereotruth.config.labels import Limits
 from stereotruth.dataset.quality_limits import FIGURES, flag, missed
-from stereotruth.dataset.settings import Limits
 
 GOOD = {
     "gcp_rms_px": 0.4,
@@ -14,8 +14,8 @@ GOOD = {
     "warp_correlation": 0.97,
     "agreement": 0.4,
 }
-LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.5, 0.01)
-NO_LIMITS = Limits(*[None] * 7)
+LIMITS = Limits()
+NO_LIMITS = Limits(**dict.fromkeys(Limits.model_fields))
 
 
 def test_good_figures_miss_nothing():

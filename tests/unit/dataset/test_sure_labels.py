@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.dataset.sure_labels import TOO_UNCERTAIN, tile_flags, tile_labels
+from stereotruth.dataset.sure_labels import tile_flags, tile_labels
+from stereotruth.status import Status
 
 FLAGS = {0: "no_points", 1: "labelled", 12: "labelled_crown"}
 
@@ -26,7 +27,7 @@ def test_unsure_crowns_are_left_out_and_nothing_else(store, limit, left_out) -> 
     sure = tile_labels(store, FLAGS, limit)
     status, disparity = (sure[name][0:2, 0:3] for name in ("status", "disparity"))
     assert sure["disparity"].shape == (2, 3)
-    out = status == TOO_UNCERTAIN
+    out = status == Status.TOO_UNCERTAIN
     assert out.sum() == left_out
     assert np.array_equal(np.isfinite(disparity), np.isin(status, (1, 12)))
     assert np.array_equal(disparity[~out], store["disparity"][:][~out], equal_nan=True)
@@ -38,4 +39,4 @@ def test_stores_without_crowns_are_taken_as_they_are(store) -> None:
     flags = {0: "no_points", 1: "labelled"}
     assert isinstance(tile_labels(store, flags, 0.1)["disparity"], zarr.Array)
     assert tile_flags(flags) == flags
-    assert tile_flags(FLAGS) == FLAGS | {TOO_UNCERTAIN: "too_uncertain"}
+    assert tile_flags(FLAGS) == FLAGS | {Status.TOO_UNCERTAIN: "too_uncertain"}

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from stereotruth.config.labels import Limits
 from stereotruth.dataset import label_doubts
-from stereotruth.dataset.settings import Limits
 from stereotruth.dataset.summary import summary_lines
 from stereotruth.dataset.verify import defects
 from stereotruth.errors import InputError
@@ -31,7 +30,7 @@ from ...synthetic.tiled_scene import (
 )
 
 SIZE = 96
-LIMITS = Limits(1.0, 0.5, 0.5, 1.0, 10, 0.9, 0.01)
+LIMITS = Limits(min_warp_correlation=0.9)
 
 
 def rough(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
@@ -157,7 +156,7 @@ def test_a_strict_run_ends_with_scene_tile_gate_value_and_limit(made, tmp_path):
     text = str(caught.value)
     for word in ("scene s1", "tile TN_0", "sift_median_error_px -1", "max_sift_error_px 0.5"):
         assert word in text
-    strict = replace(NO_LIMITS, max_gcp_rms_px=0.1)
+    strict = NO_LIMITS.model_copy(update={"max_gcp_rms_px": 0.1})
     with pytest.raises(InputError, match=r"gcp_rms_px 0\.4 is above max_gcp_rms_px 0\.1"):
         run([made["clean"].scene], tmp_path / "T", size=SIZE, quality=strict, strict=True)
     assert not (tmp_path / "T").exists()

@@ -12,10 +12,9 @@ from stereotruth.disparity.image_agreement import Comparison
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow, WindowLabels
 from stereotruth.disparity.pixel_labels import Labels, OwnPoints
-from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.shifted_agreement import WIDE_SHIFTS_PX
-from stereotruth.disparity.status import Status
 from stereotruth.simulate.changes import REASONS
+from stereotruth.status import Reason, Status
 
 IMAGE = 200, 300
 ROWS, COLS = slice(10, 190), slice(50, 250)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.dataset.sure_labels import NAME, TOO_UNCERTAIN
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.crowns import _clearance, _higher
 from stereotruth.disparity.recipe import label_window
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.status import Status, is_labelled
 
 from ...synthetic.box_scene import Scene, on_ground, write_points
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
@@ -66,14 +65,13 @@ def test_a_canopy_is_labelled_with_an_uncertainty_of_its_own(wood) -> None:
     assert grid["point_count"].values[crown].max() == 0
     assert np.isfinite(grid["height"].values[crown]).all()
     assert wood.summary["pixels"]["labelled_crown"] == crown.sum()
-    assert NAME not in grid["status"].attrs["flag_meanings"]
-    assert TOO_UNCERTAIN == Status.TOO_UNCERTAIN and Status.TOO_UNCERTAIN.name.lower() == NAME
+    assert Status.TOO_UNCERTAIN.label not in grid["status"].attrs["flag_meanings"]
 
 
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_any_cut_gives_the_same_crowns(wood, view) -> None:
     def labels(rows: slice, cols: slice):
-        settings = Settings()
+        settings = LabelSettings()
         return label_window(wood.inputs(settings, view), rows, cols)[0]
 
     whole = labels(slice(60, 180), slice(80, 220))

@@ -10,7 +10,7 @@ from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels, OwnLabels, OwnPoints
 from stereotruth.disparity.pixel_scale import PixelScale
-from stereotruth.disparity.status import Status
+from stereotruth.status import Status
 from stereotruth.surface.raster import VISIBLE, SeenSurface
 from stereotruth.surface.scale import SurfaceScale, ground_cell
 

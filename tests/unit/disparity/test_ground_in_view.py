@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity import recipe as module
 from stereotruth.disparity import scene_inputs
 from stereotruth.disparity.ground_in_view import ground_in_view
-from stereotruth.disparity.settings import Settings
 from stereotruth.surface.region import Region
 from stereotruth.surface.scale import PART
 from stereotruth.surface.vertices import Vertices
@@ -74,7 +74,7 @@ def test_triangles_that_touch_stay() -> None:
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) -> None:
     box = Scene(tmp_path_factory.mktemp("box"), box=True, spacing=2.5)
-    scene = box.inputs(Settings(), view)
+    scene = box.inputs(LabelSettings(), view)
     windows = [(slice(r, r + 50), slice(c, c + 50)) for r in (90, 140) for c in (60, 110, 160)]
     labels = [module.label_window(scene, *window)[0] for window in windows]
     sizes = []
@@ -97,7 +97,7 @@ def test_labels_are_those_of_all_triangles(tmp_path_factory, monkeypatch, view) 
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_labels_are_those_of_all_blocks(tmp_path, monkeypatch, view) -> None:
     monkeypatch.setattr("stereotruth.surface.make_surface.block_side", lambda scale: 32)
-    scene = Scene(tmp_path, box=True, spacing=2.5).inputs(Settings(), view)
+    scene = Scene(tmp_path, box=True, spacing=2.5).inputs(LabelSettings(), view)
     windows = [(slice(r, r + 50), slice(c, c + 50)) for r in (90, 140) for c in (60, 110, 160)]
     labels = [module.label_window(scene, *window)[0] for window in windows]
     taken = [len(scene.surface_blocks(*window)) for window in windows]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import is_labelled
 from stereotruth.lidar.gps_times import day_of
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.products.grids import require_complete
+from stereotruth.status import is_labelled
 from stereotruth.surface.make_surface import make_surface
 
 from ...synthetic.box_scene import Scene, project_with, surfaces_of, write_points
@@ -85,7 +85,7 @@ def test_bytes_are_the_same_for_any_blocks_windows_and_workers(box, tmp_path):
     day = np.where(box.points[:, 0] < LON, WEST, EAST)
     mixed = np.random.default_rng(1).permutation(len(day))
     store = write_points(tmp_path, box.points[mixed], day=day[mixed])
-    inputs = SceneInputs.of(*box.images, [store], Settings())
+    inputs = SceneInputs.of(*box.images, [store], LabelSettings())
     digests = set()
     for number, (blocks, run) in enumerate(
         [(1, {}), (16, {"max_points": 20_000}), (3, {"workers": 2, "scheduler": "sync"})]

@@ -13,19 +13,18 @@ import zarr
 
 import stereotruth.disparity.recipe as module
 from stereotruth.alignment.label_uncertainty import label_covariance
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.facet_labels import facet_labels
 from stereotruth.disparity.pixel_labels import RIDGE, Labels
 from stereotruth.disparity.project import FAR_BEYOND, project_scene
-from stereotruth.disparity.reason import Reason
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore, query_points
 from stereotruth.products.grids import open_grid
+from stereotruth.status import Reason, Status, is_labelled
 
 from ...synthetic.box_scene import (
     ROOF,
@@ -133,10 +132,10 @@ def labels_of_own_points(scene: Scene, monkeypatch) -> tuple[Labels, dict[str, n
         return facet_labels(visible, own, *rest)
 
     monkeypatch.setattr(module, "facet_labels", record)
-    inputs = scene.inputs(Settings())
+    inputs = scene.inputs(LabelSettings())
     rows, cols = scene.model.shape
     layers, _ = label_window(inputs, slice(0, rows), slice(0, cols))
-    inner = (slice(inputs.settings.margin, -inputs.settings.margin),) * 2
+    inner = (slice(inputs.margin, -inputs.margin),) * 2
     own = recorded[0]
     return Labels(own.disparity[inner], own.slope[:, *inner], own.variance[inner]), layers
 
@@ -332,7 +331,7 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
 
 def test_blocks_can_go_to_other_processes(plane) -> None:
     """A block's task is made of plain values, whatever has been opened before."""
-    scene = plane.inputs(Settings())
+    scene = plane.inputs(LabelSettings())
     window = slice(100, 140), slice(120, 170)
     first = label_window(scene, *window)
     second = label_window(pickle.loads(pickle.dumps(scene)), *window)
@@ -445,7 +444,7 @@ def test_the_store_says_what_decided_on_its_light(
     images = [plane.images[0], tmp_path / "right.zarr"]
     told = {"taken": "2020-06-01T04:00:00+00:00", "sun": [150.0, 75.0]}
     write_image(images[1], plane.model, image_of(plane.surface), **told)
-    inputs = SceneInputs.of(*images, [plane.store], Settings(recipe="paper"))
+    inputs = SceneInputs.of(*images, [plane.store], LabelSettings(recipe="paper"))
     cells = {"left": (left_cell, None, None), "right": ("", None, None)}
     project_scene(inputs.in_light(None, cells), tmp_path / "out.zarr", code="test")
     attrs = open_grid(tmp_path / "out.zarr").attrs
@@ -496,6 +495,11 @@ def refused(scene: Scene, store: Path, match: str) -> None:
     assert not list(scene.folder.glob("refused*"))
 
 
+def test_no_point_store_is_refused(plane) -> None:
+    with pytest.raises(InputError, match="no point store"):
+        project_with(*plane.images, [], plane.folder / "x.zarr")
+
+
 def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     """The message tells a survey of another place from a wrong coordinate system."""
     near = plane.points[:2000] + np.array([0.1, 0, 0])
@@ -504,14 +508,6 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
     with pytest.raises(InputError, match=r"114\.3.*30\.6"):
         project_with(*plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr")
-
-
-def test_settings_are_checked(plane) -> None:
-    for options in ({"recipe": "guess"}, {"window": 8}, {"min_points": 0}):
-        with pytest.raises(InputError, match="Remedy"):
-            plane.project(**options)
-    with pytest.raises(InputError, match="no point store"):
-        project_with(*plane.images, [], plane.folder / "x.zarr")
 
 
 def test_store_bounds_and_density_are_kept(plane) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.disparity.status import Status, is_labelled
 from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
+from stereotruth.status import Status, is_labelled
 
 from ...synthetic.box_scene import Scene, dilated, project_with
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.config.labels import LabelSettings
 from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.settings import Settings
-from stereotruth.disparity.status import Status, is_labelled
+from stereotruth.status import Status, is_labelled, statuses_of
 
 from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
 from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
@@ -94,7 +94,7 @@ def test_right_view_is_labelled_between_points_too(box) -> None:
 )
 def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
     def scene() -> SceneInputs:
-        return box.inputs(Settings(recipe=recipe), view)
+        return box.inputs(LabelSettings(recipe=recipe), view)
 
     rows, cols = slice(60, 220), slice(70, 250)
     whole = label_window(scene(), rows, cols)[0]
@@ -120,6 +120,6 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
 
 @pytest.mark.parametrize("recipe", ["surface", "paper"])
 def test_labels_between_points_need_the_surface(recipe) -> None:
-    statuses = Settings(recipe=recipe).statuses
+    statuses = statuses_of(recipe, masked=False)
     assert (Status.LABELLED_BETWEEN in statuses) == (recipe == "surface")
     assert not {Status.LABELLED_BY_IMAGES, Status.MASKED} & set(statuses)

@@ -11,8 +11,8 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.epipolar.image_reader import Source, open_pair
-from stereotruth.epipolar.settings import Settings
+from stereotruth.config.labels import Rectify
+from stereotruth.epipolar.image_reader import Source, band_weights, open_pair
 from stereotruth.errors import InputError
 
 from ...synthetic.images import pattern
@@ -252,14 +252,24 @@ def test_colours_and_a_mix_of_bands_are_read(tmp_path) -> None:
 )
 def test_colour_is_what_both_images_call_so(tmp_path, options, expected, caplog) -> None:
     pair = [coloured(tmp_path / f"{n}.tif") for n in "ab"]
-    with open_pair(*pair, bands=Settings(**options)) as (left, right):
+    with open_pair(*pair, bands=Rectify(**options)) as (left, right):
         assert left.colour == right.colour == expected
         assert left.mix == pytest.approx(dict.fromkeys(expected, 1 / 3) if expected else {1: 1})
     assert ("band 1 (red) is used" in caplog.text) == (not expected)
     grey = write(tmp_path / "g.tif", GREY.astype(np.uint16))
     if options.get("colour"):
         with pytest.raises(InputError, match=r"g.tif: no band 4: it has 1\. .*rectify.colour"):
-            open_pair(pair[0], grey, bands=Settings(**options)).__enter__()
+            open_pair(pair[0], grey, bands=Rectify(**options)).__enter__()
     else:
-        with open_pair(pair[0], grey, bands=Settings(**options)) as (left, right):
+        with open_pair(pair[0], grey, bands=Rectify(**options)) as (left, right):
             assert left.colour == right.colour == ()
+
+
+def test_weights_of_bands_are_of_sum_one() -> None:
+    """Band 1 without colour, the mean with it, or what is named."""
+    assert band_weights(None, None) == {1: 1.0}
+    assert band_weights(None, (3, 2, 1)) == pytest.approx({3: 1 / 3, 2: 1 / 3, 1: 1 / 3})
+    assert band_weights(4, (1, 2, 3)) == {4: 1.0}
+    assert band_weights({1: 1, 2: 3}, None) == {1: 0.25, 2: 0.75}
+    with pytest.raises(InputError):
+        band_weights({}, None)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from stereotruth.config.labels import Rectify
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.epipolar.settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.products.grids import open_grid, require_complete
 
@@ -269,7 +269,7 @@ def test_colours_are_rectified_alike(tmp_path: Path) -> None:
     grey = render(sensors[0], HEIGHT)
     bands = [(grey // k).astype(np.uint16) + 1 for k in (1, 2, 3)]
     stores = {}
-    mix = Settings(panchromatic={1: 1, 2: 1})
+    mix = Rectify(panchromatic={1: 1, 2: 1})
     for name, pixels, given in (("rgb", np.stack(bands), mix), ("green", bands[1], None)):
         options = {"photometric": "RGB"} if name == "rgb" else {}
         images = [write_image(tmp_path / f"{n}.tif", None, pixels, **options) for n in "lr"]

@@ -9,7 +9,14 @@ import zarr
 
 from stereotruth.errors import InputError
 from stereotruth.products.files import atomic_file
-from stereotruth.products.grids import Layer, atomic_store, blocks, create_grid, open_grid
+from stereotruth.products.grids import (
+    Layer,
+    atomic_store,
+    blocks,
+    create_grid,
+    open_grid,
+    require_complete,
+)
 from stereotruth.products.resumable_grids import resumable_grid
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
@@ -114,3 +121,21 @@ def test_any_damage_to_the_metadata_is_one_sentence_with_the_store(tmp_path):
             assert "grid.zarr" in str(error)
             refused += 1
     assert refused > 60
+
+
+def flip(file, bit) -> None:
+    data = bytearray(file.read_bytes())
+    data[bit // 8] ^= 1 << bit % 8
+    file.write_bytes(data)
+
+
+def test_a_flipped_bit_of_a_chunk_is_never_read_as_another_value(tmp_path):
+    path, rng = make(tmp_path / "d.zarr"), random.Random(5)
+    file = path / "disparity/c/1/0"
+    for _ in range(60):
+        bit = rng.randrange(file.stat().st_size * 8)
+        flip(file, bit)
+        with pytest.raises(Exception):  # noqa: B017  the decoder's, or the checksum's
+            require_complete(path)["disparity"][:]
+        flip(file, bit)
+    assert require_complete(path)["disparity"][40, 8] == 5

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from stereotruth.config.section import LONGEST_NAME
 from stereotruth.errors import InputError
 from stereotruth.products.names import path_below, plain_name
-from stereotruth.settings import LONGEST_NAME
 
 OUTSIDE = ("/etc/x", "../../../../x", "..", ".", ".x", "a\\b", "C:\\x", "a\0b", "a\nb")
 NO_NAMES = (*OUTSIDE, "a/b", "", "x" * (LONGEST_NAME + 1), "é" * 51, "a\udce9", 7)

@@ -209,7 +209,7 @@ def test_scenes_and_limits_of_the_gates_are_listed(tmp_path):
         },
     }
     (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
-    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html")
+    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html", sliders=2)
     text = (tmp_path / "index.html").read_text()
     section = re.search(r'<section id="quality">.*?</section>', text, re.DOTALL)[0]
     assert "Limits: y-parallax ≤ 0.5 px; SIFT matches ≥ 10." in section
@@ -230,7 +230,7 @@ def test_doubts_and_what_the_images_say_by_surface_are_listed(tmp_path):
         "surfaces": {"S-1": {"roofs": {"matches": 400, "bias_px": 0.1512}}},
     }
     (tmp_path / "tiles/export.json").write_text(json.dumps({"quality": record}))
-    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html")
+    page.write_report("City", CityFiles(tmp_path / "tiles"), tmp_path / "index.html", sliders=2)
     section = re.search(
         r'<section id="quality">.*?</section>', (tmp_path / "index.html").read_text(), re.DOTALL
     )[0]
@@ -244,6 +244,7 @@ def test_a_real_city_without_truth_or_evaluation_has_no_empty_sections(tmp_path)
         "Bare",
         CityFiles(tmp_path / "tiles", truth="none", truth_table="none"),
         tmp_path / "index.html",
+        sliders=2,
     )
     text = (tmp_path / "index.html").read_text()
     sections = re.findall(r'<section id="(\w+)"', text)

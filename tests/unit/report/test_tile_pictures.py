@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.dataset.quick_looks import SPLIT_COLOURS, STATUS_COLOURS, status_colours
+from stereotruth.dataset.quick_looks import SPLIT_COLOURS, status_colours
 from stereotruth.pages.pictures import NO_VALUE
 from stereotruth.products.rasters import write_tiff
 from stereotruth.report import tile_pictures
+from stereotruth.status import Status
 
 from ...synthetic.colour_vision import nearest, rgb
 from ...synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
@@ -55,5 +56,5 @@ def test_a_wrong_disparity_shows_in_the_difference(tmp_path):
 
 
 def test_colours_of_status_and_splits_are_apart_for_all_eyes():
-    assert nearest([rgb(colour) for colour in STATUS_COLOURS.values()]) > 20
+    assert nearest([rgb(status.colour) for status in Status]) > 20
     assert nearest([rgb(colour) for colour in SPLIT_COLOURS.values()]) > 20

@@ -60,10 +60,9 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "",
         "errors",
         "job",
-        "kernel_cache",
         "kernels",
         "products",
-        "products.damaged_chunks",
+        "products.damaged_store",
         "products.files",
         "products.folders",
         "products.grids",
@@ -73,5 +72,4 @@ def test_shares_no_code_with_the_pipeline() -> None:
         "products.making",
         "products.remote_files",
         "products.web_files",
-        "settings",
     }

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from ...config.methods import Audit, AuditLimits
 from ...dataset.split_names import SPLITS
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from ...job import progress
@@ -35,7 +36,6 @@ from ...products.provenance import digest, file_sha256
 from ...products.rasters import read_image
 from .page import write_audit
 from .pair import measure
-from .settings import Limits, Settings
 from .sharing import Features, Shared, features, find_shared
 from .summary import Audited, in_words, summarise, table_rows
 from .verdicts import FAULT, NOTE, Finding, judge
@@ -46,7 +46,7 @@ log = logging.getLogger("stereotruth")
 def audit(
     dataset: StereoDataset,
     out: str | Path,
-    settings: Settings,
+    settings: Audit,
     *,
     work: str | Path,
     workers: int = 1,
@@ -60,7 +60,7 @@ def audit(
 
     Raises InputError if the dataset has no pairs or a file cannot be read.
     """
-    out, work, limits = Path(out), Path(work), settings.limits
+    out, work, limits = Path(out), Path(work), settings
     pairs = dataset.pairs()
     measured = _measure_all(dataset, pairs, work, workers, code)
     log.info("looking for shared ground")
@@ -122,7 +122,7 @@ def decide(
     pairs: Sequence[Pair],
     measured: Sequence[Mapping[str, Any]],
     shared: Sequence[Shared],
-    limits: Limits,
+    limits: AuditLimits,
 ) -> list[Audited]:
     """The verdicts on all pairs."""
     common = _sharing(pairs, measured, shared)

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from ...config.methods import AuditLimits
 from ...dataset.stereo_dataset import StereoDataset
 from ...pages import pictures
 from ...pages.figures import AXES, Chart, Plot, look, styled
@@ -20,7 +21,6 @@ from ...pages.tables import Cell, Headline, Table, minus, table, value_cell, wor
 from ...products.rasters import read_image
 from .matches import grey, label_offsets, match_pair
 from .pair import EXTRA_PX, estimate
-from .settings import Limits
 from .summary import Audited, table_rows
 from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED
 
@@ -55,7 +55,7 @@ def write_audit(
     dataset: StereoDataset,
     audited: Sequence[Audited],
     summary: Mapping[str, Any],
-    limits: Limits,
+    limits: AuditLimits,
     worst: int,
     *,
     index: str | None = None,
@@ -117,7 +117,7 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
 
 
 @styled
-def all_pairs(audited: Sequence[Audited], limits: Limits, linked: set[str]) -> Chart | None:
+def all_pairs(audited: Sequence[Audited], limits: AuditLimits, linked: set[str]) -> Chart | None:
     """All pairs that have both: label bias over vertical parallax, px; the box is tolerated.
 
     ``linked``: names of pairs that the page shows in large.

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ...config.methods import AuditLimits
 from ...dataset.stereo_dataset import Pair, StereoDataset
 from .conventions import AS_STATED
 from .pair import estimate
-from .settings import Limits
 from .sharing import Shared
 from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Verdict
 
@@ -51,7 +51,7 @@ class Audited:
     figures: Mapping[str, Any]
     verdict: Verdict
 
-    def severity(self, limits: Limits) -> float:
+    def severity(self, limits: AuditLimits) -> float:
         """By how much the pair is off, in tolerances; faults of files count most."""
         found = 100.0 * sum(f.check in ("files", "convention") for f in self.verdict.of(FAULT))
         found += 10.0 * len({f.check for f in self.verdict.of(FAULT)})
@@ -105,7 +105,10 @@ def pooled(audited: Sequence[Audited]) -> dict[str, Any]:
 
 
 def summarise(
-    dataset: StereoDataset, audited: Sequence[Audited], shared: Sequence[Shared], limits: Limits
+    dataset: StereoDataset,
+    audited: Sequence[Audited],
+    shared: Sequence[Shared],
+    limits: AuditLimits,
 ) -> dict[str, Any]:
     """What is known of the dataset, JSON-ready."""
     by_city = defaultdict(list)
@@ -144,7 +147,7 @@ def summarise(
             }
             for s in shared
         ],
-        "limits": asdict(limits),
+        "limits": limits.model_dump(include=set(AuditLimits.model_fields)),
     }
     return summary | {"statements": statements(summary)}
 

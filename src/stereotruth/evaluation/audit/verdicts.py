@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ...config.methods import AuditLimits
 from . import conventions
 from .pair import estimate
 from .registration import SHIFTS
-from .settings import Limits
 
 FAULT, UNDECIDED, NOTE = "fault", "undecided", "note"
 GOOD = "good"
@@ -65,7 +65,7 @@ class Verdict:
 
 
 def judge(
-    figures: Mapping[str, Any], limits: Limits, pairs: int, shared: Sequence[Finding] = ()
+    figures: Mapping[str, Any], limits: AuditLimits, pairs: int, shared: Sequence[Finding] = ()
 ) -> Verdict:
     """The verdict on one of ``pairs`` pairs, from its figures and what it shares with others."""
     level = limits.false_alarms / max(pairs, 1)
@@ -119,7 +119,7 @@ def _rows(figures: Mapping[str, Any], tolerance: float, level: float) -> list[Fi
     return [Finding("rows", UNDECIDED, text)] if open_ else []
 
 
-def _labels(figures: Mapping[str, Any], limits: Limits, level: float) -> list[Finding]:
+def _labels(figures: Mapping[str, Any], limits: AuditLimits, level: float) -> list[Finding]:
     found = _values(figures, level)
     if not figures["labels"]["labelled"]:
         return [*found, Finding("values", FAULT, "no labels")]

@@ -37,6 +37,7 @@ from ...dataset.pixel_size import PixelSize
 from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...products.grids import require_complete
 from ...products.rasters import read_flags
+from ...status import HIDDEN
 
 Bools = NDArray[np.bool_]
 
@@ -44,7 +45,6 @@ Bools = NDArray[np.bool_]
 NEAR_PX = 5
 STEP_PX = 3.0
 FAR_PX = np.float32(1e6)  # beyond any disparity
-HIDDEN = ("hidden_in_left", "hidden_in_right")  # of the meanings of a status
 WATER = 5  # of the layer surface of the exact truth
 AGL_M = (2.0, 10.0, 30.0)  # bounds: low things, houses and trees, blocks, towers
 UNCERTAINTY_PX = (0.05, 0.1, 0.2)

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from ...config.methods import Augmentation
 from ...dataset.stereo_dataset import Pair, StereoDataset, match_inside
 from ...errors import InputError
 from ...products.rasters import read_image
-from ..image_faults import faulty_pair
-from .training_settings import Augmentation
+from ..image_faults import FAULTS, faulty_pair
 from .weights import SavedNetwork, scaled
 
 TRIES = 10  # random windows looked at for one with enough labels
@@ -101,7 +101,7 @@ class LabelledPairs(Dataset):
         low, high = self.dataset.disparity_range
         disparity[~((disparity >= low) & (disparity < high))] = np.nan
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        chances = self.augmentation.faults
+        chances = self.augmentation.model_dump(include=set(FAULTS))
         if any(chances.values()):
             left, right = faulty_pair(left, right, chances, rng)
         images = np.stack([scaled(image, self.model, None) for image in (left, right)])

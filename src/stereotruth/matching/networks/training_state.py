@@ -185,7 +185,7 @@ def publish_training(job: TrainingJob, provenance: dict[str, Any]) -> dict[str, 
     model, network, best = load_weights(job.work / "best.pt")
     summary = {
         "model": asdict(model),
-        "training": asdict(job.training),
+        "training": job.training.model_dump(),
         "parameters": sum(p.numel() for p in network.parameters()),
         "pairs": {"train": len(job.data.pairs), "val": len(job.held.pairs)},
         "steps": state["curve"][-1]["step"],

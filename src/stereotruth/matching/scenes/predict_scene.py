@@ -23,6 +23,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from ...config.methods import CHUNK, SceneMatching
 from ...errors import InputError
 from ...job import block_progress
 from ...products.grids import Layer, require_complete
@@ -32,7 +33,6 @@ from ..kinds import kind_of, names_of
 from ..matcher import Matcher
 from ..methods import make_method
 from .offsets import Offsets, find_offsets
-from .settings import CHUNK, Settings
 from .tiling import Tiling, blend, inside, predict_tile, view_of
 
 log = logging.getLogger("stereotruth")
@@ -172,7 +172,7 @@ def predict_scene(
     *,
     method: str,
     entry: Mapping[str, Any],
-    settings: Settings,
+    settings: SceneMatching,
     workers: int = 1,
     scheduler: Any = dask.threaded.get,
     code: str = "",
@@ -280,14 +280,14 @@ class _Plan:
         return cls(tiling, moved.offsets, places, windows, keys, tile_keys)
 
 
-def _offsets(pair: _ImagePair, settings: Settings, attrs: Mapping[str, Any]) -> Offsets:
+def _offsets(pair: _ImagePair, settings: SceneMatching, attrs: Mapping[str, Any]) -> Offsets:
     """By how much the right image is moved for each block."""
     if settings.offset != "auto":
         return _fixed(settings.offset, pair.tiling)
     return find_offsets(*pair.images, pair.tiling, pair.disparity_range, _search(attrs))
 
 
-def _parameters(job: _ImagePair, settings: Settings) -> dict[str, Any]:
+def _parameters(job: _ImagePair, settings: SceneMatching) -> dict[str, Any]:
     """What a prediction follows from besides its files, for its record."""
     return {
         "method": job.method,

@@ -44,7 +44,6 @@ from ...products.files import atomic_file
 from ...products.grids import Layer, blocks, require_complete
 from ...products.provenance import digest
 from ...products.resumable_grids import BlockStore, resumable_grid
-from .settings import SurfaceModel as Settings
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -307,7 +306,7 @@ def write_dsm(
     disparity_store: str | Path,
     out: str | Path,
     *,
-    resolution_m: float | None = Settings.resolution_m,
+    resolution_m: float | None = None,
     workers: int = 1,
     scheduler: Any = dask.threaded.get,
     code: str = "",

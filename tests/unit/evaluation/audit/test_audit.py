@@ -7,18 +7,17 @@ import html
 import json
 import re
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
+from stereotruth.config.methods import Audit
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
 from stereotruth.evaluation.audit import audit
 from stereotruth.evaluation.audit import audit as run
-from stereotruth.evaluation.audit.settings import Settings
 from stereotruth.evaluation.audit.verdicts import FAULT, GOOD
 from stereotruth.pages.page import PAPER
 from stereotruth.pages.tables import minus
@@ -27,8 +26,8 @@ from stereotruth.products.files import write_table
 from ....browser import CHROMIUM, look
 from ....synthetic.pair_with_block import make
 
-LIMITS = Settings(0.3, 0.3, 0.05, 0.01, 0.01)
-ONE_SHOWN = replace(LIMITS, worst=1)
+LIMITS = Audit(contradicted_share=0.05, hidden_share=0.01)
+ONE_SHOWN = LIMITS.model_copy(update={"worst": 1})
 
 
 def write(path, values, nodata=None):
@@ -91,7 +90,7 @@ def audited(tmp_path_factory):
     same.right = same.left
     add(root, 12, same)
     out = root / "audit" / "mine"
-    shown = replace(LIMITS, worst=3)
+    shown = LIMITS.model_copy(update={"worst": 3})
     summary = audit.audit(dataset(root), out, shown, work=root / "work", workers=2)
     return root, out, summary
 
@@ -216,7 +215,7 @@ def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
     assert len(seen) == 1
     assert summary["verdicts"][GOOD] == 2 and not summary["shared"]
     seen.clear()
-    strict = replace(LIMITS, parallax_px=0.001)
+    strict = LIMITS.model_copy(update={"parallax_px": 0.001})
     work = tmp_path / "work"
     assert audit.audit(dataset(root), out, strict, work=work)["verdicts"][GOOD] < 2
     audit.audit(dataset(root), out, ONE_SHOWN, work=work)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereotruth.config.methods import AuditLimits
 from stereotruth.evaluation.audit.estimates import Estimate
-from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, Limits, judge
+from stereotruth.evaluation.audit.verdicts import FAULT, GOOD, judge
 
 
 def figures(bias, error, freedom=40):
@@ -31,7 +32,7 @@ def figures(bias, error, freedom=40):
 def test_verdicts_have_the_error_rate_that_is_stated():
     """Biases at the very edge of what is tolerated, many datasets of 20 pairs."""
     rng = np.random.default_rng(62)
-    limits = Limits(0.3, 0.3, 0.05, 0.02, 0.2)
+    limits = AuditLimits(contradicted_share=0.05, false_alarms=0.2)
     alarms = 0
     for _ in range(120):
         seen = 0.3 + 0.05 * rng.standard_normal(20)

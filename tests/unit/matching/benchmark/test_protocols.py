@@ -8,8 +8,8 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
+from stereotruth.config.methods import StereoDatasetEntry
 from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.dataset.stereo_dataset_settings import Settings
 from stereotruth.errors import InputError
 from stereotruth.matching.benchmark.compare_methods import compare
 from stereotruth.matching.benchmark.protocols import (
@@ -36,7 +36,7 @@ def test_the_frozen_ones_keep_their_ids():
         "us3d-track2": "us3d-track2-ba686ae3",
         "exact-2026": "exact-2026-84f216ff",
     }
-    allowed = get_args(get_type_hints(Settings)["protocol"])
+    allowed = get_args(get_type_hints(StereoDatasetEntry)["protocol"])
     assert set(get_args(allowed[0])) == set(PROTOCOLS)
     assert set(PUBLISHED) <= set(PROTOCOLS)
 

@@ -10,7 +10,6 @@ import rasterio
 import zarr
 
 from stereotruth.dataset.stereo_dataset import Pair
-from stereotruth.disparity.status import Status
 from stereotruth.matching.benchmark.strata import (
     Products,
     exact_truth,
@@ -20,6 +19,7 @@ from stereotruth.matching.benchmark.strata import (
     near_step,
 )
 from stereotruth.products.grids import seal
+from stereotruth.status import Status
 
 from ....synthetic.flat_orientation import GSD, RATIO, orientation
 

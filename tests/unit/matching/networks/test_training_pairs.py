@@ -12,10 +12,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from torch.utils.data import DataLoader
 
+from stereotruth.config.methods import Augmentation
 from stereotruth.dataset.stereo_dataset import StereoDataset
 from stereotruth.errors import InputError
 from stereotruth.matching.networks.training_pairs import LabelledPairs
-from stereotruth.matching.networks.training_settings import Augmentation
 from stereotruth.matching.networks.weights import scaled
 from stereotruth.products.rasters import read_image
 

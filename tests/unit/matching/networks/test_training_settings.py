@@ -12,10 +12,3 @@ from stereotruth.matching.networks.training_settings import TrainingSettings
 def test_the_learning_rate_is_halved_every_ten_epochs() -> None:
     rates = [training_state.learning_rate_of(TrainingSettings(), epoch) for epoch in (0, 9, 10, 25)]
     assert rates == [1e-3, 1e-3, 5e-4, 2.5e-4]
-
-
-def test_settings_of_a_method_precede_the_general_ones() -> None:
-    made = TrainingSettings.of(
-        {"epochs": 120, "crop_px": [64, 64], "augmentation": {"noise": 0.1}}, {"epochs": 3}
-    )
-    assert (made.epochs, made.crop_px, made.augmentation.noise) == (3, (64, 64), 0.1)

@@ -11,12 +11,12 @@ import pytest
 import zarr
 from whole_images import match
 
+from stereotruth.config.methods import SceneMatching
 from stereotruth.errors import InputError
 from stereotruth.job import dask_scheduler
 from stereotruth.matching.methods import make_method
 from stereotruth.matching.scenes import predict_scene as whole
 from stereotruth.matching.scenes.predict_scene import predict_scene
-from stereotruth.matching.scenes.settings import Settings
 from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
 
 from ....synthetic.images import textured
@@ -37,7 +37,7 @@ GIVEN = {
 def predict(
     left, right, out, *, method, entry, code, workers=1, scheduler=dask.threaded.get, **settings
 ):
-    how = {"method": method, "entry": entry, "code": code, "settings": Settings(**settings)}
+    how = {"method": method, "entry": entry, "code": code, "settings": SceneMatching(**settings)}
     return predict_scene(left, right, out, **how, workers=workers, scheduler=scheduler)
 
 
@@ -195,8 +195,6 @@ def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"block_px": 200}, "multiple of 256"),
-        ({"overlap_px": 200}, "overlap"),
         ({"entry": {"kind": "sgm", "mode": "none"}}, "no mode"),
         ({"offset": 5000}, "no disparity at all"),
     ],
