@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stereotruth.errors import InputError
-from stereotruth.products.making import making
 from stereotruth.products.damaged_store import damaged_store
 from stereotruth.products.grids import Layer, atomic_store, create_grid, require_complete
+from stereotruth.products.making import making
 
 LAYERS = {"image": Layer("uint16", 0, {"units": "DN", "long_name": "image"})}
 
