@@ -15,12 +15,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from checkpoints import evaluate_checkpoints
-from drawn_cities import DENSITIES, NAMED, compare_drawn, compare_twin
-from geometry_errors import geometry_errors
+from drawn_scenes import DENSITIES, NAMED, add_place, compare_drawn, compare_twin, place_given
+from figures import draw_panels, evaluate_checkpoints, geometry_errors, print_records
 from synthetic_pairs import label_by, labels_of
-from twin_places import add_place, place_given
-from warped_panels import draw_panels
 
 from stereotruth import sheets
 from stereotruth.alignment.align import align
@@ -62,18 +59,6 @@ def share(value: float | None) -> str:
 
 def pixels(value: float | None, sign: bool = False) -> str:
     return "–" if value is None else f"{value:{'+' if sign else ''}.3f}"
-
-
-def print_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
-    """A table of text cells, columns as wide as needed."""
-    if not rows:
-        return
-    columns = list(rows[0])
-    width = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
-    print(f"\n{title}")
-    print("  ".join(f"{c:<{width[c]}}" for c in columns))
-    for row in rows:
-        print("  ".join(f"{row[c]:<{width[c]}}" for c in columns))
 
 
 def truth_row(name: str, comparison: labels_against_truth.Comparison) -> dict[str, Any]:
@@ -403,13 +388,13 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def show(report: Mapping[str, Any]) -> None:
-    print_table("Labels against the exact truth", [shown_truth(row) for row in report["truth"]])
-    print_table("The same, tiles by city", [shown_truth(row) for row in report["cities"]])
-    print_table("With noise-free GCPs", [shown_truth(row) for row in report["exact"]])
-    print_table("Where labels are missing or wrong, tiles by city", report["status"])
-    print_table("Calibration of the uncertainty, tiles by city", report["calibration"])
-    print_table("Alignment and epipolar model alone, on exact ground points", report["geometry"])
-    print_table(
+    print_records("Labels against the exact truth", [shown_truth(row) for row in report["truth"]])
+    print_records("The same, tiles by city", [shown_truth(row) for row in report["cities"]])
+    print_records("With noise-free GCPs", [shown_truth(row) for row in report["exact"]])
+    print_records("Where labels are missing or wrong, tiles by city", report["status"])
+    print_records("Calibration of the uncertainty, tiles by city", report["calibration"])
+    print_records("Alignment and epipolar model alone, on exact ground points", report["geometry"])
+    print_records(
         "Check points (label less measured disparity, px)",
         [
             {
@@ -439,9 +424,9 @@ def show(report: Mapping[str, Any]) -> None:
                 "lowest of a tile": f"{min(tiles):.4f}" if tiles else "–",
             }
         )
-    print_table("Left and warped right image, labelled pixels", warped)
-    print_table("SIFT matches (table 4; by snakemake evaluate)", report["table4"])
-    print_table("What is asked for, tiles by city", report["goals"])
+    print_records("Left and warped right image, labelled pixels", warped)
+    print_records("SIFT matches (table 4; by snakemake evaluate)", report["table4"])
+    print_records("What is asked for, tiles by city", report["goals"])
 
 
 def main() -> int:

@@ -31,11 +31,10 @@ from changes import (
     dated_truth,
     inputs_of,
 )
-from made_fields import made_field
+from made_fields import in_eight_bits, made_field
 from numpy.typing import NDArray
 from planted_changes import GROUND, KINDS, ROOF, Planted, RealScene
 from real import Pair, Site
-from shaded_ground import in_eight_bits
 
 from stereotruth.disparity.change_evidence import Evidence, LabelledWindow, change_evidence
 from stereotruth.disparity.change_probability import (

@@ -1,7 +1,7 @@
 """What changed between LiDAR and images: who notices, what is lost, which reason is told.
 
 python bench/changes.py [--seeds 1 2] [--kinds built felled] [--density 4] [--folder FOLDER]
-                        [--without-classes] [--figure docs/changes.png]
+                        [--without-classes]
                         [--twin place.laz --crs EPSG:2154]
 
 Cities are drawn by seed, one for each kind of change and one with many (mixed), and each of them is
@@ -17,15 +17,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import laspy
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from drawn_scenes import Place, add_place, place_given
 from numpy.typing import NDArray
-from synthetic_pairs import gain, noise, rectify_by
-from twin_places import Place, add_place, place_given
+from synthetic_pairs import VIEWS, change_images, fly, gain, noise, rectify_by
 
 from stereotruth.alignment.align import align
 from stereotruth.config.labels import LabelSettings
@@ -33,23 +28,17 @@ from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.lidar.ingest import ingest
-from stereotruth.matching.image_faults import as_images
-from stereotruth.pages.pictures import save_figure, stretch
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.grids import require_complete
-from stereotruth.products.ungeoreferenced import open_raster
 from stereotruth.simulate.changes import REASONS, changes_at
 from stereotruth.simulate.cities import (
     Canopy,
     CitySpec,
     Dates,
     ViewSpec,
-    lidar_files,
     training_city,
 )
 from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE, WATER
 from stereotruth.status import Status, is_labelled
@@ -58,15 +47,6 @@ FIRST_CITY = 4000  # of the numbers of cities
 SIDE_PX = 800
 CHANGED_M = 1.0  # of height
 YEAR = 365.0
-UNCLASSIFIED = 1  # ASPRS
-VIEWS = ("left", "right")
-BLOCK_PX = 220  # side of the figure's block
-COLOURS = {  # apart for all eyes
-    "unchanged": "#e9ecef", "built": "#d95f02", "demolished": "#7570b3",
-    "grown_or_felled": "#1b9e77", "moved": "#e7298a", "water": "#0259cb", "ground": "#e6ab02",
-    "unknown": "#222222", "label": "#e9ecef", "changed": "#c1121f",
-    "no label else": "#adb5bd",
-}  # fmt: skip
 TOWN = {"slabs": 1.0, "lowrise": 2.0, "village": 1.5, "park": 1.0, "fields": 1.0}
 SHARES = {
     "built": {"built": 0.25},
@@ -157,16 +137,10 @@ class Case:
         for view, image in zip(VIEWS, images):
             simulate_image(city, spec, view, image, seed=self.seed)
         if self.kind in SPOILT:
-            _spoil(images, self.seed)
+            change_images(images, [noise, gain], np.random.default_rng([self.seed, 9]))
         tables = [folder / f"{name}.csv" for name in ("measured", "exact", "checkpoints")]
         simulate_points(city, spec, *tables, seed=self.seed)
-        for file in lidar_files(city, spec):
-            simulate_lidar_tile(city, spec, file, folder / file,
-                                spacing_m=self.density**-0.5, seed=self.seed)  # fmt: skip
-            if not self.classed:
-                _unclass(folder / file)
-            ingest(folder / file, folder / f"{Path(file).stem}.points")
-            (folder / file).unlink()
+        fly(city, spec, folder, self.seed, self.density**-0.5, classed=self.classed)
         rectify_by(align(*images, tables[1], provenance={}), images, folder)
 
     def made(self, folder: Path) -> Path:
@@ -181,23 +155,6 @@ class Case:
             with atomic_folder(path) as scratch:
                 self.make(scratch)
         return path
-
-
-def _unclass(file: Path) -> None:
-    points = laspy.read(file)
-    points.classification[:] = UNCLASSIFIED
-    points.write(file)
-
-
-def _spoil(images: list[Path], seed: int) -> None:
-    rng = np.random.default_rng([seed, 9])
-    for image in images:
-        with open_raster(image) as source:
-            profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
-        changed = gain(noise(pixels.astype(np.float32), rng), rng)
-        (changed,) = as_images([changed], [pixels])
-        with open_raster(image, "w", **profile, rpcs=rpcs) as target:
-            target.write(changed, 1)
 
 
 def dated_truth(case: Case, folder: Path) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
@@ -333,90 +290,20 @@ HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these 
           "within 2 σ, %"]  # fmt: skip
 
 
-def richest(changes: NDArray[np.uint8]) -> tuple[slice, slice]:
-    """The block of BLOCK_PX² that has most reasons of 150 px each, then most pixels of any."""
-    blocks = (
-        np.s_[row : row + BLOCK_PX, col : col + BLOCK_PX]
-        for row in range(40, changes.shape[0] - BLOCK_PX - 40, 20)
-        for col in range(40, changes.shape[1] - BLOCK_PX - 40, 20)
-    )
-
-    def worth(block: tuple[slice, slice]) -> tuple[int, int]:
-        counts = np.bincount(changes[block].ravel(), minlength=8)[1:7]
-        return int((counts >= 150).sum()), int(counts.sum())
-
-    return max(blocks, key=worth)
-
-
-def draw(case: Case, given: argparse.Namespace) -> None:
-    """One block in the worlds of both images and of the LiDAR, its reasons, status and labels."""
-    labelled = Labelled.of(case, given.folder)
-    layers, changes = labelled.layers, labelled.changes
-    with np.errstate(invalid="ignore"):
-        other = np.abs(changes["height"] - changes["height_other"])
-        differs = np.fmax(other, np.abs(changes["height"] - changes["height_lidar"])) > CHANGED_M
-    true = np.where(differs, changes["reason"], 0)
-    block = richest(true)
-    left, right = (require_complete(case.made(given.folder) / f"{v}.zarr")["image"] for v in VIEWS)
-    shift = round(float(np.nanmedian(layers["disparity"][block])))
-    there = slice(block[1].start - shift, block[1].stop - shift)
-    heights = changes["height_lidar"][block]
-    status = layers["status"][block]
-    meaning = np.select([is_labelled(status), status == Status.CHANGED], [0, 1], 2)
-    figure = Figure(figsize=(11.4, 8.6))
-    axes = figure.subplots(2, 3)
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.96, bottom=0.1, wspace=0.04, hspace=0.1)
-    low = float(np.nanmin(heights))
-    for axis, picture, title in (
-        (axes[0, 0], stretch(left[block]), "left image"),
-        (axes[0, 1], stretch(right[block[0], there]), "right image, the same day"),
-    ):
-        axis.imshow(picture, cmap="gray")
-        axis.set_title(title)
-    shades = axes[0, 2].imshow(heights - low, cmap="viridis")
-    scale = axes[0, 2].inset_axes((0.05, 0.06, 0.4, 0.03))
-    figure.colorbar(shades, cax=scale, orientation="horizontal")
-    scale.tick_params(colors="white", labelsize=7)
-    scale.set_title("m above the lowest", color="white", fontsize=8)
-    axes[0, 2].set_title("LiDAR, three years before")
-    names = "unchanged", *REASONS.split()[1:7], "unknown"
-    change = layers["change"][block]
-    flags(axes[1, 0], true[block], names, "true reasons (more than 1 m)")
-    flags(axes[1, 1], meaning, ("label", "changed", "no label else"), "status")
-    flags(axes[1, 2], change, names, "layer change")
-    for axis in axes.flat:
-        axis.set(xticks=[], yticks=[])
-    save_figure(given.figure, figure, dpi=80)
-
-
-def flags(axis: Axes, codes: NDArray, names: tuple[str, ...], title: str) -> None:
-    """A picture of codes that index ``names``, with those that occur beside it."""
-    axis.imshow(np.array([to_rgb(COLOURS[n]) for n in names])[codes], interpolation="nearest")
-    present = [names[k] for k in np.unique(codes)]
-    patches = [Patch(color=COLOURS[n], label=n.replace("_", " ")) for n in present]
-    axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3,
-                fontsize=9, frameon=False)  # fmt: skip
-    axis.set_title(title)
-
-
 def main() -> None:
-    """Print the table, or draw the figure."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--folder", type=Path, default=Path("results/changes"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--kinds", nargs="+", default=list(SHARES), choices=list(SHARES))
     parser.add_argument("--density", type=float, default=4.0)
     parser.add_argument("--without-classes", action="store_true", help="of the LiDAR's points")
-    parser.add_argument("--figure", type=Path, help="draw a block of the city mixed, no table")
     add_place(parser)
     given = parser.parse_args()
     twin = place_given(given)
     if given.twin and twin is None:
         return
     kinds = given.kinds if twin is None else [kind for kind in given.kinds if kind in OF_TWINS]
-    if given.figure:
-        draw(Case("mixed", CONDITIONS[0], given.seeds[0], given.density, twin=twin), given)
-        return
     print("| " + " | ".join(HEADER) + " |")
     print("|---" * len(HEADER) + "|")
     for kind in kinds:

@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from label_tables import (
+from figures import (
     DISTANCES_PX,
     NEAR_PX,
     SURFACES,
@@ -26,8 +26,7 @@ from label_tables import (
     shown,
     spread,
 )
-from labelled_block import Block
-from synthetic_pairs import CONDITIONS, Pair, fresh_pair, made_pair
+from synthetic_pairs import CONDITIONS, Block, Pair, fresh_pair, made_pair
 
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.pages.pictures import SERIES
@@ -40,7 +39,7 @@ TARGETS = {  # points/m²: visible labelled at least, hidden, off by more than 1
     0.25: (88, 0.3, 0.05),
 }
 RECIPES = ("surface", "paper")
-TABLES = ("errors", "edges", "surfaces")
+TABLES = ("errors", "edges")
 Run = tuple[str, str, str]  # scene, condition, recipe
 
 
@@ -147,16 +146,6 @@ def rings(places: dict[tuple[str, str], object]) -> list[str]:
     return list(dict.fromkeys(name for _, name in places))
 
 
-def print_surfaces(found: dict[Run, dict[float, Figures]]) -> None:
-    """Statuses of visible pixels by kind of surface."""
-    for run, by in found.items():
-        for target, figures in by.items():
-            print(f"\nStatus of visible pixels, %: {', '.join(run)}, {target:g} points/m²")
-            for name, row in figures.surfaces.items():
-                kept = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if v >= 0.005)
-                print(f"    {name}: {kept}")
-
-
 def draw(path: Path, found: dict[Run, dict[float, Figures]]) -> None:
     """Shares of visible and of hidden pixels with a label by density, for each run."""
     import matplotlib
@@ -189,7 +178,7 @@ def as_json(found: dict[Run, dict[float, Figures]]) -> list[dict]:
         {"pair": run[0], "condition": run[1], "recipe": run[2], "points/m2": target}
         | dict(zip(names, shares(figures.counts)))
         | {"hidden in the LiDAR's world, too, labelled, %": figures.hidden_in_both}
-        | {"errors": figures.errors, "surfaces": figures.surfaces}
+        | {"errors": figures.errors}
         for run, by in found.items()
         for target, figures in by.items()
     ]
@@ -216,7 +205,7 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     found = labelled(options)
     print_shares(found, options.densities)
-    for name, table in zip(TABLES, (print_errors, print_edges, print_surfaces)):
+    for name, table in zip(TABLES, (print_errors, print_edges)):
         if name in options.tables:
             table(found)
     if options.figure:

@@ -1,4 +1,4 @@
-"""Made fields of texture with changes of exact outlines, which the trees of changes are fitted to.
+"""Made images that the trees of changes are fitted to: fields of texture, and cities in 8 bits.
 
 Simulated cities and real scenes never show images without any noise, roofs of the ground's own
 brightness, huts of a few pixels or ground without texture. A field is level ground on which
@@ -6,10 +6,14 @@ rectangles stand apart from each other. Each is of one kind: new in both images 
 disparity (built), in the LiDAR alone (gone, as a building or a crown), moved up or down (raised),
 in one image alone (passing), or as it was (kept). Under two lights the right image has another
 gain, and patches of it are darker.
+
+Images of 8 bits have a tone curve, and noise whose neighbours correlate and which is five times as
+great in shadow as in the light.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +24,8 @@ from stereotruth.disparity.change_evidence import LabelledWindow
 from stereotruth.disparity.image_patches import read_patch
 from stereotruth.disparity.pair_window import PairWindow
 from stereotruth.disparity.pixel_labels import Labels
+from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.epipolar.image_noise import NoiseCurve, pair_noise
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -32,6 +38,8 @@ GROUND, TREE, ROOF = 2, 5, 6  # ASPRS
 # Share of the fields that have no texture at all, or noise alone; what share of these has changed
 BLANK, OF_BLANK = 0.15, 0.05
 TOLD = 4.0  # times the noise, a contrast that tells a new roof from new asphalt
+SHADE_DN, LIGHT_DN = 3.5, 0.7  # noise of images of 8 bits at the darkest and at the brightest
+BLUR_PX = 0.55  # of that noise: neighbours correlate by 0.4
 BLEEDS = 0.3, 0.03  # what the optics bring over from a roof to the pixels beside it, by turns
 
 
@@ -202,3 +210,30 @@ def _other_light(image: Floats, rng: np.random.Generator) -> None:
         rows, cols = rng.integers(8, 60, 2)
         top, first = (rng.integers(0, len(image) - size) for size in (rows, cols))
         image[top : top + rows, first : first + cols] *= rng.uniform(0.2, 0.7)
+
+
+def toned(image: NDArray[np.floating], seed: int) -> NDArray[np.float32]:
+    """An image of 8 bits; 0 stays 0."""
+    known = image > 0
+    low, high = np.quantile(image[known], [0.001, 0.995])
+    grey = 20.0 + 230.0 * np.sqrt(np.clip((image - low) / (high - low), 0.0, 1.0))
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=image.shape), BLUR_PX)
+    sigma = SHADE_DN * (LIGHT_DN / SHADE_DN) ** ((grey - 20.0) / 230.0)
+    noisy = np.clip(np.rint(grey + sigma * noise / noise.std()), 1, 255)
+    return np.where(known, noisy, 0).astype(np.float32)
+
+
+def in_eight_bits(
+    inputs: SceneInputs, window: PairWindow
+) -> tuple[PairWindow, tuple[NoiseCurve, NoiseCurve]]:
+    """A window with such images in place of its own, and their noise."""
+    images = [toned(image[:, :].astype(float), n) for n, image in enumerate(inputs.pair.images)]
+    patches = []
+    for patch, image in zip((window.left, window.right), images):
+        pixels = np.zeros_like(patch.pixels)
+        top, side = max(patch.row, 0), max(patch.col, 0)
+        here = image[top : patch.row + pixels.shape[0], side : patch.col + pixels.shape[1]]
+        pixels[top - patch.row :, side - patch.col :][: here.shape[0], : here.shape[1]] = here
+        patches.append(replace(patch, pixels=pixels))
+    window = replace(window, left=patches[0], right=patches[1])
+    return window, pair_noise(*images, inputs.pair.model)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import spearmanr
-from site_alignment import make_points
+from synthetic_pairs import fly
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.image_reader import open_pair
@@ -85,7 +85,8 @@ def rows_of(number: int, images: int, side_px: int) -> list[dict]:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        rough = {"roughness": roughness_m(open_stores(make_points(site, folder, SPACING_M, SEED)))}
+        stores = open_stores(fly(site.city, site.area, folder, SEED, SPACING_M))
+        rough = {"roughness": roughness_m(stores)}
         opened = {image.name: exact_image(site, image.name, folder) for image in site.images}
         for pair in pairs_of_site(list(opened.values())):
             if pair.convergence < 1.5:

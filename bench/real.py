@@ -7,8 +7,7 @@ The site's folder has images (`images.tsv`, or `left.tif` and `right.tif`), LiDA
 `lidar/`, and, where there are such, `gcps.csv`, `checkpoints_<image>_<image>.csv` or
 `checkpoints.csv` (positions in both images) and `rpc_ba/<image>_ba.json` (RPCs by an independent
 bundle adjustment). Labels are made by the workflow in a project of the bench's own; a run that was
-stopped is carried on. A folder that is absent is skipped with a reason. See README.md beside this
-file.
+stopped is carried on. A folder that is absent is skipped with a reason.
 """
 
 from __future__ import annotations
@@ -27,10 +26,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from accuracy import print_table
-from checkpoints import check_point_errors
+from figures import check_point_errors, draw_panels, print_records
 from numpy.typing import NDArray
-from warped_panels import draw_panels
 
 from stereotruth.alignment.control_points import ControlPoints
 from stereotruth.config.labels import LabelSettings
@@ -385,9 +382,9 @@ def main() -> None:
     found = [Pair(site, name) for name in pairs]
     figures = [pair.figures() for pair in found]
     rows = [{HEADER[name]: _cell(name, of.get(name)) for name in HEADER} for of in figures]
-    print_table(str(given.site), rows)
+    print_records(str(given.site), rows)
     for pair in found:
-        print_table(f"{pair.name}, by grey value of the darker image", list(pair.by_brightness()))
+        print_records(f"{pair.name}, by grey value of the darker image", list(pair.by_brightness()))
         if given.panels:
             pair.draw(given.panels)
     if given.json:

@@ -19,7 +19,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from throughput import decode, fastest
+from kernel_rates import fastest
+from throughput import decode
 
 from stereotruth.command import example_city
 from stereotruth.command.new_project import begin

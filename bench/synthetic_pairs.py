@@ -1,7 +1,8 @@
-"""Synthetic pairs that benchmarks label: made anew, or as the workflow left them; under conditions.
+"""Synthetic pairs that benchmarks label, made anew or by the workflow, and blocks of them.
 
-A condition says how the pair was imaged and aligned: with exact control points, with noise in its
-images, with nothing that refines it. Everything is made once, and found again by its folder.
+A condition says how a pair was imaged and aligned: with exact control points, with noise in its
+images, with nothing that refines it. A block is labelled with its points thinned to any density,
+and has its exact truth. Everything is made once, and found again by its folder.
 """
 
 from __future__ import annotations
@@ -9,9 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
+import laspy
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from stereotruth.alignment.adjustment import epipolar_model
@@ -20,14 +24,19 @@ from stereotruth.alignment.aligned_pair import Alignment
 from stereotruth.alignment.refine import refine
 from stereotruth.config.configuration import Configuration
 from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
+from stereotruth.disparity.project import MAX_POINTS, SHARD, project_scene
+from stereotruth.disparity.recipe import label_window
 from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.epipolar.image_reader import open_pair
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.evaluation.epipolar_truth import truth_window
+from stereotruth.evaluation.labels_against_truth import Truth
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.matching.image_faults import as_images, smooth
+from stereotruth.numerics.degrees import DEGREE_M
 from stereotruth.products.files import atomic_folder
 from stereotruth.products.provenance import source_digest
 from stereotruth.products.ungeoreferenced import open_raster
@@ -51,6 +60,7 @@ NOISE_DN = 20.0
 GAIN = 0.05
 GAIN_PX = 128  # how wide the features of the gain field are
 HOUR_DEG = 15.0
+UNCLASSIFIED = 1  # ASPRS
 
 Image = NDArray[np.float32]
 Change = Callable[[Image, np.random.Generator], Image]
@@ -65,6 +75,60 @@ def gain(image: Image, rng: np.random.Generator) -> Image:
     """A smooth random field of factors whose standard deviation is GAIN."""
     field = smooth(image.shape, GAIN_PX, rng)
     return image * (1 + GAIN * (field - field.mean()) / field.std())
+
+
+def change_images(
+    images: Sequence[Path],
+    changes: Sequence[Change],
+    rng: np.random.Generator,
+    folder: Path | None = None,
+) -> list[Path]:
+    """Change the pixels of images, in place or in copies of the same names in a folder."""
+    made = [image if folder is None else folder / image.name for image in images]
+    for image, out in zip(images, made):
+        with open_raster(image) as source:
+            profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
+        changed = pixels.astype(np.float32)
+        for change in changes:
+            changed = change(changed, rng)
+        (changed,) = as_images([changed], [pixels])
+        with open_raster(out, "w", **profile, rpcs=rpcs) as target:
+            target.write(changed, 1)
+    return made
+
+
+def fly(
+    city: CitySpec,
+    scene: SceneSpec,
+    folder: Path,
+    seed: int,
+    spacing_m: float | None = None,
+    *,
+    classed: bool = True,
+) -> list[Path]:
+    """Point stores of a scene's LiDAR in a folder; ``spacing_m`` None: by the city's strips."""
+    spacing = {} if spacing_m is None else {"spacing_m": spacing_m}
+    stores = []
+    for name in lidar_files(city, scene):
+        file = folder / name
+        simulate_lidar_tile(city, scene, name, file, **spacing, seed=seed)
+        if not classed:
+            points = laspy.read(file)
+            points.classification[:] = UNCLASSIFIED
+            points.write(file)
+        stores.append(file.with_suffix(".points"))
+        ingest(file, stores[-1])
+        file.unlink()
+    return stores
+
+
+def far_apart(at: NDArray[np.float64], count: int) -> list[int]:
+    """Indices of ``count`` places [n, 2], each as far as can be from those before."""
+    chosen = [int(np.argmin(at.sum(axis=1)))]
+    while len(chosen) < min(count, len(at)):
+        away = np.min([np.hypot(*(at - at[k]).T) for k in chosen], axis=0)
+        chosen.append(int(np.argmax(away)))
+    return sorted(chosen)
 
 
 def sun_an_hour_later(city: CitySpec) -> tuple[float, float]:
@@ -112,13 +176,7 @@ class Condition:
         if self.change is None:
             return images
         rng = np.random.default_rng([SEED, pair.spec.pose_seed])
-        for image in images:
-            with open_raster(image) as source:
-                profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
-            (changed,) = as_images([self.change(pixels.astype(np.float32), rng)], [pixels])
-            with open_raster(folder / image.name, "w", **profile, rpcs=rpcs) as target:
-                target.write(changed, 1)
-        return [folder / image.name for image in images]
+        return change_images(images, [self.change], rng, folder)
 
 
 def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], folder: Path) -> None:
@@ -247,14 +305,129 @@ def fresh_pair(number: int, folder: Path) -> Pair:
         with atomic_folder(pair.data) as data:
             for view in VIEWS:
                 simulate_image(city, pair.spec, view, data / f"{view}.tif", seed=SEED)
-            for file in lidar_files(city, pair.spec):
-                simulate_lidar_tile(
-                    city, pair.spec, file, data / "lidar" / file, spacing_m=SPACING_M, seed=SEED
-                )
     stores = pair.results / "ingest" / name / name
     if not stores.is_dir():
         with atomic_folder(stores) as scratch:
-            for file in lidar_files(city, pair.spec):
-                store = scratch / f"{Path(file).stem}.points"
-                ingest(pair.data / "lidar" / file, store)
+            fly(city, pair.spec, scratch, SEED, SPACING_M)
     return pair
+
+
+class Thinned(PointStore):
+    """A point store of which a share of the pulses is seen, drawn by their place."""
+
+    def __init__(self, path: Path, share: float) -> None:
+        super().__init__(path)
+        self.share = share
+        self.count = int(self.count * share)
+
+    @property
+    def square_counts(self) -> NDArray[np.float64]:
+        return super().square_counts * self.share
+
+    def query(self, *box: float) -> Points:
+        points = super().query(*box)
+        if self.share >= 1.0:
+            return points
+        mixed = points.lon_q.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= points.lat_q.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
+        mixed ^= mixed >> np.uint64(29)
+        mixed *= np.uint64(0xBF58476D1CE4E5B9)
+        mixed ^= mixed >> np.uint64(32)
+        kept = mixed < np.uint64(self.share * 2.0**64)
+        return Points(*(getattr(points, name)[kept] for name in points.__dataclass_fields__))
+
+
+def density(store: PointStore) -> float:
+    """First returns per m² in the hectare in the middle."""
+    box = store.bounds
+    middle = [(box[k] + box[k + 2]) / 2 for k in (0, 1)]
+    half = 50.0 / DEGREE_M
+    wide = half / np.cos(np.radians(middle[1]))
+    found = store.query(middle[0] - wide, middle[1] - half, middle[0] + wide, middle[1] + half)
+    return float((found.return_number <= 1).sum()) / 100.0**2
+
+
+@dataclass
+class Block:
+    """A block [rows, cols] of the grid of a pair that was rectified into a folder."""
+
+    pair: Pair
+    rectified: Path
+    rows: slice
+    cols: slice
+    view: str = "left"
+
+    @cached_property
+    def density(self) -> float:
+        """First returns per m² of all points: of the fullest store's, since water returns few."""
+        return max(density(PointStore(path)) for path in self.pair.points)
+
+    @cached_property
+    def _layers(self) -> dict[str, NDArray]:
+        """The exact truth, by rays through the pixels."""
+        model = EpipolarModel.load(self.rectified / "epipolar.json")
+        pair = self.pair
+        return truth_window(model, pair.city, pair.spec, self.rows, self.cols, self.view)
+
+    @cached_property
+    def truth(self) -> Truth:
+        """The exact truth of the block."""
+        layers = xr.Dataset({name: (("y", "x"), array) for name, array in self._layers.items()})
+        return Truth.read(layers, *(slice(0, side) for side in self.surface.shape))
+
+    @property
+    def surface(self) -> NDArray[np.uint8]:
+        """Kind of surface of each pixel, at edges too; index into the truth's SURFACES."""
+        return self._layers["surface"]
+
+    @property
+    def megapixels(self) -> float:
+        """Its size."""
+        return self.surface.size / 1e6
+
+    def job(self, points_per_m2: float | None, recipe: str = "surface") -> SceneInputs:
+        """What labels the block; ``points_per_m2`` None, or more than there are: all points."""
+        settings = LabelSettings(recipe=recipe)
+        images = (self.rectified / f"{view}.zarr" for view in ("left", "right"))
+        alignment = self.pair.alignment(self.rectified)
+        job = SceneInputs(*images, tuple(self.pair.points), settings, self.view, alignment)
+        share = min((points_per_m2 or self.density) / self.density, 1.0)
+        stores = tuple(Thinned(path, share) for path in self.pair.points)
+        job.__dict__["stores"] = stores  # the surface is made of these
+        job = job.with_surface(self.rectified / f"surface_{share:.9f}", workers=2)
+        job.__dict__["stores"] = stores  # and so are the labels: a copy has opened none
+        return job
+
+    def compile(self, job: SceneInputs) -> None:
+        """Label a corner, so that what follows is compiled."""
+        label_window(job, *(slice(edge.start, edge.start + 32) for edge in (self.rows, self.cols)))
+
+    def labels(self, job: SceneInputs) -> dict[str, NDArray]:
+        """The layers of the block, put together from its windows."""
+        out: dict[str, NDArray] = {}
+        for rows, seen in self.windows(job):
+            found = label_window(job, rows, seen)
+            if found is None:
+                continue
+            cols = job.pair.cols(seen)
+            for name, part in job.pair.arrays(found[0]).items():
+                nothing = np.nan if part.dtype.kind == "f" else 0
+                whole = out.setdefault(name, np.full(self.surface.shape, nothing, part.dtype))
+                whole[
+                    rows.start - self.rows.start : rows.stop - self.rows.start,
+                    cols.start - self.cols.start : cols.stop - self.cols.start,
+                ] = part
+        return out
+
+    def windows(self, job: SceneInputs) -> list[tuple[slice, slice]]:
+        """Of the blocks of stage project, as far as they lie in this one, as the pair sees them."""
+        return [
+            window
+            for r in range(self.rows.start, self.rows.stop, SHARD)
+            for c in range(self.cols.start, self.cols.stop, SHARD)
+            for window in job.windows.parts(
+                slice(r, min(r + SHARD, self.rows.stop)),
+                job.pair.cols(slice(c, min(c + SHARD, self.cols.stop))),
+                MAX_POINTS,
+            )
+        ]

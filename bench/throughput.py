@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import cProfile
-import importlib.util
 import json
 import logging
 import math
@@ -25,42 +24,28 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import cv2
 import laspy
-import numpy as np
-import pyproj
-import rasterio
-from rasterio.transform import RPCTransformer
+from figures import print_records
+from kernel_rates import CITY, fastest, kernels, show_kernels
 
 import stereotruth
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align
 from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.image_patches import read_patch
-from stereotruth.disparity.paper_correlation import correlate
-from stereotruth.disparity.pixel_points import Collection
 from stereotruth.disparity.project import project_scene
 from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.epipolar.image_reader import Source, open_pair
-from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.epipolar.rectify import rectify, rectify_image
-from stereotruth.epipolar.rpc import RPC, SensorModel
-from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.epipolar.image_reader import open_pair
+from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import Points, PointStore
-from stereotruth.lidar.smooth_maps import PatchedTransform
-from stereotruth.products.grids import Layer, require_complete
 from stereotruth.products.provenance import source_digest
-from stereotruth.products.resumable_grids import resumable_grid
 from stereotruth.simulate.cities import CITIES, lidar_files
 from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(stereotruth.__file__).parent
-CITY, SCENE = "Qichun", "Qichun-1"
+SCENE = f"{CITY}-1"
 POINTS_AT_25_CM = 82.6  # million, of this scene
-BLOCK = 1 << 16
 INGEST_JOB = """
 import sys
 from stereotruth.job import job
@@ -83,47 +68,6 @@ with job(log, "project"):
     inputs = inputs.with_surface(os.path.dirname(out), json.loads(options).get("workers", 1))
     project_scene(inputs, out, **json.loads(options))
 """
-BOUNDS = {  # part of a profile: what its time goes into
-    "laspy": "arithmetic decoding, bit by bit: the floor",
-    "to_wgs84": "two passes over 6 arrays: memory",
-    "cell_sort": "scattered writes of the sort: cache misses",
-    "point_store": "one pass over memory",
-    "zarr": "LZ4 and three copies in Zarr",
-    "smooth_maps": "27 or 80 multiplications and additions a point in vectors: memory, arithmetic",
-    "pixel_points": "scattered writes of the sort: cache misses",
-    "vertices": "scattered updates of the cells",
-    "delaunay": "exact tests and cache misses, a vertex at a time",
-    "facets": "passes over all triangles: memory",
-    "step_points": "points on both sides of each edge",
-    "breaklines": "half-planes of the points on both sides of each edge",
-    "raster": "triangles drawn into both views",
-    "pixel_labels": "exact sums by pixel: one pass over the points",
-    "change_evidence": "windows of pixels, not of points",
-    "paper_correlation": "200 samples a point in vectors: arithmetic",
-}
-
-
-def print_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
-    """A table of text cells, columns as wide as needed."""
-    columns = list(rows[0])
-    width = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
-    print(f"\n{title}")
-    print("  ".join(f"{c:<{width[c]}}" for c in columns).rstrip())
-    for row in rows:
-        print("  ".join(f"{row[c]:<{width[c]}}" for c in columns).rstrip())
-
-
-def fastest(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """Seconds on the clock and of CPU (all threads and child processes), the least of the calls."""
-    best = math.inf, math.inf
-    for _ in range(repeats):
-        clock, cpu = time.perf_counter(), sum(os.times()[2:4]) + time.process_time()
-        call()
-        clock = time.perf_counter() - clock
-        cpu = sum(os.times()[2:4]) + time.process_time() - cpu
-        best = min(best[0], clock), min(best[1], cpu)
-    return best
-
 
 # ------------------------------------------------------------------ data
 
@@ -365,7 +309,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
 def show_chain(report: Mapping[str, Any]) -> None:
     count, seconds, cpu = (report[name] for name in ("points", "seconds", "cpu_seconds"))
     whole = [name for name in seconds if name != "T0"]
-    print_table(  # the CPU's time tells more than the clock where the machine is shared
+    print_records(  # the CPU's time tells more than the clock where the machine is shared
         f"{count / 1e6:.1f} M points in {report['files']} files "
         f"({report['store_bytes_per_point']:.2f} bytes a point in the stores)",
         [
@@ -389,311 +333,25 @@ def show_chain(report: Mapping[str, Any]) -> None:
     print(f"start-up of a job, in each of {jobs}: {report['start_up_s']:.2f} s of CPU")
     for stage, profile in report["profiles"].items():
         whole = sum(profile["ns_per_point"].values())
-        print_table(
+        print_records(
             f"{stage}: CPU time of one core, {whole:.0f} ns a point",
             [
                 {
                     "part": part,
                     "ns / point": f"{value:.1f}",
                     "share": f"{100 * value / whole:.1f} %",
-                    "bound": BOUNDS.get(part, ""),
                 }
                 for part, value in sorted(profile["ns_per_point"].items(), key=lambda p: -p[1])
                 if value > 0.005 * whole
             ],
         )
-        print_table(
+        print_records(
             f"{stage}: functions",
             [
                 {"function": name, "ns / point": f"{value:.1f}"}
                 for name, value in profile["functions_ns"].items()
             ],
         )
-
-
-# ------------------------------------------------------------------ kernels
-
-
-def plain_projection(rpc: RPC, lon, lat, height) -> np.ndarray:
-    """(col, row) [2, n] by RPC00B as it is written, in NumPy."""
-    x = (lon - rpc.long_off) / rpc.long_scale
-    y = (lat - rpc.lat_off) / rpc.lat_scale
-    z = (height - rpc.height_off) / rpc.height_scale
-    terms = [1, x, y, z, x * y, x * z, y * z, x**2, y**2, z**2, x * y * z, x**3, x * y**2]
-    terms += [x * z**2, x**2 * y, y**3, y * z**2, x**2 * z, y**2 * z, z**3]
-
-    def ratio(name: str) -> np.ndarray:
-        top, bottom = (
-            sum(c * t for c, t in zip(getattr(rpc, f"{name}_{part}_coeff"), terms))
-            for part in ("num", "den")
-        )
-        return top / bottom * getattr(rpc, f"{name}_scale") + getattr(rpc, f"{name}_off")
-
-    return np.stack([ratio("samp"), ratio("line")])
-
-
-def plain_splines(image: Mapping[str, Any], col: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """(x, y) [2, n] by the formula that a stored model holds, inside of the splines' domain."""
-    n, box = image["n"], image["spline_domain"]
-    s = (col - box["col_min"]) / (box["col_max"] - box["col_min"]) * (n - 3)
-    t = (row - box["row_min"]) / (box["row_max"] - box["row_min"]) * (n - 3)
-    i, j = (np.minimum(np.floor(v).astype(int), n - 4) for v in (s, t))
-
-    def weights(f: np.ndarray) -> list[np.ndarray]:
-        middle = (3 * f**3 - 6 * f**2 + 4) / 6, (-3 * f**3 + 3 * f**2 + 3 * f + 1) / 6
-        return [(1 - f) ** 3 / 6, *middle, f**3 / 6]
-
-    w, v = weights(s - i), weights(t - j)
-    result = []
-    for axis in ("x", "y"):
-        a = image[f"{axis}_affine"]
-        value = a[0] * col + a[1] * row + a[2]
-        if image[f"{axis}_spline"] is not None:
-            c = np.array(image[f"{axis}_spline"])
-            value = value + sum(v[b] * w[k] * c[j + b, i + k] for b in range(4) for k in range(4))
-        result.append(value)
-    return np.stack(result)
-
-
-def ground_points(folder: Path, wanted: int) -> Points:
-    store = PointStore(max((folder / "points").glob("*.points"), key=lambda s: PointStore(s).count))
-    points = store.query(*store.bounds[:4])
-    return Points(*(getattr(points, name)[:wanted] for name in Points.__dataclass_fields__))
-
-
-def in_threads(call: Callable[[slice], Any], total: int, threads: int) -> None:
-    """Call for blocks of 65536, as the stages do it."""
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(call, [slice(k, min(k + BLOCK, total)) for k in range(0, total, BLOCK)]):
-            pass
-
-
-def geometry(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rates (points/s) of projections, and how far they are from the plain formula."""
-    folder, repeats = arguments.folder, max(arguments.repeats, 3)
-    points = ground_points(folder, 4_000_000)
-    lon, lat, height = points.lon, points.lat, points.height
-    model = EpipolarModel.load(folder / "epipolar.json")
-    rows = []
-
-    def row(
-        name: str, seconds: tuple[float, float], count: int, difference: float, unit: str
-    ) -> None:
-        rows.append(
-            {
-                "what": name,
-                "per_s": count / seconds[0],
-                "per_cpu_s": count / seconds[1],
-                "difference": difference,
-                "unit": unit,
-            }
-        )
-
-    some = slice(0, 200_000)
-    few = lon[some], lat[some], height[some]
-    stored = model.to_dict()
-    expected = []
-    for side, sensor in (("left", model.left), ("right", model.right)):
-        col, line = sensor.affine[:, :2] @ plain_projection(sensor.rpc, *few)
-        place = col + sensor.affine[0, 2], line + sensor.affine[1, 2]
-        expected.append(plain_splines(stored[f"{side}_to_epipolar"], *place))
-    expected = np.concatenate(expected)
-    worst = float(np.abs(model.ground_to_epipolar(*few) - expected).max())
-    for threads in sorted({1, arguments.workers}):
-        seconds = fastest(
-            lambda threads=threads: in_threads(
-                lambda part: model.ground_to_epipolar(lon[part], lat[part], height[part]),
-                lon.size,
-                threads,
-            ),
-            repeats,
-        )
-        name = f"ground to epipolar coordinates of both images, {threads} threads"
-        row(name, seconds, lon.size, worst, "px")
-
-    image = folder / "left.tif"
-    rpc = read_rpc(image)
-    expected = plain_projection(rpc, *few)
-    seconds = fastest(lambda: plain_projection(rpc, *few), repeats)
-    row("ground to one image, NumPy as written", seconds, few[0].size, 0.0, "px")
-    sensor = SensorModel(rpc)
-    worst = float(np.abs(np.stack(sensor.project(*few)) - expected).max())
-    seconds = fastest(
-        lambda: in_threads(
-            lambda part: sensor.project(lon[part], lat[part], height[part]), lon.size, 1
-        ),
-        repeats,
-    )
-    row("ground to one image, stereotruth", seconds, lon.size, worst, "px")
-    if importlib.util.find_spec("shareloc"):
-        from shareloc.geomodels import GeoModel
-
-        shareloc = GeoModel(str(image), "RPC")
-        theirs = shareloc.inverse_loc(*few)
-        worst = float(np.abs(np.stack([theirs[1], theirs[0]]) - 0.5 - expected).max())
-        seconds = fastest(lambda: shareloc.inverse_loc(*few), repeats)
-        row("ground to one image, shareloc", seconds, few[0].size, worst, "px")
-    if importlib.util.find_spec("rpcm"):
-        from rpcm import rpc_from_geotiff
-
-        rpcm = rpc_from_geotiff(str(image))
-        worst = float(np.abs(np.stack(rpcm.projection(*few)) - expected).max())
-        seconds = fastest(lambda: rpcm.projection(*few), repeats)
-        row("ground to one image, rpcm", seconds, few[0].size, worst, "px")
-    with rasterio.open(image) as dataset, RPCTransformer(dataset.rpcs) as gdal:
-        line, col = gdal.rowcol(*few, op=float)
-        worst = float(np.abs(np.stack([col, line]) - 0.5 - expected).max())
-        seconds = fastest(lambda: gdal.rowcol(*few, op=float), repeats)
-        row("ground to one image, GDAL", seconds, few[0].size, worst, "px")
-
-    code = CITIES[CITY].epsg
-    to_map = pyproj.Transformer.from_crs("EPSG:4979", f"EPSG:{code}", always_xy=True)
-    source = pyproj.CRS(code).to_3d()
-    exact = pyproj.Transformer.from_crs(source, "EPSG:4979", always_xy=True)
-    east, north = to_map.transform(*few[:2])
-    patches = PatchedTransform(exact.transform, 1.0)
-    got, truth = patches(east, north, few[2]), exact.transform(east, north, few[2])
-    worst = float(np.abs(np.subtract(got, truth)[:2]).max())
-    seconds = fastest(lambda: patches(east, north, few[2]), repeats)
-    row("UTM to WGS 84, stereotruth", seconds, east.size, worst, "degree")
-    seconds = fastest(lambda: exact.transform(east, north, few[2]), repeats)
-    row("UTM to WGS 84, pyproj", seconds, east.size, 0.0, "degree")
-    return rows
-
-
-def correlation(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rates (points/s) of the paper's filter, on windows as the stage has them."""
-    folder = arguments.folder
-    points = ground_points(folder, 6_000_000)
-    model = EpipolarModel.load(folder / "epipolar.json")
-    xy = model.ground_to_epipolar(points.lon, points.lat, points.height)
-    images = [require_complete(folder / f"{view}.zarr")["image"] for view in ("left", "right")]
-    x, y = (int(np.median(values)) - 512 for values in xy[:2])
-    windows = []
-    for part in range(2):
-        cols, rows = slice(x, x + 1024), slice(y + 512 * part, y + 512 * (part + 1))
-        inside = (xy[0] > cols.start) & (xy[0] < cols.stop - 1)
-        inside &= (xy[1] > rows.start) & (xy[1] < rows.stop - 1)
-        across = xy[2, inside]
-        reach = slice(int(across.min()) - 1, int(across.max()) + 2)
-        patches = [read_patch(image, rows, c, 9) for image, c in zip(images, (cols, reach))]
-        origin = int(points.lon_q.min()), int(points.lat_q.min())
-        collection = Collection((512, 1024), (rows.start, cols.start), origin, *patches)
-        names = "lon_q", "lat_q", "h_q", "classification"
-        attributes = [getattr(points, name)[inside] for name in names]
-        day = np.zeros_like(attributes[-1])
-        collection.add(*attributes, day, np.ascontiguousarray(xy[:, inside]))
-        found = collection.sorted()
-        windows.append((found, np.ones(found.points.size, np.bool_), *patches, 9))
-    count = sum(window[1].size for window in windows)
-    rows = []
-    for threads in (1, 2)[: arguments.workers]:
-        with ThreadPoolExecutor(threads) as pool:
-            clock, cpu = fastest(
-                lambda pool=pool: list(pool.map(lambda window: correlate(*window), windows)),
-                max(arguments.repeats, 2),
-            )
-        density = count / (1024 * 1024)
-        name = f"correlation filter, window 9, {density:.1f} points a pixel, {threads} threads"
-        rows.append({"what": name, "per_s": count / clock, "per_cpu_s": count / cpu})
-    return rows
-
-
-class InMemory:
-    """What rectification reads of a source, without decoding, and what it writes, thrown away."""
-
-    def __init__(self, source: Source) -> None:
-        self.path, self.size, self.nodata, self.gain = source.path, source.size, 0.0, 1.0
-        self.colour, self.band_count = (), 1
-        self.pixels = source.read(0, 0, *source.size)
-        self.valid: list[int] = []
-
-    def read_layers(
-        self, col: int, row: int, cols: int, rows: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        layers = self.pixels[None, row : row + rows, col : col + cols].copy()
-        return layers, np.zeros((rows, cols), np.bool_)
-
-    def missing(self, blocks: Sequence[Any], *_: object) -> list[int]:
-        return list(range(len(blocks)))
-
-    def write(self, *told: Any) -> None:
-        self.valid.append(told[-1])
-
-    def results(self, _: object) -> list[int]:
-        return self.valid
-
-
-def rectification(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rates (px/s) of rectification and of cv2.remap with the maps given."""
-    folder, repeats = arguments.folder, max(arguments.repeats, 3)
-    model = EpipolarModel.load(folder / "epipolar.json")
-    y, x = np.mgrid[: model.shape[0], : model.shape[1]].astype(np.float64)
-    col, line = (v.astype(np.float32) for v in model.epipolar_to_left(x, y))
-    layers = {"image": Layer("uint16", 0)}
-
-    def ours(source: Source, threads: int) -> None:
-        store = folder / "remap" / "left.zarr"
-        with resumable_grid(store, model.shape, layers, chunk=256, shard=1024) as target:
-            key = str(time.perf_counter_ns())  # nothing of an earlier call is taken over
-            rectify_image(source, model.left_image, target, model.shape, key=key, workers=threads)
-
-    rows = []
-    with Source(folder / "left.tif") as source:
-        memory = InMemory(source)
-        pixels = memory.pixels
-        for threads in sorted({1, arguments.workers}):
-            cv2.setNumThreads(threads)
-            flags = {"remap, bicubic": cv2.INTER_CUBIC, "remap, Lanczos": cv2.INTER_LANCZOS4}
-            calls = {
-                name: lambda flag=flag: cv2.remap(
-                    pixels, col, line, flag, borderMode=cv2.BORDER_CONSTANT
-                )
-                for name, flag in flags.items()
-            }
-            calls["stereotruth"] = lambda threads=threads: rectify_image(
-                memory, model.left_image, memory, model.shape, key="", workers=threads
-            )
-            calls["stereotruth, file to store"] = lambda threads=threads: ours(source, threads)
-            for name, call in calls.items():
-                clock, cpu = fastest(call, repeats)
-                row = {"what": name, "threads": threads}
-                rows.append(row | {"per_s": x.size / clock, "per_cpu_s": x.size / cpu})
-    cv2.setNumThreads(1)
-    shutil.rmtree(folder / "remap")
-    return rows
-
-
-def rates(row: Mapping[str, Any], what: str) -> dict[str, str]:
-    return {
-        "": row["what"],
-        f"M {what}/s": f"{row['per_s'] / 1e6:.2f}",
-        f"M {what} per CPU s": f"{row['per_cpu_s'] / 1e6:.2f}",
-    }
-
-
-def show_kernels(report: Mapping[str, Any]) -> None:
-    print_table(
-        "geometry: rates, and greatest difference from the plain formula or PROJ",
-        [
-            rates(row, "points") | {"difference": f"{row['difference']:.1e} {row['unit']}"}
-            for row in report["geometry"]
-        ],
-    )
-    print_table("the paper's filter", [rates(row, "points") for row in report["correlation"]])
-    ours = {r["threads"]: r for r in report["rectification"] if r["what"] == "stereotruth"}
-    print_table(
-        "rectification, and cv2.remap with the maps given, in memory",
-        [
-            rates(row, "px")
-            | {
-                "threads": str(row["threads"]),
-                "stereotruth / this": f"{ours[row['threads']]['per_s'] / row['per_s']:.2f}",
-                "by CPU": f"{ours[row['threads']]['per_cpu_s'] / row['per_cpu_s']:.2f}",
-            }
-            for row in report["rectification"]
-        ],
-    )
 
 
 # ------------------------------------------------------------------ the command
@@ -729,11 +387,7 @@ def main() -> int:
     if not arguments.kernels:
         report["chain"] = chain(arguments, settings)
         show_chain(report["chain"])
-    report |= {
-        "geometry": geometry(arguments),
-        "correlation": correlation(arguments),
-        "rectification": rectification(arguments),
-    }
+    report |= kernels(arguments)
     show_kernels(report)
     if arguments.json:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)

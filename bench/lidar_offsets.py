@@ -1,15 +1,20 @@
-"""Places and heights of scenes whose LiDAR is in a national frame and whose GCPs are in ITRF.
+"""LiDAR that does not lie where images do: strips that disagree, and national frames.
 
-One small synthetic scene for each country goes through the whole workflow twice: with its LiDAR in
-WGS 84, which is taken as ITRF at the date of the images, and with the same points in the national
-frame, where PROJ's time-dependent operations (written out from EPSG's parameters) put them at that
-date. Both must make the same place and height of a point, and of a pixel of the original image.
+``strips``: cities are drawn, flown in four strips that are off by centimetres in height and
+decimetres in plan, labelled as they are (``named``) and with the points moved (``adjusted``), and
+compared with their exact truth. ``frames``: one small synthetic scene for each country goes through
+the whole workflow twice: with its LiDAR in WGS 84, which is taken as ITRF at the date of the
+images, and with the same points in the national frame, where PROJ's time-dependent operations
+(written out from EPSG's parameters) put them at that date. Both must make the same place and height
+of a point, and of a pixel of the original image. See README.md beside this file.
 
-python bench/frames.py FOLDER [COUNTRY …]
+python bench/lidar_offsets.py strips --cities 2 3
+python bench/lidar_offsets.py frames Usa France
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import shutil
 import subprocess
@@ -24,20 +29,114 @@ import pyproj
 import yaml
 import zarr
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+from synthetic_pairs import SEED, VIEWS, fly, label_by
 
+from stereotruth.alignment.align import align
+from stereotruth.alignment.refine import refine
 from stereotruth.command.example_city import DEMO
+from stereotruth.config.labels import LabelSettings
 from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.evaluation.epipolar_truth import write_grid_truth
 from stereotruth.lidar.frames import Epoch, Epochs
+from stereotruth.lidar.point_store import PointStore
+from stereotruth.lidar.strip_comparison import compare_strips
+from stereotruth.lidar.strip_moves import move_strips
 from stereotruth.lidar.to_wgs84 import to_wgs84
 from stereotruth.numerics.degrees import metres_per_degree
 from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.cities import SceneSpec
+from stereotruth.simulate.cities import (
+    CitySpec,
+    FlightStrip,
+    Jitter,
+    SceneSpec,
+    ViewSpec,
+    training_city,
+)
+from stereotruth.simulate.control_points import simulate_points
+from stereotruth.simulate.render import simulate_image
+
+OFFSETS_M = (0.31, 0.0, 0.07), (-0.2, 0.25, -0.06), (0.1, -0.33, 0.09), (-0.25, -0.15, -0.08)
+DENSITIES = 10.6, 2.6, 5.0, 4.0  # points/m²
+EDGE_PX = 4  # from edges of truth: ground beyond is judged
+GROUND = 1
+
+
+def drawn_strips(number: int, side_px: int, jitter_px: float) -> CitySpec:
+    """A city of one scene, flown in strips, whose images may jitter."""
+    city = training_city(number, SEED, side_px)
+    scene = replace(city.scenes[0], name="Strips", lidar_grid=(1, 2))
+    strips = tuple(FlightStrip(o, d**-0.5) for o, d in zip(OFFSETS_M, DENSITIES))
+    view = ViewSpec(jitter=Jitter(jitter_px)) if jitter_px else ViewSpec()
+    return replace(city, name="Strips", scenes=(scene,), strips=strips, left=view, right=view)
+
+
+def make_strips(city: CitySpec, folder: Path) -> tuple[list[Path], list[Path]]:
+    """Images and point stores of a city, and its control points, in a folder."""
+    scene = city.scenes[0]
+    images = [folder / f"{view}.tif" for view in VIEWS]
+    for view, image in zip(VIEWS, images):
+        simulate_image(city, scene, view, image, seed=SEED)
+    tables = (folder / f"{name}.csv" for name in ("gcps", "gcps_exact", "checkpoints"))
+    simulate_points(city, scene, *tables, seed=SEED)
+    (folder / "named").mkdir(exist_ok=True)
+    stores = fly(city, scene, folder / "named", SEED)
+    return images, stores
+
+
+def judge(folder: Path) -> dict[str, float]:
+    """Errors (px) of the labels of ground beyond EDGE_PX of edges, and shares within 1 and 2 σ."""
+    made, truth = zarr.open(folder / "disparity.zarr"), zarr.open(folder / "truth.zarr")
+    error = made["disparity"][:] - truth["disparity"][:]
+    sigma = made["uncertainty"][:]
+    use = (truth["visible"][:] == 1) & (truth["changed"][:] == 0) & np.isfinite(error)
+    use &= truth["surface"][:] == GROUND
+    use &= ~binary_dilation(truth["edge"][:] > 0, iterations=EDGE_PX)
+    error, sigma = error[use], sigma[use]
+    return {
+        "labels": error.size,
+        "mean": float(error.mean()),
+        "rms": float(np.sqrt((error**2).mean())),
+        "sigma": float(np.median(sigma)),
+        **{f"within_{k}_sigma": float((np.abs(error) < k * sigma).mean()) for k in (1, 2)},
+    }
+
+
+def strips(given: argparse.Namespace) -> None:
+    """offsets that are found, and labels against truth"""
+    for number in given.cities:
+        city = drawn_strips(number, given.side, given.jitter)
+        folder = given.folder / f"{number}-{given.side}-{given.jitter:g}"
+        folder.mkdir(parents=True, exist_ok=True)
+        images, stores = make_strips(city, folder)
+        found = compare_strips([PointStore(store) for store in stores])
+        of = {int(strip.name) - 1: np.array(strip.offset_m) for strip in found.strips}
+        reference = int(found.strips[0].name) - 1
+        for k, offset in sorted(of.items()):
+            miss = offset - np.subtract(OFFSETS_M[k], OFFSETS_M[reference])
+            plan, up = 100 * np.hypot(*miss[:2]), 100 * miss[2]
+            print(f"city {number}, strip {k + 1}: {plan:.1f} cm in plan, {up:+.1f} cm in height")
+        moved = [folder / "adjusted" / store.name for store in stores]
+        for store, out in zip(stores, moved):
+            move_strips(store, found, out)
+        for name, points in (("named", stores), ("adjusted", moved)):
+            out = folder / f"labels_{name}"
+            out.mkdir(exist_ok=True)
+            alone = align(*images, folder / "gcps.csv", provenance={})
+            alignment, _ = refine(alone, *images, points, provenance={})
+            label_by(alignment, images, points, out, LabelSettings(), workers=given.threads)
+            truth = out / "epipolar.json", out / "truth.zarr"
+            write_grid_truth(city, city.scenes[0], *truth, workers=given.threads)
+            print(f"city {number}, {name}:", {k: round(v, 4) for k, v in judge(out).items()})
+
+
+# ------------------------------------------------------------------------------- frames
 
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parents[1]
 LIDAR = ("in/lidar", "national")  # in WGS 84, in the frame
-SEED, SPACING_M, SIDE_PX, TILE_PX = 1, 0.5, 560, 128
+DEMO_SEED, SPACING_M, SIDE_PX, TILE_PX = 1, 0.5, 560, 128
 NAD83 = (
     "+proj=helmert +x=1.0039 +y=-1.90961 +z=-0.54117 +rx=0.02678138 +ry=-0.00042027 "
     "+rz=0.01093206 +s=-5.109e-05 +dx=0.00079 +dy=-0.0007 +dz=-0.00124 +drx=6.667e-05 "
@@ -111,7 +210,7 @@ def to_national(file: Path, to: Path, country: Country) -> None:
     out.write(to)
 
 
-def made(name: str, folder: Path) -> Path:
+def made_project(name: str, folder: Path) -> Path:
     """A project of two cities, the same scene with its LiDAR in WGS 84 and in the frame."""
     country, project = COUNTRIES[name], folder / name
     if (project / "config.yaml").is_file():
@@ -121,7 +220,7 @@ def made(name: str, folder: Path) -> Path:
     )
     city = replace(DEMO, name=name, lon=country.lon, lat=country.lat, epsg=country.utm,
                    scenes=(spec,))  # fmt: skip
-    make_scene(city, spec, project / "in", spacing_m=SPACING_M, seed=SEED)
+    make_scene(city, spec, project / "in", spacing_m=SPACING_M, seed=DEMO_SEED)
     (project / "national").mkdir()
     for file in sorted((project / "in" / "lidar").iterdir()):
         to_national(file, project / "national" / file.name, country)
@@ -192,11 +291,10 @@ def pixels(project: Path, name: str) -> tuple[Floats, float, int]:
     return off, float(np.nanmedian(change)), int(known.sum())
 
 
-def main() -> None:
-    """Make and compare the scenes of all countries, or of those that are named."""
-    folder = Path(sys.argv[1])
-    for name in sys.argv[2:] or COUNTRIES:
-        project = made(name, folder)
+def frames(given: argparse.Namespace) -> None:
+    """places and heights by a national frame less those by WGS 84"""
+    for name in given.countries or COUNTRIES:
+        project = made_project(name, given.folder)
         stores = [f"results/project/{name}{k}/{name}{k}-1.zarr" for k in (0, 1)]
         command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
         command += ["--snakefile", ROOT / "Snakefile", "--directory", project]
@@ -208,6 +306,24 @@ def main() -> None:
             east, north, up = shift
             print(f"{name}: {what} east {east:+.4f}, north {north:+.4f}, up {up:+.4f} m")
         print(f"{name}: disparity {change:+.4f} px at {count} pixels", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parts = parser.add_subparsers(required=True)
+    of_strips = parts.add_parser("strips", help=strips.__doc__)
+    of_strips.set_defaults(run=strips)
+    of_strips.add_argument("--folder", type=Path, default=Path("results/strips_bench"))
+    of_strips.add_argument("--cities", type=int, nargs="+", default=[2, 3], help="by number")
+    of_strips.add_argument("--side", type=int, default=800, help="px of the left image")
+    of_strips.add_argument("--jitter", type=float, default=0.0, help="px rms of both attitudes")
+    of_strips.add_argument("--threads", type=int, default=2)
+    of_frames = parts.add_parser("frames", help=frames.__doc__)
+    of_frames.set_defaults(run=frames)
+    of_frames.add_argument("countries", nargs="*", help=", ".join(COUNTRIES))
+    of_frames.add_argument("--folder", type=Path, default=Path("results/frames"))
+    given = parser.parse_args()
+    given.run(given)
 
 
 if __name__ == "__main__":

@@ -1,45 +1,55 @@
-"""Scenes for alignments: cities with crowns, drawn by seed, and the errors of an alignment there.
+"""Scenes that are drawn by seed, or twins of real places, and the errors of an alignment there.
 
 A scene is a pair of images with biased RPCs, point stores of any density and control points, made
-once and found again by what it was drawn from. Errors are those of labels at exact places.
+once and found again by what it was drawn from. Errors are those of labels at exact places. Some
+cities, by seeds that nothing is tuned on, are aligned, refined, labelled and compared as a whole.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import hashlib
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from synthetic_pairs import VIEWS, Change, gain, noise, sun_an_hour_later
+from synthetic_pairs import (
+    VIEWS,
+    change_images,
+    far_apart,
+    fly,
+    gain,
+    label_by,
+    noise,
+    sun_an_hour_later,
+)
 
 from stereotruth.alignment.adjustment import epipolar_model
 from stereotruth.alignment.align import align, from_rpcs
 from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.errors import InputError
-from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import open_stores
-from stereotruth.matching.image_faults import as_images
+from stereotruth.alignment.refine import refine
+from stereotruth.config.labels import LabelSettings
+from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.evaluation.labels_against_truth import SceneComparison, compare_scene
+from stereotruth.numerics.error_sums import ErrorSum
 from stereotruth.products.files import atomic_folder
-from stereotruth.products.ungeoreferenced import open_raster
+from stereotruth.products.provenance import source_digest
 from stereotruth.simulate.cities import (
     Canopy,
     CitySpec,
     Jitter,
     SceneSpec,
     ViewSpec,
-    lidar_files,
     training_city,
 )
 from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.lidar import simulate_lidar_tile
 from stereotruth.simulate.render import simulate_image
 from stereotruth.simulate.surfaces import TREE
 from stereotruth.simulate.truth import SURFACES, truth_at
+from stereotruth.simulate.twin_world import twin_city
 
 Floats = NDArray[np.float64]
 STEP_PX = 8.0  # between the places where an alignment is examined
@@ -52,6 +62,10 @@ ZONES = {
 LOW = {"trunk_m": (0.0, 0.3), "slimness": (0.4, 0.7)}  # bushes, orchards
 HIGH = {"trunk_m": (0.4, 2.2), "slimness": (0.75, 1.1)}
 MIXED = {"trunk_m": (0.0, 2.2), "slimness": (0.4, 1.1)}
+COMPARED = Path("results/accuracy/drawn")  # folder of the cities that are compared as a whole
+DENSITIES = (4.0, 1.0)  # points/m², of these
+GCPS = 15
+TWIN_SEED = 27
 
 
 @dataclass(frozen=True)
@@ -137,10 +151,62 @@ class Draw:
 
 
 @dataclass(frozen=True)
+class Place:
+    """A LAS or LAZ file, and the coordinate system of its points if it declares none."""
+
+    file: Path
+    crs: str = ""
+
+    def city(self, name: str, seed: int) -> CitySpec:
+        """The twin, whose orbit and textures a seed draws."""
+        return twin_city(name, self.file, crs=self.crs, pose_seed=seed)
+
+    @property
+    def key(self) -> str:
+        """A name that tells the places apart."""
+        size = self.file.stat().st_size
+        told = f"{self.file.name} {size} {self.crs}".encode()
+        return f"{self.file.stem}-{hashlib.sha256(told).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True)
+class TwinDraw:
+    """What the scene of a twin is made of, in the place of a :class:`Draw`."""
+
+    place: Place
+    seed: int
+    density: float
+    noise: bool = False
+    gain: bool = False
+    key = Draw.key
+
+    @property
+    def city(self) -> CitySpec:
+        """The twin and its one scene."""
+        return self.place.city("Twin", self.seed)
+
+
+def add_place(parser: argparse.ArgumentParser) -> None:
+    """The arguments that name a place."""
+    parser.add_argument("--twin", type=Path, help="LAS or LAZ file of a real place: its twin")
+    parser.add_argument("--crs", default="", help="of the twin's points, if they declare none")
+
+
+def place_given(arguments: argparse.Namespace) -> Place | None:
+    """The place that is named and there; else None, with the reason if it is not there."""
+    if arguments.twin is None:
+        return None
+    if not arguments.twin.is_file():
+        print(f"twin skipped: there is no file {arguments.twin}")
+        return None
+    return Place(arguments.twin, arguments.crs)
+
+
+@dataclass(frozen=True)
 class Scene:
     """The files of a draw, made under ``folder`` when they are first asked for."""
 
-    draw: Draw
+    draw: Draw | TwinDraw
     folder: Path
 
     @cached_property
@@ -162,24 +228,11 @@ class Scene:
                 for view in VIEWS:
                     simulate_image(self.city, self.spec, view, scratch / f"{view}.tif",
                                    seed=self.draw.seed)  # fmt: skip
-                changes: list[Change] = [
-                    change for change, asked in ((noise, self.draw.noise), (gain, self.draw.gain))
-                    if asked
-                ]  # fmt: skip
-                self._change([scratch / f"{view}.tif" for view in VIEWS], changes)
+                asked = (noise, self.draw.noise), (gain, self.draw.gain)
+                if changes := [change for change, is_asked in asked if is_asked]:
+                    rng = np.random.default_rng([self.draw.seed, 9])
+                    change_images([scratch / f"{view}.tif" for view in VIEWS], changes, rng)
         return [made / f"{view}.tif" for view in VIEWS]
-
-    def _change(self, images: Sequence[Path], changes: Sequence[Change]) -> None:
-        rng = np.random.default_rng([self.draw.seed, 9])
-        for image in images if changes else ():
-            with open_raster(image) as source:
-                profile, pixels, rpcs = source.profile, source.read(1), source.rpcs
-            changed = pixels.astype(np.float32)
-            for change in changes:
-                changed = change(changed, rng)
-            (changed,) = as_images([changed], [pixels])
-            with open_raster(image, "w", **profile, rpcs=rpcs) as target:
-                target.write(changed, 1)
 
     @cached_property
     def stores(self) -> list[Path]:
@@ -189,15 +242,9 @@ class Scene:
             "saturates",
         )  # fmt: skip
         made = self.folder / "lidar" / self.draw.key(*looks)
-        if not _readable(made):
+        if not made.is_dir():
             with atomic_folder(made) as scratch:
-                for file in lidar_files(self.city, self.spec):
-                    simulate_lidar_tile(
-                        self.city, self.spec, file, scratch / file,
-                        spacing_m=self.draw.density**-0.5, seed=self.draw.seed,
-                    )  # fmt: skip
-                    ingest(scratch / file, scratch / f"{Path(file).stem}.points")
-                    (scratch / file).unlink()
+                fly(self.city, self.spec, scratch, self.draw.seed, self.draw.density**-0.5)
         return sorted(made.glob("*.points"))
 
     @property
@@ -230,7 +277,7 @@ class Scene:
             with made.open("w", newline="", encoding="utf-8") as stream:
                 writer = csv.DictWriter(stream, rows[0])
                 writer.writeheader()
-                writer.writerows(rows[k] for k in _spread(at, count))
+                writer.writerows(rows[k] for k in far_apart(at, count))
         return made
 
     def align(self, gcps: int) -> Alignment:
@@ -242,25 +289,6 @@ class Scene:
     def errors(self, alignment: Alignment) -> LabelErrors:
         """What an alignment makes of exact places of this scene."""
         return label_errors(alignment, self.city, self.spec)
-
-
-def _readable(folder: Path) -> bool:
-    """Whether a folder has point stores, in the format of this version."""
-    stores = list(folder.glob("*.points"))
-    try:
-        open_stores(stores)
-    except InputError:
-        return False
-    return bool(stores)
-
-
-def _spread(at: Floats, count: int) -> list[int]:
-    """Indices of ``count`` places [n, 2], each as far as can be from those before."""
-    chosen = [int(np.argmin(at.sum(axis=1)))]
-    while len(chosen) < min(count, len(at)):
-        away = np.min([np.hypot(*(at - at[k]).T) for k in chosen], axis=0)
-        chosen.append(int(np.argmax(away)))
-    return sorted(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,12 +331,6 @@ class LabelErrors:
             if (self.surface == k).any()
         }
 
-    def __str__(self) -> str:
-        return (
-            f"bias {self.bias:+.3f}, mean abs {self.mean_absolute:.3f}, y-parallax rms "
-            f"{self.parallax_rms:.3f} px at {self.disparity.size} places"
-        )
-
 
 def label_errors(
     alignment: Alignment, city: CitySpec, scene: SceneSpec, step_px: float = STEP_PX
@@ -344,3 +366,69 @@ def label_errors(
     )
     at = np.column_stack([x_left, y_left])[same]
     return LabelErrors(*found[:, same], at, exact["surface"][same])
+
+
+NAMED = {
+    "suburb": Draw(
+        61803, zones="suburb", ground_m2=110.0, arrangement="single", brightness=0.4,
+        ground_look=(1.5, 0.5), buildings=0.9, relief_m=15.0, vehicles=4.0, side_px=1400, **MIXED,
+    ),
+    "park": Draw(
+        41421, zones="park", ground_m2=70.0, arrangement="forest", brightness=0.5,
+        ground_look=(1.4, 0.4), buildings=0.8, relief_m=25.0, side_px=1400, **MIXED,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A drawn city against its truth.
+
+    ``labels``: of the whole grid. ``alignments``: errors of disparity and y-parallax at exact
+    places, by the control points alone and as used.
+    """
+
+    name: str
+    labels: SceneComparison
+    alignments: dict[str, tuple[ErrorSum, ErrorSum]]
+
+
+def compare_drawn(name: str, density: float, settings: LabelSettings, workers: int) -> Compared:
+    """Labels and alignment of a city of NAMED at a density of its LiDAR."""
+    scene = Scene(replace(NAMED[name], density=density), COMPARED)
+    return _compared(
+        scene, f"{name}-{density:g}", f"{name}, {density:g} points/m²", settings, workers
+    )
+
+
+def compare_twin(place: Place, density: float, settings: LabelSettings, workers: int) -> Compared:
+    """The same of the twin of a place."""
+    scene = Scene(TwinDraw(place, TWIN_SEED, density), COMPARED)
+    title = f"twin of {place.file.stem}, {density:g} points/m²"
+    return _compared(scene, f"{place.key}-{density:g}", title, settings, workers)
+
+
+def _compared(
+    scene: Scene, key: str, title: str, settings: LabelSettings, workers: int
+) -> Compared:
+    """Labels and alignment of a scene, made once in a folder that has its ``key``."""
+    alone = scene.align(GCPS)
+    code = source_digest("alignment.refine", "disparity.project")[:8]
+    made = COMPARED / f"{key}-{code}"
+    if not made.is_dir():
+        with atomic_folder(made) as scratch:
+            refined, _ = refine(alone, *scene.images, scene.stores, provenance={})
+            label_by(refined, scene.images, scene.stores, scratch, settings, workers=workers)
+            write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",
+                             scratch / "truth.zarr", workers=workers)  # fmt: skip
+    used = Alignment.load(made / "alignment.json")
+    labels = compare_scene(
+        made / "disparity.zarr", made / "truth.zarr", None, scene=title, workers=workers
+    )
+    alignments = {}
+    for word, alignment in (("GCPs", alone), ("as used", used)):
+        errors = scene.errors(alignment)
+        alignments[word] = ErrorSum(), ErrorSum()
+        for total, values in zip(alignments[word], (errors.disparity, errors.parallax)):
+            total.add(values)
+    return Compared(title, labels, alignments)
