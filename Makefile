@@ -75,7 +75,7 @@ networks: $(READY)
 	$(PIP) install --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py tests/test_bench.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py
 
 test-s3: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py

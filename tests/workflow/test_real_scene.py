@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import rasterio
 import yaml
-from checkpoints import evaluate_checkpoints
+from figures import evaluate_checkpoints
 from rasterio.windows import Window
 
 from stereotruth.evaluation.scene_warping import warp_scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from warped_panels import draw_panels
+from figures import draw_panels
 
 from stereotruth.dataset import warped_tile
 from stereotruth.epipolar import warping

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from whole_images import match
 
 from stereotruth.errors import InputError
 from stereotruth.matching.scenes.offsets import best_offset, find_offsets, reduced
@@ -13,6 +12,7 @@ from stereotruth.matching.sgm import SemiGlobalMatcher
 
 from ....synthetic.exact_method import SHAPE, Exact, coded
 from ....synthetic.images import textured
+from ....synthetic.whole_images import match
 
 
 def test_offsets_of_blocks_bring_a_large_relief_into_a_small_range():

@@ -9,7 +9,6 @@ import dask.threaded
 import numpy as np
 import pytest
 import zarr
-from whole_images import match
 
 from stereotruth.config.methods import SceneMatching
 from stereotruth.errors import InputError
@@ -21,6 +20,7 @@ from stereotruth.products.grids import Layer, atomic_store, create_grid, open_gr
 
 from ....synthetic.images import textured
 from ....synthetic.stores import Killed, tree
+from ....synthetic.whole_images import match
 
 SHAPE = (300, 600)  # 2 by 3 tiles
 SETTINGS = {"kind": "sgm", "mode": "sgbm"}

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import checkpoints
 import numpy as np
 import pytest
-from geometry_errors import geometry_errors
+from figures import evaluate_checkpoints, geometry_errors, sample_labels
 
 from .synthetic.surveyed_pair import LAT, LON
 from .synthetic.truth_scene import (
@@ -32,7 +31,7 @@ def test_labels_are_sampled_bilinearly_and_not_across_edges():
     grid[20:, :10] = np.nan
     px = np.array([3.25, 29.4, 29.6, 5.0, 5.0, 5.0, -0.4, 49.4, 60.0])
     py = np.array([7.75, 11.0, 11.0, 19.3, 19.6, 25.0, 0.0, 39.4, 1.0])
-    got, inner = checkpoints.sample_labels(grid, px, py)
+    got, inner = sample_labels(grid, px, py)
     assert np.flatnonzero(inner).tolist() == [0, 6, 7]
     smooth = 0.1 * px - 0.07 * py
     assert got[0] == pytest.approx(smooth[0])
@@ -56,7 +55,7 @@ def test_check_points_of_perfect_labels(scene, tmp_path):
         lines.append(f"C{k:03d}," + ",".join(f"{v:.10f}" for v in values))
     lines.append(f"C900,{LON},{LAT},60,100,100,,")
     (tmp_path / "c.csv").write_text("\n".join(lines))
-    figures = checkpoints.evaluate_checkpoints(store, tmp_path / "c.csv", scene="S-1")
+    figures = evaluate_checkpoints(store, tmp_path / "c.csv", scene="S-1")
     before = np.array(scene.model.right_to_epipolar(189.0, 209.0))
     moved = np.array(scene.model.right_to_epipolar(189.2, 208.9)) - before
     assert figures["points"] == figures["labelled"] == 200
