@@ -64,7 +64,7 @@ def in_threads(call: Callable[..., Any], places: Sequence[np.ndarray], threads: 
 
 
 def geometry(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rates (points/s) of projections, and how far they are from GDAL's, PROJ's, or their steps."""
+    """Rates (points/s) of projections, and how far they are from GDAL's and PROJ's."""
     points = ground_points(arguments.folder, 4_000_000)
     every = points.lon, points.lat, points.height
     few = [values[:200_000] for values in every]
@@ -81,14 +81,6 @@ def geometry(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         rates = {"what": name, "per_s": count / clock, "per_cpu_s": count / cpu}
         rows.append(rates | {"difference": worst, "unit": unit})
 
-    left, right = (view.project(*few) for view in (model.left, model.right))
-    steps = np.concatenate([model.left_to_epipolar(*left), model.right_to_epipolar(*right)])
-    for threads in sorted({1, arguments.workers}):
-        row(
-            f"ground to epipolar coordinates of both images, {threads} threads",
-            lambda threads=threads: in_threads(model.ground_to_epipolar, every, threads),
-            points.lon.size, model.ground_to_epipolar(*few), steps, "px",
-        )  # fmt: skip
     with rasterio.open(image) as dataset, RPCTransformer(dataset.rpcs) as gdal:
         line, col = gdal.rowcol(*few, op=float)
         theirs = np.subtract([col, line], 0.5)
@@ -99,6 +91,14 @@ def geometry(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         row(
             "ground to one image, GDAL", lambda: gdal.rowcol(*few, op=float),
             few[0].size, theirs, theirs, "px",
+        )  # fmt: skip
+    affine = model.left.affine
+    left = model.left_to_epipolar(*(affine[:, :2] @ theirs + affine[:, 2:]))
+    for threads in sorted({1, arguments.workers}):
+        row(
+            f"ground to epipolar coordinates of both images, {threads} threads",
+            lambda threads=threads: in_threads(model.ground_to_epipolar, every, threads),
+            points.lon.size, model.ground_to_epipolar(*few)[:2], left, "px",
         )  # fmt: skip
     code = CITIES[CITY].epsg
     to_map = pyproj.Transformer.from_crs("EPSG:4979", f"EPSG:{code}", always_xy=True)
@@ -227,7 +227,7 @@ def rates(row: Mapping[str, Any], what: str) -> dict[str, str]:
 
 def show_kernels(report: Mapping[str, Any]) -> None:
     print_records(
-        "geometry: rates, and greatest difference from the steps one by one, GDAL or PROJ",
+        "geometry: rates, and greatest difference from GDAL or PROJ",
         [
             rates(row, "points") | {"difference": f"{row['difference']:.1e} {row['unit']}"}
             for row in report["geometry"]

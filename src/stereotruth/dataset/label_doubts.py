@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 
 CELL_PX = 256  # px of the scene's grid
 MIN_CELLS = 5  # with fewer, by number or by weight, their scatter says nothing
-SIFT_SIGMA_PX = 0.02  # what SIFT may be off on exact labels: measured by bench/label_doubts.py
+SIFT_SIGMA_PX = 0.02  # what SIFT may be off on exact labels of drawn scenes
 STATED = 0.2  # quantile of the labels' uncertainties
 REMARK_PX = 0.1
 REACH = 3.0  # scales from the location at which a match no longer counts

@@ -53,7 +53,7 @@ Bools = NDArray[np.bool_]
 HIGHER_PX, HIGHER_REACH = 4.0, 3
 # Nor if a surface that is higher by ABOVE_PX comes nearer to it than CLEARANCE_PX in the right
 # image. The next BESIDE_PX of a row can do so. Contours of crowns lie beyond their last points, by
-# about a spacing of points. Six drawn scenes: bench/README.md, refinement.py.
+# about a spacing of points. Six drawn scenes (bench/refinement.py).
 CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
 # Nor if fewer of the 3 x 3 pixels around it have labels: what stands alone lies beside a contour.
 # (Steep forest, 4 and 1 points/m²: 0.2 and 0.5 % fewer visible pixels, hidden ones 0.90 for 1.09 %

@@ -1,7 +1,7 @@
 """What real pairs have and simulated ones lack: haze, shadows that moved, blur.
 
 The faults are planted in images as they come, before any method scales them: to see how methods
-bear them (bench/degraded.py), and in training (:mod:`.networks.training_pairs`).
+bear them, and in training (:mod:`.networks.training_pairs`).
 """
 
 from __future__ import annotations

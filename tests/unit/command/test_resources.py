@@ -10,7 +10,7 @@ from stereotruth.command.findings import Findings, Level
 from stereotruth.command.resources import check_resources
 from stereotruth.config.configuration import Configuration
 
-# bench/README.md, scale.py: 34000 x 30000 px, 80 M points in 20 files, a twentieth with LiDAR
+# As it was measured: 34000 x 30000 px, 80 M points in 20 files, a twentieth with LiDAR
 LARGE = SceneFacts("Large-1", pixels=1_020_000_000, points=80_000_000, lidar_files=20, covered=0.05)
 
 
