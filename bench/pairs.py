@@ -4,9 +4,8 @@ Each pair of a drawn site is rectified by exact sensor models, matched by SGM as
 it, and held against the exact truth: the share of the pixels that both images show whose disparity
 SGM misses by more than 1 px, or has not at all. The site's roughness is that of a LiDAR of 4
 points/m². ``--fit`` prints the coefficients of epipolar/pair_quality.py from sites of even numbers;
-without it, the rank correlation of what is
-predicted with what is found over sites of odd numbers, which no fit has seen: within each site,
-since pairs are chosen within a site, and over all of them together.
+without it, the rank correlation of what is predicted with what is found over sites of odd numbers,
+which no fit has seen: within each site, since pairs are chosen within a site, and over all of them.
 """
 
 from __future__ import annotations

@@ -218,11 +218,8 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     files = make_scene(folder, arguments.points, arguments.seed)
     env = environment(folder)
     stores = [folder / "points" / f"{file.stem}.points" for file in files]
-    left, right, out = (
-        folder / "left.zarr",
-        folder / "right.zarr",
-        folder / "project" / "disparity.zarr",
-    )
+    left, right = folder / "left.zarr", folder / "right.zarr"
+    out = folder / "project" / "disparity.zarr"
     smallest = min(files, key=lambda file: file.stat().st_size)
     stores[0].parent.mkdir(exist_ok=True)
     shutil.rmtree(out.parent, ignore_errors=True)
@@ -267,9 +264,8 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         ):
             clock, used = fastest(call, 1)
             seconds[name], cpu[name] = min(seconds[name], clock), min(cpu[name], used)
-    start_up = fastest(lambda: job("import stereotruth.lidar.ingest, stereotruth.job", env=env), 3)[
-        1
-    ]
+    start = "import stereotruth.lidar.ingest, stereotruth.job"
+    _, start_up = fastest(lambda: job(start, env=env), 3)
     total = seconds["ingest"] + seconds["project"]
     profiles = {}
     if arguments.profile:
@@ -289,6 +285,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         )
         profiles["project"] = parts(times, count)
 
+    stored = sum(f.stat().st_size for s in stores for f in s.rglob("*") if f.is_file())
     return {
         "files": len(files),
         "points": count,
@@ -299,10 +296,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         "T / T0": total / seconds["T0"],
         "start_up_s": start_up,
         "profiles": profiles,
-        "store_bytes_per_point": sum(
-            f.stat().st_size for s in stores for f in s.rglob("*") if f.is_file()
-        )
-        / count,
+        "store_bytes_per_point": stored / count,
     }
 
 
