@@ -97,6 +97,6 @@ lock: $(READY)
 	  --output-file envs/requirements.lock
 
 clean:
-	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark submission audit score_dsm report.html bench/out docs/_build .snakemake
+	rm -rf data results tiles dataset dataset_kitti dataset_us3d originals logs benchmark submission audit score_dsm report.html docs/_build .snakemake
 
 FORCE:

@@ -26,8 +26,10 @@ from stereotruth.command import example_city
 from stereotruth.command.new_project import begin
 from stereotruth.simulate.sites import drawn_site
 
-BEFORE = ("ingest", "surface", "align", "refine", "adjust", "adjusted_alignment", "rectify")
-RULES = (*BEFORE, "project")
+RULES = (
+    "ingest", "compare_strips", "surface", "align", "refine", "adjust", "adjusted_alignment",
+    "rectify", "project",
+)  # fmt: skip
 ONCE = ("ingest", "surface")
 # For all processes of a run: rule, script and file where a script of a rule opens LiDAR; at its end
 # the processor time that it took, of which Snakemake's records hold a sample of up to 30 s before.
