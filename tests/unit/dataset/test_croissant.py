@@ -49,6 +49,6 @@ def test_without_the_extra_it_is_said_how_to_get_it(exported, tmp_path, monkeypa
     monkeypatch.setitem(sys.modules, "mlcroissant", None)
     monkeypatch.delitem(sys.modules, "stereotruth.dataset.croissant", raising=False)
     monkeypatch.delattr("stereotruth.dataset.croissant", raising=False)
-    with pytest.raises(InputError, match=r"croissant needs mlcroissant.*stereotruth\[catalog\]"):
+    with pytest.raises(InputError, match=r"croissant needs mlcroissant.*the extra catalog"):
         assemble_dataset([exported[0]], tmp_path / "out", catalogs=["croissant"])
     assert not (tmp_path / "out").exists()
