@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from snakemake.logging import logger
 from snakemake.utils import min_version
 
 from stereotruth.errors import InputError, in_words
@@ -14,12 +13,7 @@ min_version("9.10")
 shell.prefix("set -euo pipefail; export OPENBLAS_NUM_THREADS=1; ")
 
 
-class Refused(SystemExit):
-    """What users are meant to read, without the lines that it came from: it ends Snakemake."""
-
-    def __init__(self, message):
-        logger.error(f"Refused:\n{message}")
-        super().__init__(1)
+include: "workflow/rules/refused.smk"
 
 
 OWN_CONFIG = Path("config/config.yaml")  # of the working directory; see common.smk

@@ -40,10 +40,10 @@ def checksum_of(path):
 @cache
 def made_by(path):
     """Name and wildcards of the rule of this workflow that makes a file; None if users give it."""
-    for rule in workflow.rules:
-        for output in rule.output:
+    for maker in workflow.rules:
+        for output in maker.output:
             if found := output.match(path if path.startswith(PLACE) else PLACE + path):
-                return rule.name, Wildcards(found.groupdict())
+                return maker.name, Wildcards(found.groupdict())
     return None
 
 
