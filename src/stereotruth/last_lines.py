@@ -133,13 +133,6 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
 }
 
 
-def products_of(snakemake_logs: Iterable[str]) -> list[str]:
-    """Files and folders that the jobs of a run have made, as Snakemake has logged them."""
-    text = "".join(Path(file).read_text("utf-8", "replace") for file in snakemake_logs)
-    lines = re.findall(r"^    output: (.*)$", text, flags=re.MULTILINE)
-    return [re.sub(r" \(.*\)$", "", name) for line in lines for name in line.split(", ")]
-
-
 REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
 DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
 

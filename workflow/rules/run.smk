@@ -4,6 +4,7 @@ import shutil
 import sys
 
 from stereotruth.products.locks import FileLock
+from stereotruth.products.making import begin_notes, noted
 
 LOCKS = []  # held until this process ends
 
@@ -24,13 +25,14 @@ onstart:
             "Remedy: wait until it ends, or stop it"
         )
     LOCKS.append(lock)
+    begin_notes()
 
 
-def made(logs):
+def made():
     """What the last lines of a run say: what it has made, its figures, and where to look."""
-    from stereotruth.last_lines import last_lines, products_of  # take a second; no plan needs it
+    from stereotruth.last_lines import last_lines  # takes a second; no plan needs it
 
-    products = products_of(logs)
+    products = [f"{BUCKET}/{path.removeprefix(PLACE)}" if BUCKET else path for path in noted()]
     left_out = [
         said for name, said in LEFT_OUT.items() if f"benchmark/{name}/index.html" in products
     ]
@@ -61,7 +63,7 @@ onsuccess:
         BUCKET and not workflow.storage_settings.keep_storage_local
     ):  # what killed jobs have left
         shutil.rmtree(workflow.storage_settings.local_storage_prefix, ignore_errors=True)
-    say(made(log))
+    say(made())
 
 
 onerror:

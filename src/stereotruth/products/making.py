@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import InputError
 from . import remote_files
 from .inputs import Marks, marks, refuse_replaced
 from .locks import exclusive
+from .provenance import digest
 
+MADE = Path(".snakemake", "stereotruth", "made")  # what the jobs of a run have made
 _inputs: Marks = {}  # of this process's job
 
 
@@ -31,6 +35,7 @@ def making(inputs: Iterable[str | Path], outputs: Sequence[str | Path]) -> Itera
             refuse_replaced(_inputs)
             for path in inputs:
                 remote_files.refuse_changed(path)
+            _note(outputs)
         except (InputError, OSError):
             raise
         except Exception as error:
@@ -41,6 +46,24 @@ def making(inputs: Iterable[str | Path], outputs: Sequence[str | Path]) -> Itera
             raise
         finally:
             _inputs = {}
+
+
+def begin_notes() -> None:
+    """Have the jobs of a run that begins note what they make."""
+    shutil.rmtree(MADE, ignore_errors=True)
+    MADE.mkdir(parents=True, exist_ok=True)
+
+
+def noted() -> list[str]:
+    """Files and folders that the jobs of the newest run have made."""
+    return [path for file in sorted(MADE.glob("*")) for path in json.loads(file.read_text())]
+
+
+def _note(outputs: Sequence[str | Path]) -> None:
+    """One file for each job: several nodes may write at once."""
+    names = [str(path) for path in outputs]
+    with suppress(FileNotFoundError):  # no run of the workflow
+        (MADE / digest(names)).write_text(json.dumps(names))
 
 
 def marks_of_inputs() -> Marks:
