@@ -8,7 +8,7 @@ import pytest
 
 from stereotruth.errors import InputError
 from stereotruth.products.files import atomic_file
-from stereotruth.products.making import making, marks_of_inputs
+from stereotruth.products.making import begin_notes, making, marks_of_inputs, noted
 
 
 def test_a_later_job_waits_and_has_the_last_word(tmp_path):
@@ -48,3 +48,18 @@ def test_an_input_that_is_edited_and_put_back_ends_the_job(tmp_path):
             source.write_text("1,2")
             scratch.write_text("made of either")
     assert not marks_of_inputs()
+
+
+def test_what_the_jobs_of_a_run_made_is_noted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with making([], ["before.txt"]):
+        pass
+    assert noted() == []  # no run has begun
+    begin_notes()
+    with making([], ["one.txt", "two"]):
+        pass
+    with pytest.raises(ValueError), making([], ["failed.txt"]):
+        raise ValueError
+    assert noted() == ["one.txt", "two"]
+    begin_notes()
+    assert noted() == []
