@@ -153,7 +153,8 @@ def test_the_papers_16_bits_can_be_chosen(scene: SceneFiles, tmp_path: Path) -> 
     run([scene], tmp_path / "T", disparity_dtype="float16")
     row = rows_of(tmp_path / "T")[0]
     with rasterio.open(tmp_path / "T" / row["disp"]) as dataset:
-        assert dataset.tags(1, ns="IMAGE_STRUCTURE")["NBITS"] == "16"
+        half = dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS") == "16"  # before GDAL 3.11
+        assert half or dataset.dtypes == ("float16",)
     values = labels(tmp_path / "T" / row["disp"])
     assert 1e-4 < float(row["disparity_rounding_px"]) <= 1 / 128
     assert np.array_equal(values.astype(np.float16), values, equal_nan=True)

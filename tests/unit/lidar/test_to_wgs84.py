@@ -140,7 +140,7 @@ def test_ballpark_and_missing_grids_are_named() -> None:
     )
     assert any("OSTN15" in note for note in british.notes) or british.accuracy_m < 1.5
     wgs84 = to_wgs84.to_wgs84(header_of(UTM_10.to_3d().to_wkt()), "a.laz")
-    assert (wgs84.accuracy_m, wgs84.notes) == (0.0, ())
+    assert wgs84.accuracy_m in (0.0, None) and wgs84.notes == ()  # none is stated by PROJ 9.8
 
 
 def test_points_far_from_the_area_of_their_system() -> None:
