@@ -99,7 +99,8 @@ def test_windows_show_rims_and_middle_about_as_often(dataset: StereoDataset) -> 
 
 
 def test_windows_follow_from_seed_epoch_and_number(dataset: StereoDataset) -> None:
-    settings = {"crop_px": (16, 16), "augmentation": Augmentation(True, 0.2, 0.2, 0.1)}
+    augmentation = Augmentation(flip_rows=True, contrast=0.2, brightness=0.2, noise=0.1)
+    settings = {"crop_px": (16, 16), "augmentation": augmentation}
     data = LabelledPairs.of(dataset, "train", crops_per_pair=2, **settings)
     assert len(data) == 6
     first = [t.numpy() for t in data[4]]
