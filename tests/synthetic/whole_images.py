@@ -15,8 +15,10 @@ from stereotruth.matching.matcher import Matcher
 from stereotruth.matching.scenes.tiling import (
     BLOCK_PX,
     OVERLAP_PX,
+    Disparities,
+    Place,
     Tiling,
-    blend_lists,
+    blend,
     inside,
     predict_tile,
     view_of,
@@ -83,3 +85,10 @@ def match(
         rows.append(row)
     whole = da.block(rows)
     return whole if lazy else whole.compute(scheduler="synchronous")
+
+
+def blend_lists(
+    tiling: Tiling, place: Place, places: list[Place], tiles: list[Disparities]
+) -> Disparities:
+    """:func:`blend` for Dask, which looks for its tasks in lists, not in keys of mappings."""
+    return blend(tiling, place, dict(zip((tuple(p) for p in places), tiles)))

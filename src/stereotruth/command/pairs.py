@@ -23,7 +23,7 @@ from .add_scene import append_row
 from .site import images_of, scene_pairs
 
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
-ALIKE_BASES = 1.5  # greatest ratio
+ALIKE_BASES = 1.5  # greatest ratio of the bases over height of pairs that tell much the same
 LEAST_SHARED = 0.05  # of the smaller image's ground
 INGESTED = Path("results/ingest")
 # What a pair takes from its city's other rows.
@@ -66,66 +66,68 @@ class Choice:
         """
         allowed = [rated for rated in pairs if self.allows(rated.pair)]
         most = len(allowed) if self.most is None else self.most
-        taking = _linking(allowed, self.each)
-        if len(taking.taken) > most:
-            taking = _growing(allowed, self.each, most)
-        while len(taking.taken) < most and taking.take():
+        selection = _linking(allowed, self.each)
+        if len(selection.chosen) > most:
+            selection = _growing(allowed, self.each, most)
+        while len(selection.chosen) < most and selection.choose():
             pass
-        return [rated for rated in allowed if rated.names in taking.taken]
+        return [rated for rated in allowed if rated.names in selection.chosen]
 
 
-class _Taking:
-    """Pairs that are taken one by one, each time the one that adds most to those before it.
+class _Selection:
+    """Pairs that are chosen one by one, each time the one that adds most to those before it.
 
     ``each``: pairs that one image may be in; None: any number.
     """
 
     def __init__(self, pairs: Sequence[RatedPair], each: int | None) -> None:
-        self.left = {one.names: one for one in pairs}
-        self.alike = dict.fromkeys(self.left, 0)  # how many of those taken
+        self.remaining = {one.names: one for one in pairs}
+        self.alike = dict.fromkeys(self.remaining, 0)  # chosen pairs of like convergence
         self.each = each
         self.used: Counter[str] = Counter()
-        self.taken: list[Names] = []
+        self.chosen: list[Names] = []
 
-    def take(self, wanted: Callable[[Names], object] = lambda _: True) -> bool:
-        """Take the best of those ``wanted``, by names; false if there is none."""
-        free = [names for names in self.left if self._may(names) and wanted(names)]
+    def choose(self, wanted: Callable[[Names], object] = lambda _: True) -> bool:
+        """Choose the best of those ``wanted``, by names; false if there is none."""
+        free = [names for names in self.remaining if self._may(names) and wanted(names)]
         if not free:
             return False
-        best = max(free, key=lambda names: self.left[names].quality.bits / (1 + self.alike[names]))
-        pair = self.left.pop(best).pair
-        for names, other in self.left.items():
+        best = max(
+            free, key=lambda names: self.remaining[names].quality.bits / (1 + self.alike[names])
+        )
+        pair = self.remaining.pop(best).pair
+        for names, other in self.remaining.items():
             self.alike[names] += _alike(pair, other.pair)
         self.used.update(best)
-        self.taken.append(best)
+        self.chosen.append(best)
         return True
 
     def _may(self, names: Names) -> bool:
         return self.each is None or max(self.used[name] for name in names) < self.each
 
 
-def _linking(pairs: Sequence[RatedPair], each: int | None) -> _Taking:
-    """The best pairs that link all images which a pair is of."""
-    taking = _Taking(pairs, each)
-    while taking.take(lambda names: new_links([names], taking.taken)):
+def _linking(pairs: Sequence[RatedPair], each: int | None) -> _Selection:
+    """The best pairs that link all images which any of the ``pairs`` has."""
+    selection = _Selection(pairs, each)
+    while selection.choose(lambda names: new_links([names], selection.chosen)):
         pass
-    return taking
+    return selection
 
 
-def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Taking:
+def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Selection:
     """The best pair, and ``most`` − 1 more, each the best of those that link one image more to
     the images before (Prim 1957); where none does, the best of two others."""
-    taking = _Taking(pairs, each)
+    selection = _Selection(pairs, each)
 
     def links(names: Names) -> bool:
-        return sum(name in taking.used for name in names) == 1
+        return sum(name in selection.used for name in names) == 1
 
     def apart(names: Names) -> bool:
-        return not any(name in taking.used for name in names)
+        return not any(name in selection.used for name in names)
 
-    while len(taking.taken) < most and (taking.take(links) or taking.take(apart)):
+    while len(selection.chosen) < most and (selection.choose(links) or selection.choose(apart)):
         pass
-    return taking
+    return selection
 
 
 def _alike(one: SitePair, other: SitePair) -> bool:

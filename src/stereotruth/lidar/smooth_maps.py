@@ -15,6 +15,7 @@ is needed, the exact map itself is asked. Two maps are kept so:
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -287,7 +288,7 @@ def _evaluate(
     return unknown
 
 
-class _SmoothMap:
+class _SmoothMap(ABC):
     """The patches of a map that are fitted, of which more are as points need them.
 
     ``basis``, ``tolerance`` of each output: see :func:`_fitted`.
@@ -298,9 +299,9 @@ class _SmoothMap:
         self._keys = np.empty(0, np.int64)
         self._coefficients = np.empty((0, len(tolerance), len(basis.solve)))
 
+    @abstractmethod
     def _values_at(self, patches: Ints, places: Floats) -> Floats:
         """The exact map [outputs, k, n] at places [3, n] of patches [3, k] (column, row, slab)."""
-        raise NotImplementedError
 
     def _fit(self, keys: Ints) -> None:
         """Take in new patches."""

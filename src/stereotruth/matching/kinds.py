@@ -4,6 +4,8 @@ A new kind is an entry of :data:`KINDS` and the module that the entry names. Tha
 function ``make(name, kind, settings, workers)`` that returns a :class:`matcher.Matcher`:
 ``settings`` are those of the method's entry in the configuration, ``workers`` the threads that it
 may use.
+
+Which files of a user's code are imported by others is found without running any of them.
 """
 
 from __future__ import annotations

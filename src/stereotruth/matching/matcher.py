@@ -1,4 +1,4 @@
-"""The interface of stereo methods."""
+"""The interface of stereo methods, and a standard uncertainty from two results of one."""
 
 from __future__ import annotations
 

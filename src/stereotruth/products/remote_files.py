@@ -18,7 +18,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -220,20 +219,6 @@ def _failure(error: Exception, url: str) -> tuple[Exception, bool, float | None]
         "the right to list) and AWS_ENDPOINT_URL"
     )
     return InputError(problem, file=url, remedy=remedy), False, None
-
-
-@contextmanager
-def answering(url: str) -> Iterator[None]:
-    """In the block, what a server or its client fails with is an InputError."""
-    try:
-        yield
-    except Exception as error:  # clients raise what they like
-        failure = _failure(error, url)[0]
-        if isinstance(failure, FileNotFoundError):
-            failure = InputError(
-                "no such bucket or object", file=url, remedy="check the URL and AWS_ENDPOINT_URL"
-            )
-        raise failure from None
 
 
 def ask_patiently(url: str, ask: Callable[[], Answer]) -> Answer:

@@ -1,4 +1,7 @@
-"""Buildings of a city, and which of them change between images and LiDAR."""
+"""Buildings of a city, which of them change between images and LiDAR, and vehicles on its streets.
+
+Each image and the LiDAR have the vehicles elsewhere.
+"""
 
 from __future__ import annotations
 

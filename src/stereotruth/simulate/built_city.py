@@ -1,4 +1,8 @@
-"""A built city in a file, so that jobs which look at the same one need not build it each."""
+"""A built city in a file, so that jobs which look at the same one need not build it each.
+
+Its top surface at any place is what a surface model should hold; the tests and benchmarks of
+surface models are held against it.
+"""
 
 from __future__ import annotations
 

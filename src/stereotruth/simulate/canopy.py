@@ -1,4 +1,4 @@
-"""Crowns with rough tops: single ones, rows and forest, with or without their leaves.
+"""Trees of a city: crowns with rough tops, single, in rows and in forest, with leaves or without.
 
 A crown is the union of ellipsoids: a core, and lobes that stand out of its upper half. Rays meet it
 exactly, as they meet each of its ellipsoids. Without leaves it is a few boughs.

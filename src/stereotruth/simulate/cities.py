@@ -1,6 +1,10 @@
-"""The six synthetic cities as plain values, and which files each of them is made of.
+"""Synthetic cities as plain values, and which files each of them is made of.
 
-Nothing here computes or reads anything, so that a workflow can plan with it.
+Six are built in. Others are drawn by number and seed, to train on: ground, buildings, trees,
+season's sun, orbit and place, and none of them is one that a test shows. A project has more, each
+in a file ``data/synthetic/<City>/city.json``, which holds what differs from the defaults of
+:class:`CitySpec` by the names of its fields. A workflow plans with these values: nothing is built
+here, and only such a file is read.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
 """Airborne LiDAR of a city: two crossed sets of flight lines over the same exact surfaces.
 
-A city may have strips instead, each with an error of its own (:mod:`.lidar`).
+A city may have strips instead, as real flights have: they overlap, and none lies quite where it
+should. A strip has an offset in plan and in height, perhaps a roll, and pulses of a density of its
+own. Its points tell it as those of real files do: by ``point_source_id``, by times that leave gaps
+between the strips, and by the flag of the first and last point of each line of pulses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""RPC00B coefficients fitted to the rigorous camera, with an affine bias as real ones have."""
+"""RPC00B coefficients: fitted to the rigorous camera, or given, as cameras of the twin of a place.
+
+The fitted ones have an affine bias as real ones have. Given ones are read, moved over the twin's
+place, cropped and turned round. RPCs tell where a ground point appears; rays need the way back. A
+camera (:mod:`.camera`) is fitted to them; the camera, and not the RPCs, is the truth then.
+"""
 
 from __future__ import annotations
 

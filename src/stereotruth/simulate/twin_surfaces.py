@@ -1,7 +1,9 @@
 """Ground, roofs and crowns of the twin of a real place, from its points.
 
-Roofs are planes that grow over points from smooth seeds; crowns are ellipsoids whose tops are the
-points of leaves that were hit first; the ground is what lies below both.
+The ground is a smooth surface through the points that lie lowest. Roofs are planes that are grown
+from point to point by the points' neighbours (Rabbani et al. 2006, Segmentation of point clouds
+using smoothness constraint), and become a raster of planar patches. Crowns are ellipsoids whose
+tops are the points of leaves that were hit first.
 """
 
 from __future__ import annotations

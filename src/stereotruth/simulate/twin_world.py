@@ -1,4 +1,8 @@
-"""Building a twin: ground, roofs and crowns of a real place from its points."""
+"""Twins of real places: a city whose surfaces follow from the points of a LAS or LAZ file.
+
+What is made of the points is the truth: images, LiDAR and truth of a twin look at one and the same
+ground, roofs and crowns, and the points of the file are never seen again.
+"""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@
 =======  ==========================================================================================
 entropy  the standard deviation of a uniform distribution as wide as the planes that the last
          softmax is spread over, by the exponential of its entropy (:func:`.layers.perplexity`)
-flips    the spread (:mod:`..spread`) between the disparities of the pair and of the pair upside
-         down, which takes twice the time
+flips    the spread (:func:`..matcher.spread`) between the disparities of the pair and of the pair
+         upside down, which takes twice the time
 =======  ==========================================================================================
 
 A weight file (``.pt``) holds a network's weights and what is needed to use them: kind, disparity

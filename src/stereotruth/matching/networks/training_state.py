@@ -1,4 +1,7 @@
-"""The state of a training between steps: start, file, what is frozen, learning rate."""
+"""The state of a training between steps, and what a training leaves.
+
+State: start, file, what is frozen, learning rate. Left are weights, curves, a figure, a summary.
+"""
 
 from __future__ import annotations
 

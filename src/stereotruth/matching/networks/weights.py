@@ -1,4 +1,4 @@
-"""Weight files of networks, with what is needed to use them."""
+"""Weight files of networks with what is needed to use them; images as a network takes them."""
 
 from __future__ import annotations
 

@@ -281,10 +281,3 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
             weight = in_rows[r, None] * in_cols[None, c]
             change[r, c] += weight * (bias[at] + np.nan_to_num(same * rest))
     return (own + change).astype(np.float32)
-
-
-def blend_lists(
-    tiling: Tiling, place: Place, places: list[Place], tiles: list[Disparities]
-) -> Disparities:
-    """:func:`blend` for Dask, which looks for its tasks in lists, not in keys of mappings."""
-    return blend(tiling, place, dict(zip((tuple(p) for p in places), tiles)))
