@@ -81,7 +81,7 @@ def make_hollow(folder: Path) -> Project:
         script.write_text(SCRIPT.format(name=script.stem))
     run = folder / "workflow/rules/run.smk"
     run.write_text(
-        run.read_text().replace("    say(made(log))\n", "").replace("    list_pages()\n", "")
+        run.read_text().replace("    say(made())\n", "").replace("    list_pages()\n", "")
     )
     for name in GIVEN:
         (folder / "in" / name).parent.mkdir(parents=True, exist_ok=True)
